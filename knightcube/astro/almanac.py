@@ -77,8 +77,7 @@ def sun_direction(
 ) -> FloatArray:
     """Return the apparent direction (3,) of the Sun as a unit vector in ICRS axes.
 
-    The Sun's position is computed by VSOP2000. Parallax and aberration due to the observer's position and
-    velocity are included.
+    The Sun's position is computed by VSOP2000. Parallax and aberration due to the observer are included.
 
     Args:
         time: UTC without a time zone.

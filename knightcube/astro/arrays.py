@@ -22,8 +22,7 @@ Record = TypeVar("Record")
 def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record:
     """Return a copy of a dataclass of arrays (`record`) that contains only the selected rows.
 
-    The selection `chosen` is a Boolean mask (n,) or indices. The fields named in `common` do not have n rows
-    and remain unchanged.
+    The selection `chosen` is a Boolean mask (n,) or indices. The fields named in `common` remain unchanged.
     """
     picked: dict[str, Any] = {
         field.name: getattr(record, field.name)[chosen]

@@ -98,8 +98,7 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
 def from_rotation_vector(vector: FloatArray) -> FloatArray:
     """Return the quaternions (..., 4) of rotation vectors (..., 3), rad.
 
-    The attitude of a body that rotates with a constant rate w is q(t) = multiply(from_rotation_vector(w t),
-    q(0)).
+    A body that rotates with a constant rate w has the attitude multiply(from_rotation_vector(w t), q(0)).
     """
     v = np.asarray(vector, dtype=float)
     if v.ndim == 1:

@@ -143,13 +143,11 @@ class FirstOrbit:
     Attributes:
         time: s.
         state: position and velocity (6,) of the object relative to the Earth's centre, ICRS, m and m/s.
-        covariance: covariance (6, 6) of the state due to errors of the directions; errors of the observer's
-            orbit are not included.
+        covariance: covariance (6, 6) of the state due to errors of the directions only.
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
         lasts: whether the orbit `state`, the most likely one, is bound to the Earth and does not hit the
-            Earth. If `lasts` is false, at least one other orbit with a distance in `interval` satisfies both
-            conditions.
+            Earth. If not, another orbit with a distance in `interval` satisfies both conditions.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """

@@ -75,8 +75,7 @@ class MotionModel:
             with the rate n, its component across the line of sight is at most 1.5 n^2 = 1.8e-6 1/s^2. With
             the default density, the errors of direction and rate agree with the covariance in passes with
             angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
-        residual_wander: noise density of the residual acceleration divided by the range if the gravity
-            gradient is known, 1/s^3.
+        residual_wander: the same noise density if the gravity gradient is known, 1/s^3.
         bend: standard deviation of the unmodelled rate of change of the ratio (range rate) / range on curved
             paths, as a multiple of the squared angular rate of the object.
     """
@@ -140,8 +139,7 @@ def begin(
 def tides(observer: FloatArray) -> FloatArray:
     """Return the gravity gradient (3, 3) 1/s^2 at a position (3,) m from the Earth's centre, ICRS.
 
-    To first order, the relative acceleration of two objects in free fall is the gravity gradient times their
-    relative position.
+    To first order, the relative acceleration in free fall is the gradient times the relative position.
     """
     distance = float(np.linalg.norm(observer))
     up = observer / distance
@@ -228,8 +226,7 @@ class TrackSettings:
         needed: number of sightings within `within` frames that confirm a track.
         within: number of frames in which `needed` sightings confirm a track.
         missed: probability that the gate rejects a true sighting of the object.
-        moving: minimum difference between the angular rates of object and stars for a confirmed track, in
-            standard deviations.
+        moving: minimum angular rate of the object of a confirmed track, in standard deviations.
         minimum_rate: angular rate below which an object may be an uncatalogued star, rad/s.
         coast: time after which a confirmed track without a sighting ends, s.
         maximum_tracks: largest number of tracks, including tentative tracks.
@@ -259,8 +256,7 @@ class Track:
         frames: number of frames since the start of the track.
         magnitude: mean magnitude of the last sightings, or NaN if unknown.
         magnitude_sigma: standard deviation of the mean magnitude, computed from the scatter, or NaN before
-            the second sighting. The common error of all magnitudes due to the colours of the stars is not
-            included.
+            the second sighting. The error due to the colours of the stars is not included.
         history: one bit per frame, set if the frame contains a sighting; the lowest bit is the newest frame.
         measured: direction (3,) of the sighting in the newest frame, or NaN without a sighting.
         measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.

@@ -102,13 +102,11 @@ def estimate_rate(
         pinhole: model of the camera.
         exposure: exposure time, s.
         settings: settings of the estimation.
-        prior_rate: (3,) prior body rate in camera axes, rad/s, which only determines the sense of rotation,
-            or None if unknown.
+        prior_rate: (3,) prior rate in camera axes, rad/s, for the sense of rotation only, or None.
         prior_sigma: standard deviation of each component of the prior rate, rad/s.
         previous_checksum: checksum of the previous frame, by which a frozen camera is detected, or None.
 
-    Raises FlightError for an invalid frame, exposure or prior. If no rate is found, the status of the result
-    states the reason.
+    Raises FlightError for an invalid frame, exposure or prior. The status of the result states a failure.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = saturation_level(pixels, settings.saturation)
@@ -235,8 +233,8 @@ def fit_rotation(
     """Return the rotation with which most streaks agree.
 
     The endpoints `raw` (n, 2, 2), px, are without bias correction and have the expected errors `sigma` (n,),
-    px, the strongest streak first. Returns None if fewer than half of the streaks, or fewer than
-    `least_streaks`, agree.
+    px, the strongest streak first. Returns None unless half of the streaks and at least `least_streaks`
+    agree.
     """
     needed = max(settings.least_streaks, _LEAST_AGREEMENT * len(raw))
     outward = chord_outward(raw)
@@ -288,8 +286,7 @@ def _reject_and_solve(
     """Return the rotation and flags (n,) of the used streaks after iterative rejection of outliers.
 
     In each iteration, streaks are rejected, or accepted again, according to their residuals, until the set of
-    used streaks remains the same. Raises numpy.linalg.LinAlgError if the used streaks do not determine a
-    rotation.
+    used streaks remains the same. Raises numpy.linalg.LinAlgError if these determine no rotation.
     """
     weights = 1.0 / errors**2
     solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])

@@ -85,8 +85,8 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
 
     Each row of the linear system combines a point and the next point; the last row combines the last and the
     first point. A circle through three points fits exactly. For more points the radius of the circle is the
-    RMS distance of the points from the centre. Raises NoCircleError for fewer than three points and for
-    collinear points.
+    RMS distance of the points from the centre. Raises NoCircleError for fewer than three points or collinear
+    points.
     """
     points = np.asarray(points, dtype=float)
     if len(points) < 3:

@@ -594,8 +594,7 @@ def identify_by_rate(
     """Return the identification of a star field by rate matching.
 
     Without the `motion` of the observed points, all points are treated as stars and the attitude as constant.
-    Raises FieldUnknown if the image scale is too uncertain, and ValueError if `motion` and `field` differ in
-    length.
+    Raises FieldUnknown for a too uncertain scale, and ValueError if `motion` and `field` differ in length.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)
@@ -734,8 +733,7 @@ def match_images(
     angle. Each further step projects the stars with the newest attitude and removes most of the remaining
     error: four steps reduce a prior error of 1 deg in a 20 deg field to less than 0.01".
 
-    Raises AttitudeError if the directions do not determine an attitude, or if the prior attitude puts a star
-    behind the camera.
+    Raises AttitudeError if the attitude is undetermined, or if a star is behind the camera by the prior.
 
     Args:
         observed: (n, 3) observed unit vectors in camera axes, boresight +z.

@@ -3,8 +3,7 @@
 Background. The level and noise of the background are clipped moments of some of the pixels in each block of
 the frame. Streaks, slow gradients of stray light and hot pixels therefore hardly change the estimated
 background. Sease, chapter 3, uses the mean of the image as threshold, but noise lifts half of all pixels
-above the mean (errata). The sum over 3 x 3 pixels is nearly the matched filter of a star image one pixel
-wide.
+above the mean (errata). The sum over 3 x 3 pixels is nearly the matched filter of a star one pixel wide.
 
 A hot pixel is a bright pixel with dark neighbours. A point of light cannot cause a bright pixel with dark
 neighbours, because the optics spread its light over several pixels. If a star's image has a standard
@@ -625,8 +624,7 @@ def _moment_sums(
 def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
     """Return the ends (2, 2), px, of the uniform line with a given `centre` (2,) and `covariance` (2, 2).
 
-    If the line is not longer than `least_length` px, the centre is returned as both ends. The second moments
-    `covariance` are in px^2.
+    A line up to `least_length` px has both ends at its centre. The second moments `covariance` are in px^2.
     """
     (across, along), axes = np.linalg.eigh(covariance)
     length = float(np.sqrt(12.0 * max(along - across, 0.0)))

@@ -8,9 +8,9 @@
 2. Point stars are searched near their predicted positions if a prior attitude is available. Without a
    prior attitude, or if the stars are not found near their predictions, the whole frame is searched.
 
-3. Streaked stars are identified by their positions at mid-exposure, by the same method as point stars. After
-the identification, the streaks are fitted a second time, with a corrected focal length or with the directions
-of the identified stars.
+3. Streaked stars are identified by their positions at mid-exposure, by the same method as point stars.
+Afterwards, the streaks are fitted again, with a corrected focal length or the directions of the identified
+stars.
 
 The control process creates the job and receives the result. The streak estimators and scipy are imported at
 their first use, because they occupy tens of MB and the control process does not need them.
@@ -187,8 +187,7 @@ class FrameFound:
     Attributes:
         motion: motion of the camera over the exposure.
         solution: attitude at mid-exposure, or None if stars were not identified.
-        objects: points that may be space objects instead of stars, or None if they were not measured or the
-            attitude is unknown.
+        objects: points that may be space objects instead of stars, or None if not measured.
         lens: estimated lens parameters after the frame, or None if they are not estimated.
         field: points of light for the search for objects without a star catalogue, or None if not measured.
         problem: reason why no sky index could be used; empty if there is none.

@@ -96,8 +96,7 @@ class LensPrior:
             position error of a sensor that was mounted by hand.
         k1, k2: errors of the radial distortion coefficients. The defaults allow any lens except a fisheye.
         pixels: errors of aspect and shear. The default `pixels` means square pixels.
-        tangential: errors of the tangential distortion coefficients p1 and p2. The default `tangential` means
-            no tangential distortion.
+        tangential: errors of the tangential distortion coefficients p1 and p2, by default zero.
     """
 
     focal_length: float = 0.1
@@ -126,9 +125,8 @@ class Calibration:
 
     Attributes:
         lens: calibrated camera model.
-        covariance: covariance (9, 9) of the lens parameters PARAMETERS, including the prior. If the residuals
-            exceed their standard deviations significantly, the covariance is multiplied by chi-square per
-            degree of freedom.
+        covariance: covariance (9, 9) of the lens parameters PARAMETERS, including the prior, multiplied by
+            chi-square per degree of freedom if the residuals exceed their standard deviations significantly.
         undetermined: names of the PARAMETERS that are determined by the prior instead of the stars.
         attitudes: attitudes (m, 4) of the frames, from reference axes to camera axes.
         used: for each frame, mask (n,) of the accepted matches of stars.
@@ -171,8 +169,7 @@ def calibrate(
     """Return the lens that fits all frames best, starting from the camera `initial`.
 
     The prior, by default `LensPrior()`, is centred on a pinhole with the initial focal length. Raises
-    CalibrationError for malformed frames, for matches that do not determine a lens, and if the fit does not
-    converge to a valid lens.
+    CalibrationError for malformed frames, and if the fit does not converge to a valid lens.
     """
     _refuse_malformed(frames)
     begun = Lens.of(initial)
@@ -500,8 +497,7 @@ def calibrate_lens(
     a mirrored sky, because of a mirror or a reversed order of the rows, they are mirrored back.
 
     Args:
-        images: arrays (rows, columns) of counts, all of one shape. Colour images (rows, columns, 3) are
-            converted to luminance.
+        images: arrays (rows, columns) of counts, or colour images (rows, columns, 3), all of one shape.
         fov_deg: approximate field of view across the columns, deg. Without it, 4 to 60 deg are tried.
         progress: function that is called before each image with the number of the pass and the number of the
             image, both counted from 1.

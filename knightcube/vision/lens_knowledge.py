@@ -72,8 +72,7 @@ class MatchedFrame:
         covariance: covariances (n, 2, 2) of the star positions, px^2, used instead of `sigma`, or None if the
             errors along both axes are equal.
         late: derivatives (n, 2) of the star positions with respect to the line time of the shutter, px/s. If
-            `late` is given, the line time is the tenth parameter of the fit. If `late` is None, the fit has
-            nine lens parameters.
+            `late` is given, the line time is the tenth parameter of the fit.
     """
 
     points: FloatArray
@@ -476,8 +475,7 @@ class LensKnowledge:
         """Return an estimate that starts from stored values (7,) of LEARNED and their covariance (7, 7).
 
         Since the values were stored, each may have changed by the fraction `changed` of its configured
-        standard deviation. Returns None for values that are further than five configured standard deviations
-        from the configuration.
+        standard deviation. Returns None if values differ by five configured standard deviations.
         """
         if values.shape != _AT.shape:
             return None

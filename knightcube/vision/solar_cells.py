@@ -60,8 +60,7 @@ class SolarStringModel:
     Attributes:
         normals: outward unit vectors (n, 3) of the strings, in body axes.
         peaks: currents (n,) in full sunlight at normal incidence, A.
-        sigma: standard deviation of a reading relative to its peak, from calibration errors and departures
-            from the cosine law.
+        sigma: standard deviation of a reading relative to its peak, including departures from the cosine law.
         albedo: mean illumination by an Earth that would fill half the sky, relative to the Sun.
         albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
         dark: fraction of its peak current below which a string counts as dark.

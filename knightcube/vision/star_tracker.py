@@ -50,8 +50,7 @@ class MatchedStars:
     Attributes:
         hip: Hipparcos numbers (m,) of the stars. For a group of stars that the image does not resolve, `hip`
             is the number of the brightest star.
-        magnitude: Johnson V magnitudes (m,). For stars that the image does not resolve, `magnitude` is their
-            combined magnitude.
+        magnitude: Johnson V magnitudes (m,), combined for stars that the image does not resolve.
         directions: unit vectors (m, 3) to the stars, ICRS, at the epoch of the image.
         points: measured positions (m, 2), x and y, px, of streaked stars at mid-exposure.
         residuals: measured minus predicted positions of the stars (m, 2), px.
@@ -98,8 +97,7 @@ class StarSolution:
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
             is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
-        rate_sign_known: whether the sign of `rate` is known. The sign of the rate can only be determined with
-            a predicted rate.
+        rate_sign_known: whether the sign of `rate` is known, which requires a predicted rate.
         sky_map: conversion between pixels of the image and ICRS directions; None unless solved.
         frame: all results of the star tracker, including the points that are not catalogue stars.
         index: sky index (catalogue of guide stars) at the epoch of the image. The star indices in
@@ -178,8 +176,7 @@ class StarTracker:
         index: a sky index, or the path of a sky index file. None: the default index.
         learn: whether the lens parameters are estimated from the solved images, which must be taken by one
             camera. The attribute `lens` contains the estimated lens parameters. The accuracy of the given
-            field of view or camera is `settings.lens`. If `settings.lens` is None, the accuracy is that of an
-            uncalibrated camera.
+            field of view or camera is `settings.lens`, by default that of an uncalibrated camera.
 
     Raises:
         InputError: if a field of view is out of range or given with a camera, or for an unreadable index.
@@ -234,8 +231,7 @@ class StarTracker:
                 predicted positions, which is faster than a search of the whole sky. If the search near the
                 predicted positions does not succeed, the whole sky is searched.
             attitude_sigma: standard deviation of the predicted attitude about each axis, rad.
-            rate: predicted angular velocity (3,) in camera axes, rad/s. The predicted rate determines the
-                sign of a measured rate.
+            rate: predicted angular velocity (3,), camera axes, rad/s; gives the sign of a measured rate.
             rate_sigma: standard deviation of each component of the predicted rate, rad/s.
 
         Raises:
@@ -368,8 +364,7 @@ def camera_of_field(
 
     The tangents of the observed field angles must be multiplied by the scale for the true field of view.
     Without `fov_deg`, deg across the columns, the range `UNKNOWN_FOV_DEG` is used. Without the largest error
-    `error_deg`, deg, it is 5 % of the field. Raises InputError if the field of view is not between 1 and 120
-    deg.
+    `error_deg`, deg, it is 5 % of the field. Raises InputError unless the field is 1 to 120 deg.
     """
     _check_field_of_view(fov_deg, error_deg)
     lowest, highest = UNKNOWN_FOV_DEG

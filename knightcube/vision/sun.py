@@ -11,8 +11,7 @@ Tukey's biweight of each point's distance from the circle (Huber 1981, Robust St
 a cloud beside the disc or a hot pixel on its edge.
 
 The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
-solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
-its own covariance.
+solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ class SunSettings:
             brightest cloud, so that only the disc of the Sun exceeds it. For a linear camera, the threshold
             is slightly below saturation.
         stride: distance between the rows that are read first, px.
-        least_radius: radius below which a bright patch counts as a hot pixel, rad. The Sun itself has a
-            radius of 0.0047 rad.
+        least_radius: radius below which a bright patch is a hot pixel, rad; the Sun's is 0.0047 rad.
         greatest_radius: radius above which a bright patch counts as a cloud or the Earth, rad.
         tolerance: largest rms distance of the rim of the Sun's disc from a circle, px.
         least_agreement: minimum fraction of the disc's edge points within the image that lie on the circle.
@@ -112,8 +110,7 @@ class SunMeasurement:
     Attributes:
         direction: unit vector (3,) to the Sun in camera axes.
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
-        tangent_covariance: covariance (2, 2) of the direction error along `basis`, without the error of the
-            lens calibration, rad^2.
+        tangent_covariance: covariance (2, 2) of the direction along `basis` without lens errors, rad^2.
         point: position of the Sun's centre (2,) in the image, px. The position is NaN if the lens does not
             image the direction of the Sun's centre.
         radius: radius of the bright disc with its glare, rad.
@@ -423,8 +420,7 @@ _TUKEY = 4.685
 _NEARLY_AS_MANY = 0.75
 """Minimum ratio of the number of points on a smaller circle to that on the best circle.
 
-A smaller circle that reaches this ratio is preferred. Stray light enlarges discs, so that a smaller circle is
-more likely the Sun.
+A smaller circle that reaches this ratio is preferred, because stray light enlarges discs.
 """
 
 
@@ -605,8 +601,7 @@ def sun_of_cameras(
 
     The images (rows, columns), by camera index, were taken at one instant. A camera is not read if, according
     to the solar strings, the Sun cannot be in its field of view. A measured Sun that contradicts the solar
-    strings is rejected. Raises ValueError if an image does not have the size of its camera, or has non-finite
-    pixels.
+    strings is rejected. Raises ValueError for another image size or non-finite pixels.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}

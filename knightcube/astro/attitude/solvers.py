@@ -14,8 +14,7 @@ matrix per direction.
   Astronautical Sciences 36 (1988).
 - QUEST: Michalski, section 3.4.4, eq. 78 and 79, and Shuster and Oh, Three-axis attitude determination from
   vector observations, Journal of Guidance and Control 4 (1981). The Rayleigh quotient avoids the loss of
-  accuracy of Newton's method that Cheng and Shuster describe (Journal of Guidance, Control, and Dynamics 37,
-  2014).
+  accuracy of Newton's method (Cheng and Shuster, Journal of Guidance, Control, and Dynamics 37, 2014).
 - ESOQ2: Sease, chapter 3, text at eq. 3.23; Mortari, ESOQ-2 single-point algorithm, Advances in the
   Astronautical Sciences 95 (1997), and Markley and Mortari, Quaternion attitude estimation using vector
   observations, Journal of the Astronautical Sciences 48 (2000).
@@ -24,8 +23,8 @@ matrix per direction.
 - Predictive filter: In each step the filter chooses the body rate that minimises the weighted residuals of
   the directions predicted to first order (Michalski, section 3.4.1, without a formula; Crassidis and Markley,
   Journal of Guidance, Control, and Dynamics 20, 1997; Park and Crassidis, Navigation 53, 2006). For
-  measurements at one time, the steps converge to the solution of Wahba's problem, without the rounding errors
-  of B.
+  measurements at one time, the steps converge to the solution of Wahba's problem without rounding errors of
+  B.
 - TRIAD: The attitude follows from the pair of directions whose covariance has the smallest trace, and the
   first direction of the pair is assumed to be exact (Michalski, section 3.4.5; covariance of Shuster and Oh).
 - OLAE (optimal linear attitude estimator): The Gibbs vector follows from linear least squares (Sease, eq.
@@ -415,8 +414,7 @@ class VectorObservation:
     Attributes:
         observed: (3,) observed unit vector in body axes.
         reference: (3,) reference unit vector in inertial axes.
-        covariance: (3, 3) covariance of the observed vector in body axes, rad^2; the component along the
-            direction has no effect.
+        covariance: (3, 3) covariance of the observed vector in body axes, rad^2, across the direction.
     """
 
     observed: FloatArray

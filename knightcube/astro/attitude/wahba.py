@@ -7,8 +7,7 @@ give the uniform weights 1/N of Sease 2013.
 
 Solvers based on the profile matrix B lose accuracy by rounding. Two directions with a separation of d rad
 change B only by terms of the order d^2, so that the error of the quaternion is the rounding error divided by
-d^2. The function `refine` restores the accuracy from the residuals of the directions, which depend linearly
-on the separation d.
+d^2. The function `refine` restores the accuracy from the residuals of the directions, which are linear in d.
 """
 
 from __future__ import annotations
@@ -57,8 +56,7 @@ class AttitudeFix:
     """Attitude determined from directions.
 
     Attributes:
-        quaternion: (4,) rotation of the reference frame into the observer's frame; its scalar is not
-            negative.
+        quaternion: (4,) rotation of the reference frame into the observer's frame, with a scalar >= 0.
         covariance: (3, 3) covariance of small rotations about the observer's axes, rad^2.
         loss: half the sum of squared normalised residuals.
     """
@@ -77,8 +75,7 @@ class Sightings:
         weight: (n,) weights 1/sigma^2, scaled to a sum of one.
         total: sum of 1/sigma^2, 1/rad^2.
         profile: (3, 3) attitude profile matrix, the weighted sum of b r^T.
-        covariance: (3, 3) covariance of the optimal attitude, small rotations about the observer's axes,
-            rad^2.
+        covariance: (3, 3) covariance of small rotations about the observer's axes, rad^2.
     """
 
     observed: FloatArray
@@ -97,8 +94,7 @@ class Sightings:
 def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Sightings:
     """Check directions and return them with the quantities that all solvers need.
 
-    Raises AttitudeError for directions that are invalid or do not determine an attitude. The arguments are
-    those of `Solver`.
+    The arguments are those of `Solver`. Raises AttitudeError if the directions do not determine an attitude.
     """
     n = len(observed)
     if observed.shape != (n, 3) or reference.shape != (n, 3) or sigma.shape != (n,):
@@ -169,8 +165,7 @@ def half_rotation(component: int) -> tuple[FloatArray, FloatArray]:
 def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
     """Return the indices of the two directions that determine the TRIAD attitude most accurately.
 
-    TRIAD assumes that the first direction is exact. Raises AttitudeError if all directions are collinear in
-    one of the frames.
+    TRIAD assumes that the first direction is exact. Raises AttitudeError if all directions are collinear.
     """
     sines = np.minimum(_squared_sines(seen.observed), _squared_sines(seen.reference))
     squared = sigma**2

@@ -63,8 +63,7 @@ class Pressures:
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
     """Return the pressure vectors of air and sunlight along an orbit, at times (n,) of the ephemeris, s.
 
-    The relative strength of the air pressure is about one at an altitude of 500 km, and that of the sunlight
-    is one in full sunlight.
+    The strength is relative to the air pressure at about 500 km altitude, or to full sunlight.
     """
     position, velocity = ephemeris.position_at(times), ephemeris.velocity_at(times)
     sun = ephemeris.sun_at(times)

@@ -72,8 +72,8 @@ class NamedElements:
 def read_elements(text: str) -> list[NamedElements]:
     """Return the elements of all satellites in a text, which is recognised by its first characters.
 
-    Raises UsageError for invalid elements. The message states the line and columns of two-line elements, or
-    the field of an OMM.
+    Raises UsageError for invalid elements, with line and columns of two-line elements, or the field of an
+    OMM.
     """
     start = text.lstrip("\ufeff \t\r\n")
     first = start.partition("\n")[0]

@@ -129,8 +129,7 @@ class TwoLineElements:
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
         """Read a two-line element set.
 
-        Raises UsageError with line and columns for invalid lines (`check_lines`), and for elements that do
-        not describe an orbit.
+        Raises UsageError for invalid lines (`check_lines`), and for elements that do not describe an orbit.
 
         Args:
             first: first line of the element set.

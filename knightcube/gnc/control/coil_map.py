@@ -101,8 +101,7 @@ class CoilMap:
         resistance: resistance of each coil (n,), ohm.
         limits: largest dipole moment along each body axis (3,), A m^2. The coils can produce all dipole
             moments within these three limits.
-        heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, below the current
-            limits.
+        heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, without saturation.
     """
 
     def __init__(self, dipoles: FloatArray, current_limits: FloatArray, resistance: FloatArray) -> None:

@@ -387,8 +387,7 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,), T, measured at `time_ns`, or ignore it if the coils disturbed the measurement.
 
-        The rate (3,), rad/s, is measured by a gyro at the same time as the field. The sample may be older
-        than the last command.
+        A gyro measured the rate (3,), rad/s, with the field. The sample may be older than the last command.
         """
         age_ns = self._time_ns - time_ns
         if not self.listens(time_ns) or age_ns > OLDEST_NS:

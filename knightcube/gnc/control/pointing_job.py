@@ -430,8 +430,7 @@ does not depend on the duration of the initial guess."""
 class ObjectDirection:
     """The direction (3,) of an object, ICRS, at the time `since`, in s after the time `origin_ns` of the job.
 
-    The vector `velocity` (3,), 1/s, is the relative velocity of the object divided by its distance, and zero
-    for a fixed direction.
+    The vector `velocity` (3,), 1/s, is the object's relative velocity divided by its distance, or zero.
     """
 
     direction: FloatArray

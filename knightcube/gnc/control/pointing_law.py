@@ -125,8 +125,7 @@ class PathRecovery:
     Attributes:
         since: start time of the damping, s, or None while the body follows the path.
         ready: whether a new path may be planned.
-        leaving: whether a new path should be planned while the body still follows the old path, because the
-            deviation is large.
+        leaving: whether a new path should be planned because the deviation from the path is large.
     """
 
     def __init__(self) -> None:

@@ -108,8 +108,7 @@ def linearised(
     The magnetic field (n, 3), T, and the position (n, 3), m, are in ICRS axes. The dipole moment `dipole` (n,
     3), A m^2, is fixed in body axes, so the torque of this dipole depends on the rotation error. Each element
     of `pressed` describes an aerodynamic or solar radiation torque. The torque (N m) is the cross product of
-    the element's first part, a constant vector (3,) in body axes, and its second part, pressure directions
-    (n, 3) in ICRS axes.
+    its first part, a vector (3,) in body axes, and its second part, pressure directions (n, 3) in ICRS axes.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(

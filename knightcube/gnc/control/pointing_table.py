@@ -172,8 +172,7 @@ def best_course(
     The initial guess `initial` (n + 1,) ends on the attitude law and covers the duration of the table. The
     weights `state` (6, 6) of the errors and `dipole` of the dipole moment are computed by `step_costs`.
     Returns None if no motion is found within `STEPS` iterations or if the motion exceeds the limit of the
-    coils. The result is also None if the body rotates faster than `fastest` (rad/s) within the duration of
-    the table.
+    coils. The result is also None if the body rotates faster than `fastest` (rad/s).
     """
     count, first = len(expected.field) - 1, len(initial.times)
     quaternion = np.concatenate([initial.quaternion, expected.wanted.quaternion[first:]])
@@ -319,8 +318,7 @@ class PointingTable:
         gain: feedback gains K (n, 3, 6), in A m^2 per rad and per rad/s.
         torque_part: change of the dipole moment (n, 3, 9) per disturbance torque component, A m^2/(N m).
         sizes: components (9,) of the disturbance torques with which the path was planned, N m.
-        slew: slew path at the start of the table, with times from the start of the path, or None if the table
-            begins without a slew.
+        slew: slew path at the start of the table, with times from the start of the path, or None.
     """
 
     path: AttitudeReferences
@@ -366,8 +364,7 @@ class PointingPreview:
 
     Attributes:
         wanted: the law.
-        initial: initial guess (n + 1,) of the motion from the body's state to the attitude law, not
-            necessarily feasible.
+        initial: initial guess (n + 1,) of the motion from the body's state to the attitude law.
         field, position: magnetic field (T) and position (m), each (m, 3), ICRS.
         pressures: pressure vectors of air and sunlight at the m instants.
         sizes: presently estimated components (9,) of the disturbance torques, N m.

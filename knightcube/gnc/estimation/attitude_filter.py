@@ -220,8 +220,7 @@ class FilterSettings:
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
         field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
-        rate_walk: random walk of the rate due to torque noise other than that of the coils, rad/s per
-            sqrt(s).
+        rate_walk: random walk of the rate due to torque noise, without the coils, rad/s per sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
         gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
             component by this many standard deviations.
@@ -386,8 +385,8 @@ class AttitudeFilter:
         """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes.
 
         Commands must be recorded in order of time, each before the measurements that follow it. The default
-        of `field` is the constant field of the body description. The argument `known` is false if the coils
-        may carry other currents.
+        of `field` is the constant field of the body description. If `known` is false, the coils may carry
+        other currents.
         """
         check = self._check
         self._commands.record(max(time_ns, check.ended_ns), currents, field, known and not check.active)

@@ -159,8 +159,7 @@ def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
     """Transform, in place, the covariance of an attitude error to the axes after the correction.
 
     The slice `at` of the error state is the attitude error, which was corrected by `rotation` (3,), rad. To
-    first order, the remaining error rotates by half the correction (Markley and Crassidis 2014, section
-    6.2.4).
+    first order, the remaining error rotates by half the correction (Markley and Crassidis 2014, 6.2.4).
     """
     x, y, z = rotation
     turn = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))

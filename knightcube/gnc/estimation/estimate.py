@@ -76,9 +76,8 @@ class MeanRateMeasurement:
 class DirectionMeasurement(_AtOneTime):
     """A direction observed from the body, such as the direction of the Sun or nadir.
 
-    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The matrix
-    `covariance` (3, 3), rad^2, is the covariance of `observed` in body axes; its component along the
-    direction has no effect.
+    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The `covariance` (3,
+    3) of `observed`, rad^2, has no effect along the direction.
     """
 
     time_ns: int

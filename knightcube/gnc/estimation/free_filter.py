@@ -12,8 +12,7 @@ seconds if the body rotates slowly enough for star images. Besides attitude and 
   (Psiaki 2005, JGCD 28(4)). The common scale is observable only relative to the dipole moment of the coils.
 - `coils`: matrix of gain errors and misalignments of the coils. The estimated dipole is the commanded dipole
   plus this matrix times the commanded dipole.
-- `gyro_matrix`, `field_matrix`: scale factor errors and misalignments of gyro and magnetometer (Pittelkau
-  2001, JGCD 24(6)).
+- `gyro_matrix`, `field_matrix`: scale errors and misalignments of both sensors (Pittelkau 2001, JGCD 24(6)).
 - `camera`: misalignment of the star camera, whose attitude is known more accurately than that of the body.
 - `horizon`: misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
   cameras are used, so this block is a Gauss-Markov process with a long correlation time.

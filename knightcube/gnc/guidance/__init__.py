@@ -2,6 +2,5 @@
 
 Paths about one axis are planned by virtual motion camouflage in q2 (Sease 2013, eqs. (5.8) to (5.15)) in
 `vmc` and `vmc_program` with the model `plant`, and followed by `path_guidance`. For a free satellite,
-`attitude_law` computes the reference attitude of a `pointing_target`, and the modules `slew_*` plan optimal
-slews.
+`attitude_law` computes the attitude of a `pointing_target`, and `slew_*` plan slews.
 """

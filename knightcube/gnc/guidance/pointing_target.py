@@ -74,8 +74,7 @@ class PointingTarget:
             into body axes. The goal GROUND has latitude and longitude, rad. The goal OBJECT has right
             ascension and declination, rad, of the field to search, or no arguments for the present field of
             view. Goals other than INERTIAL, GROUND and OBJECT have no arguments.
-        roll: rotation about the pointing axis, rad, or None if the roll is free. A roll cannot be given for
-            the goals in `ROLLS`.
+        roll: rotation about the pointing axis, rad, or None if free; always None for the goals in `ROLLS`.
     """
 
     goal: Goal

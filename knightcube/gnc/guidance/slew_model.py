@@ -125,8 +125,7 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the second derivatives (n, 4, 4) with respect to q of the scalar products of `pull` and A(q) v.
 
-    The arguments are the vectors `pull` (n, 3) and v = `vector` (n, 3). The second derivatives are twice
-    Davenport's matrices.
+    The vectors are `pull` (n, 3) and v = `vector` (n, 3). The result is twice Davenport's matrices.
     """
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
@@ -142,8 +141,7 @@ class SlewDynamics:
 
     The derivative x' of the state x = (q, w) is a constant plus the quadratic form z^T H z / 2 of z = (m +
     residual, b, e, w, q). The dipole m, the magnetic field b, the scaled position direction e and the rate w
-    are in body axes, and b and e are quadratic in the attitude q. A single matrix product therefore gives the
-    derivatives at all times.
+    are in body axes, and b and e are quadratic in the attitude q. One matrix product gives all derivatives.
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
@@ -509,8 +507,7 @@ def along(
 def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float) -> tuple[Cone, ...]:
     """Return the exclusion cones of a body `axis` (3,), one for each of `angles`, rad.
 
-    The keys of `angles` are `sun` and `moon`, with half angles from the centre, and `earth`, with an angle
-    from the limb.
+    The keys of `angles` are `sun` and `moon`, from the centre, and `earth`, from the limb.
     """
     date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
     moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)

@@ -151,8 +151,7 @@ class SlewPlan:
         horizon_asked, horizon: requested and planned duration, s.
         energy: heat of the coils during the slew, J.
         peak: largest ratio of a component of the dipole moment to the dipole limit.
-        clearance: smallest angle between camera axis and each exclusion cone along the path, in the order of
-            the task's cones, rad.
+        clearance: smallest angle between camera axis and each of the task's exclusion cones, rad.
         steps: total number of Newton steps of the search.
     """
 
@@ -196,8 +195,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
     """Return the plan found from the path `near` of a similar task, or None if the search fails.
 
-    The path `near` has the duration of the task. Only the initial guess `near` is tried. Raises PlanningError
-    for invalid values.
+    The only initial guess is `near`, with the duration of the task. Raises PlanningError for invalid values.
     """
     check(task)
     search = SlewSearch(task, *GRIDS[0])
@@ -479,8 +477,8 @@ def plan_slew(
     torque. The orbit is predicted by SGP4. A plan takes about a second.
 
     In the result, `plan.path` contains attitude, rate and dipole at the times `plan.path.times`, s after the
-    start of the slew. The energy `plan.energy` is the heat of the coils, J. The start `begin` of the slew is
-    in s after `time`.
+    start of the slew. The energy `plan.energy` is the heat of the coils, J. The slew starts `begin` s after
+    `time`.
 
     Args:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.

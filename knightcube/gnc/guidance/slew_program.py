@@ -286,9 +286,8 @@ class Transcription:
     ) -> FloatArray:
         """Return the Newton matrix (the second derivatives of the Lagrangian) as a band matrix.
 
-        The barrier and convexification terms `state_part` (2 k + 1, 7, 7) are added to the second derivatives
-        with respect to the states, and the terms `dipole_part` (k + 1, 3) to those with respect to the
-        dipoles.
+        The barrier and convexification terms `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are
+        added to the second derivatives with respect to states and dipoles.
         """
         at, h = linear.at, self._step
         half, whole = np.split(multipliers[self.layout.equations], 2, axis=1)

@@ -244,8 +244,7 @@ _SAME = 0.1
 def guesses(equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -> list[Trajectory]:
     """Return initial guesses for a slew, the most promising guess first.
 
-    The guesses lead from the start to the end conditions of `equations`, and avoid the exclusion cones of the
-    constraints `kept`.
+    The guesses satisfy the end conditions of `equations` and avoid the exclusion cones of `kept`.
     """
     motion, found = equations.motion, []
     for states in _MomentumFit(equations, craft, kept).found():
@@ -428,8 +427,7 @@ class HorizonContinuation:
     def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
         """Return the best path found by shortening the slew as long as this reduces energy plus time cost.
 
-        The continuation starts from those paths in `relaxed` that satisfy the limit at the shortest
-        durations.
+        The continuation starts from the shortest paths in `relaxed` that satisfy the limit.
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:

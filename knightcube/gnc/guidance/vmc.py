@@ -335,14 +335,12 @@ def plan(
     Rates are body rates in rad/s. The argument `reference` is the reference point q_r of Sease, eq. (5.10),
     which must lie beyond the range of q2, and `q2_limit` is the upper bound of |q2|. The duration is extended
     to at most `max_stretch` times the requested duration. An extended duration is about 0.3 % longer than the
-    shortest feasible duration on `nodes` nodes, and at most 1.5 % longer than the duration of the bang-bang
-    path.
+    shortest on `nodes` nodes, and at most 1.5 % longer than that of the bang-bang path.
 
     If `time_cost`, W, is given, the path minimises energy plus `time_cost` times duration. The optimised
     duration is between SHORTEST_WITH_TIME_COST s and `max_stretch` times `horizon`, which is the initial
     guess. The argument `last` is the path followed until now, with an origin relative to the start of the new
-    path. The initial guess is the remaining part of the path `last`. The argument `cost` selects which energy
-    is minimised.
+    path. The initial guess is the remaining part of the path `last`. The energy is selected by `cost`.
 
     Raises PlanningError if an argument is outside its limits, or if no permitted duration is feasible.
     """
@@ -392,8 +390,7 @@ def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
     The initial guess is the cubic with the same end states as the rest of the path. The result is None if
     nothing of the path remains.
 
-    If the returned difference is added to the initial guess of another path, the sum has the boundary states
-    of the other path.
+    Added to the initial guess of another path, the difference gives the boundary states of that path.
     """
     if last is None:
         return None

@@ -59,8 +59,7 @@ def fits_image(content: bytes, name: str) -> Image:
     The image is the primary image or, if the primary image is empty, the first image extension. Integer
     pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned integers
     become unsigned. Pixels with any other BZERO or BSCALE value become float64. Three planes of colour are
-    converted to luminance. Raises UsageError with a message that begins with the file's `name` if the image
-    is not supported.
+    converted to luminance. Raises UsageError for an unsupported image, with the file's `name`.
     """
     header, axes, start = _first_image(content, name)
     bits = _whole(header, "BITPIX", name)

@@ -330,8 +330,7 @@ class Lens:
 def _reach(k1: float, k2: float) -> float:
     """Return the smallest tangent r of a field angle at which the distorted radius has a maximum.
 
-    The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if the equation
-    has no positive root.
+    The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite without a root.
     """
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
@@ -397,8 +396,7 @@ class CameraKnowledge:
     Attributes:
         focal_length: relative standard deviation of the focal length.
         centre: standard deviation of the optical axis along x and along y, px.
-        distortion: standard deviation of the distortion at an image corner, relative to the corner's distance
-            from the image centre.
+        distortion: standard deviation of the distortion at an image corner, relative to half the diagonal.
         line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
             of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
         covariance: covariance (5, 5) of relative focal length, optical axis along x and y, distortion and

@@ -45,8 +45,7 @@ _TAIL = 3.5
 _OUTGROWN = 1.4
 """Minimum ratio of the step heights of an edge at which the wider of two Gaussians is used.
 
-The ratio is the step height after smoothing by the wider Gaussian, divided by the step height after smoothing
-by the narrower Gaussian.
+The ratio is the step height for the wider Gaussian divided by the step height for the narrower Gaussian.
 """
 _MARGIN = 4.0
 """Distance from the image border (px) within which edges are ignored. Some detectors have a black border."""
@@ -122,10 +121,8 @@ class ScanEdges:
         towards: unit vectors along the scan line towards the bright side (n, 2).
         scale: standard deviation of the smoothing Gaussian with which each edge was found (n,), px.
         sigma: standard deviation of each edge position along the scan line before a fit of the limb (n,), px.
-        background: brightness of the dark side (n,), which is low at the limb and the terminator, and higher
-            at a coast or a cloud.
-        profile: brightness samples along the scan line around each edge, from dark to bright (n, m); NaN
-            outside the image.
+        background: brightness of the dark side (n,), low at limb and terminator, higher at coasts and clouds.
+        profile: brightness samples along the scan line, from dark to bright (n, m); NaN outside the image.
     """
 
     points: FloatArray
@@ -398,8 +395,7 @@ class Observation:
         space: distance between the scan lines, px.
         edges: detected edges as pixel positions.
         rays: detected edges as directions.
-        across, down: derivatives of the unit vector to each edge (n, 3), per pixel to the right and
-            downwards.
+        across, down: derivatives of the unit vectors to the edges (n, 3), per pixel to the right and down.
         samples: directions and brightness of sampled pixels on the scan lines.
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
     """

@@ -166,8 +166,7 @@ def limb_in_view(
     """Return the length of a limb in the image and the number of its crossings with scan lines.
 
     The points (n, 2), px, follow the closed limb. The masks (n,) mark the points inside the image, and the
-    points at which the limb is due to show an edge. The distances between scanned columns and between scanned
-    rows are `space`, px.
+    points at which the limb is due to show an edge. Scanned columns and rows are `space` px apart.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)
@@ -187,8 +186,7 @@ def log10_chance(
     """Return log10 of an upper bound on the expected number of limbs that fit equally well by chance.
 
     The distances from the fitted limb, px, are `residuals` (k,) for the edges that belong to the limb, and
-    `others` (m,) for all other edges. The number of fitted parameters `unknowns` is 2 for nadir alone and 3
-    for nadir and altitude.
+    `others` (m,) for all other edges. There are 2 `unknowns` for nadir and 3 with altitude.
     """
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
@@ -239,17 +237,15 @@ class Hypothesis:
     Attributes:
         fit: the fitted limb.
         members: mask of the image's edges that lie on the fitted horizon (n,).
-        squares: squared distance of each edge from the fitted horizon in standard deviations (n,). The value
-            is infinite for an edge away from the horizon, and NaN for an edge near the horizon that the fit
-            does not use.
+        squares: squared distance of each edge from the fitted horizon in standard deviations (n,), infinite
+            away from the horizon, and NaN for an edge near the horizon that the fit does not use.
         limb: limb points from the edges on the fitted horizon.
         residual: rms distance of the fitted edges from the limb, px.
         guess: initial guess from which the fit started.
         lighting: agreement of the image's brightness with the view of the Earth that the horizon implies.
         coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 without a sunlit limb.
         night: fraction of the edges on the fitted limb at which the Sun's elevation is below `_NIGHT`.
-        allowance: standard deviation per axis, rad, by which the uncertainty of the nadir is increased for
-            unmodelled effects.
+        allowance: standard deviation of the nadir per axis, rad, due to unmodelled effects.
         chance: log10 of the expected number of horizons that fit equally well by chance, from `log10_chance`.
         breadth: ratio of the median width of the edges on the horizon to the width expected from the
             brightness profile of the atmosphere.

@@ -360,9 +360,8 @@ def initial_guess(
 ) -> InitialGuess:
     """Return the initial guess of a horizon from a cone; `place` is None if the altitude is unknown.
 
-    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If in addition the direction
-    of the Sun is known, several trial rotations about nadir are compared with the brightness of the image,
-    and the best is used.
+    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If the direction of the Sun
+    is known, the rotation about nadir that agrees best with the brightness of the image is used.
     """
     if place is None:
         sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))

@@ -255,8 +255,7 @@ class FittedLimb:
 def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior) -> FittedLimb | None:
     """Return the limb fitted to rays (n, 3) with standard deviations `sigma` (n,), rad.
 
-    The iteration begins at the initial view `start`. Returns None if the rays do not determine the nadir, or
-    if the fit diverges.
+    The iteration begins at `start`. Returns None if the nadir is undetermined or the fit diverges.
     """
     information = _information(start, prior)
     view, moved = start, np.zeros(PARAMETERS)
@@ -385,8 +384,7 @@ def _is_outside(view: LimbView) -> bool:
 SCALE_HEIGHT = 8000.0
 """Scale height (m) of the lower atmosphere.
 
-The scale height of the US Standard Atmosphere 1976 is 8.4 km at the ground and 6.4 km at an altitude of 15
-km.
+The scale height of the US Standard Atmosphere 1976 is 8.4 km at the ground and 6.4 km at 15 km.
 """
 _VERTICAL_DEPTH = 0.097
 """Vertical optical depth of the atmosphere at 550 nm (Bucholtz 1995, Applied Optics 34, 2765, Table 3)."""

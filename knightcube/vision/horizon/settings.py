@@ -1,8 +1,7 @@
 """Settings of the horizon search, the response of the detector, and prior knowledge for one image.
 
 A horizon does not determine the rotation about nadir. Prior knowledge (position, Sun, rough attitude,
-directions from other sensors) determines the rotation about nadir. Prior knowledge is also a test of a fitted
-horizon.
+directions from other sensors) determines this rotation, and tests a fitted horizon.
 """
 
 from __future__ import annotations
@@ -146,13 +145,11 @@ class HorizonSettings:
         edges: settings of the search for edges.
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
             of the limb height is valid for an atmosphere of unknown scale height (6.5 to 9.5 km) and unknown
-            haze. If scale height and haze are known, 1,000 m is a sufficient standard deviation of the limb
-            height.
+            haze. If scale height and haze are known, 1,000 m is sufficient.
         altitude_sigma: standard deviation of the altitude of a known position, m.
         altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
             would accept any bright disc as the Earth, for instance a lens ghost.
-        tolerance: largest distance of an edge from the circular cone of a horizon, px; it must cover the
-            flattening of the Earth.
+        tolerance: largest distance of an edge from a horizon's circular cone, including flattening, px.
         least_edges: minimum number of edges on a horizon.
         enough_edges: number of edges on a horizon below which the image is searched again on more scan lines.
         some_edges: number of edges in an image below which the image is not searched again.

@@ -97,8 +97,7 @@ class ScaleSteps:
 
         At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
         / 2 across the radius. The ratio of two sides of a triangle at the field-angle tangent t therefore
-        depends on their directions by up to t^2 / 2. The steps are computed for the field angle half-way to
-        the corner of the field.
+        depends on their directions by up to t^2 / 2. The steps are computed half-way to the corner.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)

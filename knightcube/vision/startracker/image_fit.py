@@ -496,8 +496,7 @@ def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Se
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
     Bright points that disagree with the fit for their measured variances may agree for the larger variances.
-    The common variance is estimated again with the points that agree. Excluded streaks are not included
-    again.
+    The common variance is estimated again with these points. Excluded streaks remain excluded.
     """
     own = seen
     for _ in range(_AGREEMENT_ROUNDS):
@@ -547,8 +546,7 @@ def attitude_by(
     The image fit excludes outliers and determines the lens errors. The solver uses the directions of the
     stars that are not outliers, each with one standard deviation for both axes (Michalski, section 3.4). The
     first arguments are those of `fit_in_image`. The displacement of each star per standard deviation of the
-    line time is `late` (n, 2), px; (0, 2) if the line time is exact. Raises AttitudeError if the stars do not
-    determine the attitude.
+    line time is `late` (n, 2), px; (0, 2) if the line time is exact. Raises AttitudeError for too few stars.
     """
     if len(late):
         points = points - fit.delay * late

@@ -59,8 +59,7 @@ class BatchSizes:
 
     Attributes:
         bright: number of triangles in each batch of only the brightest stars, which identify most frames.
-        spread: number of triangles in each batch that also includes faint stars, for frames whose brightest
-            points are not stars.
+        spread: triangles in each batch that includes faint stars, if the brightest points are not stars.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -91,8 +90,7 @@ def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
     """Return batches of triangles (t, 3) of bright and faint stars.
 
     The last batch also includes triangles of neighbouring stars if the field has more than `_MOST_STARS`
-    points, or more than `_BRIGHTEST` points of unknown magnitude. A field and its mirror image have the same
-    batches.
+    points, or more than `_BRIGHTEST` points of unknown magnitude. Mirror images have the same batches.
     """
     batches = np.split(middle_sized(field, sum(sizes.spread)), np.cumsum(sizes.spread)[:-1])
     if len(field) > (_BRIGHTEST if field.magnitude is None else _MOST_STARS):
@@ -200,8 +198,7 @@ def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
 
     The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
     contain the pair. The votes of a match are the sum of the votes of its three pairs. Two pairs rarely have
-    the same first bits of their codes by chance. If two pairs have the same first bits, their votes are added
-    by mistake.
+    the same first bits of their codes by chance. If they do, their votes are added.
     """
     bits = max(13, code.size.bit_length())
     slot = code >> np.uint32(32 - bits)

@@ -32,8 +32,7 @@ from knightcube.vision.startracker.attitude_fit import scale_slope
 def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
     """Return the apparent directions (n, 3) of stars for a camera with a velocity (3,), m/s, as unit vectors.
 
-    The velocity is relative to the solar system barycentre. Raises ValueError unless it is finite and below
-    the speed of light.
+    The velocity is barycentric. Raises ValueError unless it is finite and below the speed of light.
     """
     beta = np.asarray(velocity, dtype=float) / SPEED_OF_LIGHT
     square = float(beta @ beta)
@@ -188,8 +187,7 @@ class SkyMap:
         camera: camera model.
         quaternion: attitude quaternion (4,) from ICRS to camera axes.
         bend: lens errors that the camera model does not include (8,); zeros if the lens is exact.
-        velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration, or None
-            for no correction.
+        velocity: velocity of the camera (3,), m/s, for the correction of aberration, or None.
         mirrored: whether the image shows the mirrored sky; the attitude then refers to the image after left
             and right are swapped about the optical axis.
     """

@@ -128,8 +128,7 @@ class Weighting:
     """Weights that express the attitude measured in a frame as a mean of the attitudes during the exposure.
 
     Attributes:
-        weights: weights of the rotations since mid-exposure at the times `NODES`; the weight of mid-exposure
-            is one minus their sum.
+        weights: weights of the rotations since mid-exposure at `NODES`; mid-exposure has one minus their sum.
         noise_share: variance due to white angular acceleration, per density times exposure time cubed.
     """
 
@@ -235,10 +234,9 @@ class SolveSettings:
         attitude: solver of Wahba's problem, or None for the fit of the image positions.
         velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
             of aberration, or None for no correction.
-        lens: standard deviations of the parameters of a lens with known focal length, or None if the
-            parameters are exact.
-        uncalibrated_lens: whether a displaced optical axis and distortion are also fitted for a lens of
-            uncertain focal length.
+        lens: standard deviations of the parameters of a lens with known focal length, or None if exact.
+        uncalibrated_lens: whether optical axis and distortion are fitted too if the focal length is
+            uncertain.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -542,8 +540,7 @@ def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
 
     If the positions are wrong, for example because a defocused lens images stars as rings, only points that
     are within the gate by chance match. If fewer than half of the points match, the matching points may be
-    only those that lie near stars by chance. The residuals of such points do not show the error of the
-    attitude.
+    only those that lie near stars by chance. Their residuals do not show the error.
     """
     count, agreeing = len(seen.points), int(np.count_nonzero(fit.agree))
     if seen.kind is not FrameKind.POINTS or 2 * agreeing >= count or fit.excess < _CONTRADICTED:

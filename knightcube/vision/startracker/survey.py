@@ -205,8 +205,7 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
     """Return rows and columns of the hot pixels of a frame (rows, columns), as `find_hot_pixels` does.
 
     Only the pixels that exceed the lowest threshold of the surrounding blocks are tested, so that the
-    background is not interpolated at every pixel. The returned arrays are empty if at most `most` pixels
-    exceed this threshold.
+    background is not interpolated at every pixel. The result is empty if at most `most` pixels do.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -478,8 +477,7 @@ class Areas:
         pixels: number of pixels of each area (n,).
         flux: sum of the counts above the background of each area (n,).
         centre: centroid of each area (n, 2), px.
-        length: length of the uniform line with the same second moments as each area, without the widening by
-            the PSF (n,), px.
+        length: length of the uniform line with the same second moments as each area, without PSF (n,), px.
         thickness: rms width of each area across its long axis (n,), px.
         direction: angle between the long axis of each area and the rows (n,), rad.
         shape: rows and columns of the frame.
@@ -614,8 +612,7 @@ def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
 
     Near the boresight, a rotation displaces the image at (x, y) by t + w (-y, x), with a vector t and a
     number w. If a line in the image is parallel to the flow of a rotation, the component of the flow along
-    the line's normal is zero. The best t and w follow from a singular value decomposition of the normal
-    components.
+    the line's normal is zero. The best t and w follow from a singular value decomposition.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0

@@ -71,9 +71,8 @@ class Chance:
 
         The observed stars with the indices `observed` match the expected stars `ranks` within `gate` standard
         deviations, both in order of brightness. Only expected stars down to a brightness limit are compared,
-        and the limit with the most significant match is selected. Because of this selection, the bound is
-        multiplied by j^2 pi^2/6, where j - 1 is the number of expected stars down to the limit that have no
-        match.
+        and the limit with the most significant match is selected. The bound is therefore multiplied by j^2
+        pi^2/6, where j - 1 is the number of expected stars down to the limit without a match.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
