@@ -105,10 +105,7 @@ def davenport_matrix(profile: FloatArray) -> FloatArray:
 
 
 def _characteristic(profile: FloatArray) -> tuple[float, float, float]:
-    """Return the coefficients b, c and d of the characteristic polynomial l^4 + b l^2 + c l + d of K.
-
-    The formulas are those of Markley's FOAM algorithm.
-    """
+    """Return the coefficients b, c and d of det(K - l) = l^4 + b l^2 + c l + d, as in Markley's FOAM."""
     rows = profile.tolist()
     cofactors = adjugate(rows)
     square, cofactor_square = (sum(x * x for row in matrix for x in row) for matrix in (rows, cofactors))

@@ -379,10 +379,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
 
 
 def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, FloatArray]:
-    """Return the attitude (4,) and rate (3,), rad/s, predicted for LEAD s after the job's time `origin_ns`.
-
-    The body is expected to keep its present attitude error and rate error relative to the present path.
-    """
+    """Return attitude (4,) and rate (3,) after LEAD s, if the errors relative to the path do not change."""
     now, then = running.since, running.since + LEAD
     path = running.path.references(np.array([now, then]))
     error = multiply(job.quaternion, conjugate(path.quaternion[0]))

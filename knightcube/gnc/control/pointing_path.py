@@ -190,10 +190,7 @@ def sweep(
 
 
 def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the gravity gradient torque (n, 3), and its derivatives (n, 3, 3) with respect to rotations.
-
-    The position relative to the Earth's centre is `up` (n, 3), m, in body axes.
-    """
+    """Return the gravity gradient torque (n, 3) at `up` (n, 3), m, and its derivatives (n, 3, 3)."""
     radius = np.linalg.norm(up, axis=1)
     down = -up / radius[:, None]
     strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3

@@ -114,10 +114,7 @@ def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
 
 
 def _rotation_jacobian(vector: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 3) of rotations with respect to the rotation vectors (n, 3).
-
-    They are left Jacobians of the rotation group, for scalar-last quaternions, inertial to body axes.
-    """
+    """Return the left Jacobians (n, 3, 3) of rotations with respect to the rotation vectors (n, 3)."""
     angle = np.linalg.norm(vector, axis=1)[:, None, None]
     safe = np.where(angle < 1e-2, 1.0, angle)
     one = np.where(angle < 1e-2, 0.5, (1.0 - np.cos(safe)) / safe**2)

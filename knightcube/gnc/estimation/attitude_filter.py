@@ -329,10 +329,7 @@ OnApplied = Callable[[list[bool]], None]
 
 @dataclass(slots=True, eq=False)
 class _Branch:
-    """A replay that starts at the checkpoint `base` and includes late measurements.
-
-    The callback `applied` is called when the replay ends.
-    """
+    """A replay from the checkpoint `base` that includes late measurements and calls `applied` at its end."""
 
     base: Checkpoint
     replay: Replay
@@ -524,10 +521,7 @@ class AttitudeFilter:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
-        """Apply measurements in order of time to the newest checkpoint.
-
-        Returns whether the measurement `asked` passed the gate.
-        """
+        """Apply measurements in order to the newest checkpoint; return whether `asked` passed the gate."""
         replay = Replay(self._model, self._history.newest, measurements)
         replay.advance()
         self._history.replace_from(len(self._history), replay.checkpoints)
@@ -536,10 +530,7 @@ class AttitudeFilter:
         return mine.used
 
     def _count(self, kind: type[Measurement], used: bool) -> None:
-        """Count consecutive rejections, and restart the filter after too many of them.
-
-        Rejected mean rates do not restart the filter, because mean rates are rare.
-        """
+        """Count consecutive rejections, and restart after too many, except for mean rates, which are rare."""
         in_a_row = 0 if used else self._refused_in_a_row.get(kind, 0) + 1
         self._refused_in_a_row[kind] = in_a_row
         self.refused += not used

@@ -162,10 +162,7 @@ class HorizonSearch:
         return self.within(time, longest)
 
     def _at_requested(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
-        """Return a path over `asked` s instead of a slightly longer path, if a path over `asked` s is found.
-
-        The search for the shorter path starts from the longer path.
-        """
+        """Return a path over `asked` s found from a longer path, or the longer path if none is found."""
         if not asked * (1.0 + _AT_BOUND) < trial.horizon <= asked * _SHORTEST_STRETCH:
             return program, trial
         at_asked, found = self.over(asked, program.from_prey(trial))
@@ -417,10 +414,7 @@ def _assemble(
     evaluations: int,
     end_rate: float,
 ) -> StepPlan:
-    """Return the plan for a solution `trial` of the optimiser.
-
-    Raises PlanningError if the path is not finite.
-    """
+    """Return the plan for a solution `trial` of the optimiser, or raise PlanningError if it is not finite."""
     energy, supplied = (program.spent(trial, cost) for cost in PathCost)
     peak = float(np.abs(program.ratios(trial)[0]).max()) * program.plant.current_limit
     node_q2 = program.family.nodes(trial.parameters, trial.horizon)

@@ -301,10 +301,7 @@ def _refined_numpy(
 
 
 def _write_normal(gram: list[list[float]], normal: FloatArray) -> list[float]:
-    """Write the normal matrix (p, p) from the Gram matrix of the rows, and return the gradient (p,).
-
-    A rotation d changes a residual by d x p, so its gradient is the sum of the products p x r.
-    """
+    """Write the normal matrix (p, p) from the rows' Gram matrix; return the gradient (p,), sums of p x r."""
     trace = gram[0][0] + gram[1][1] + gram[2][2]
     gradient = _summed_cross(gram, 3)
     for i in range(3):

@@ -167,10 +167,7 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
 
 def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the indices of the first `most` peaks, with a limit for each sixteenth of the frame's area.
-
-    Each sixteenth of the frame's area contributes at most a quarter of `most` peaks.
-    """
+    """Return the indices of the first `most` peaks, at most a quarter in each sixteenth of the area."""
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")

@@ -513,10 +513,7 @@ def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Se
 
 
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
-    """Return stars and fit after a common variance, px^2, is added to the variances of the positions.
-
-    The common variance is estimated from the stars in the mask `agree` (n,).
-    """
+    """Return stars and fit after adding the common variance, px^2, of the stars that `agree` (n,)."""
     weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
     for _ in range(_SCATTER_ROUNDS):
         root = np.linalg.cholesky(seen.covariance[agree])

@@ -484,10 +484,7 @@ def _at_scales(direction: FloatArray, scales: FloatArray) -> FloatArray:
 
 @loop_helper
 def _sorted_sides(seen: FloatArray, triangle: IntArray, side: FloatArray, corner: IntArray) -> int:
-    """Write the sides of a triangle in ascending order, and the corners opposite to them.
-
-    Returns 1 if the corners run to the left in the image, otherwise 0.
-    """
+    """Write sorted sides and their opposite corners; return 1 if the corners run to the left, otherwise 0."""
     for c in range(3):
         one, two = triangle[(c + 1) % 3], triangle[(c + 2) % 3]
         cosine = seen[one, 0] * seen[two, 0] + seen[one, 1] * seen[two, 1] + seen[one, 2] * seen[two, 2]
@@ -516,10 +513,7 @@ def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) 
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position in a cell that agrees with each ratio, and how many higher positions agree.
-
-    A position agrees with a side ratio if the two differ by at most `slack`.
-    """
+    """Return the lowest position in a cell within `slack` of each ratio, and the number of higher ones."""
     # Positions within a cell are in units of 1 / FINE of its width, and refer to the middle of such a unit.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
     reach = slack * (CELLS * FINE) + 0.5
@@ -848,10 +842,7 @@ def _into_frame(corners: FloatArray) -> None:
 
 
 def _frame(corners: FloatArray) -> FloatArray:
-    """Return the axes, as rows (3, 3), of a coordinate frame fixed to a triangle of unit vectors (3, 3).
-
-    The first axis of the coordinate frame points to the centre of the triangle.
-    """
+    """Return the axes, as rows (3, 3), of a frame fixed to three unit vectors, the first to their centre."""
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
     mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz
     norm = math.sqrt(mx * mx + my * my + mz * mz)

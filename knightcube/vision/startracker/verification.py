@@ -476,10 +476,7 @@ def _first_match_numpy(
 def _pair_numpy(
     seen: FloatArray, variance: FloatArray, matrix: FloatArray, guide: FloatArray
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Return the nearest guide star (n,) of each of `seen` (n, 3), and the squared distance in variances.
-
-    The distance is infinite if another observed star is nearer to the guide star.
-    """
+    """Return each star's nearest guide star and squared distance, infinite if another star is nearer."""
     cosines = seen @ (matrix @ guide.T)
     nearest = cosines.argmax(axis=1)
     rows = np.arange(len(nearest))
@@ -688,10 +685,7 @@ def _best_gate(
     fields: float,
     scales: float,
 ) -> tuple[float, float]:
-    """Return the gate with the most significant match, and log10 of the expected number of chance matches.
-
-    The returned gate is 0 if fewer than `least` stars match.
-    """
+    """Return the most significant gate, 0 below `least` stars, and log10 of the chance matches."""
     best, bound, matched = 0.0, math.inf, least - 1
     for gate in gates:
         within, rank = _within(squared, nearest, gate)
@@ -832,10 +826,7 @@ def track(
 def _same_shift(
     field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float, sigma: float
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
-    """Return the indices of observed stars (k,) and guide stars (k,) that have a common displacement.
-
-    The returned pairs of stars are the largest set that one displacement explains.
-    """
+    """Return the indices of the largest set of observed and guide stars that one displacement explains."""
     reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)
     wider = across + reach * (1.0 + across**2), down + reach * (1.0 + down**2)

@@ -328,10 +328,7 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
 
 
 def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
-    """Return the triangles (m, 3) of the `few` brightest stars of each of the circles that cover the sky.
-
-    The circles have the radius `radius`. The longest side of a triangle is at least `smallest`.
-    """
+    """Return the triangles (m, 3) of the `few` brightest stars in circles of `radius` that cover the sky."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
