@@ -506,10 +506,7 @@ class KnownSky:
     """
 
     def __init__(self, index: SkyIndex, half_width: tuple[float, float]) -> None:
-        """Use the guide stars of a search index for a field of view.
-
-        The argument `half_width` (2,) contains the tangents of half the angles of the field of view.
-        """
+        """Use the guide stars of an index for a field with the half-angle tangents `half_width` (2,)."""
         self.index = index
         self.half_width = half_width
         x, y = half_width

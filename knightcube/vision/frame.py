@@ -580,10 +580,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 def _moment_sums_numpy(
     owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
 ) -> FloatArray:
-    """Return the moments (6, count) of `count` regions: flux, centroid (x, y), second moments (xx, yy, xy).
-
-    The arguments are those of `moments`.
-    """
+    """Return flux, centroid (x, y) and moments (xx, yy, xy) of regions (6, count); see `moments`."""
     flux = np.bincount(owner, light, count).astype(np.float64)
     whole = np.where(flux > 0.0, flux, np.inf)
     x, y = np.bincount(owner, light * column, count) / whole, np.bincount(owner, light * row, count) / whole

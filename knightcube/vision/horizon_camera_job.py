@@ -253,10 +253,7 @@ def _nadir(
 
 
 def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
-    """Return the reasons, by camera index, why images contradict an accurately known attitude.
-
-    The result is None if the attitude is not accurately known.
-    """
+    """Return, by camera index, why images contradict an accurately known attitude, or None without one."""
     from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
     from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
 
@@ -288,10 +285,7 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
 
 
 def _expected_sun(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the Sun direction (3,), body axes, from a rough attitude.
-
-    Returns None if the rough attitude is too uncertain or the position of the Sun is unknown.
-    """
+    """Return the Sun direction (3,), body axes, from a rough attitude, or None if it is too uncertain."""
     rough = knowledge.attitude
     if rough is None or rough.sigma > LIT_SIGMA or knowledge.sun is None:
         return None

@@ -547,10 +547,7 @@ def calibrate_lens(
 
 
 def _mirrored_back(found: LensCalibration) -> LensCalibration:
-    """Return the calibration of images that show the mirrored sky.
-
-    The argument `found` is the calibration of the same images after each row was reversed.
-    """
+    """Return the calibration of mirrored images from the one `found` after each row was reversed."""
     if found.determined is None:
         return replace(found, mirrored=True)
     determined = found.determined

@@ -321,19 +321,13 @@ def _summed(image: Image, size: int) -> Image:
 
 
 def _squares(length: int, size: int) -> int:
-    """Return the largest number of bins along `length` px that leaves equal margins at both ends.
-
-    Each bin is `size` px wide, where `size` is odd.
-    """
+    """Return the largest number of bins of odd `size` along `length` px with equal margins at both ends."""
     count = length // size
     return count - (length - size * count) % 2
 
 
 def _in_whole_image(found: FrameSolution, size: int, shape: tuple[int, ...]) -> FrameSolution:
-    """Return the solution of a binned image (`_summed`), converted to pixels of the original image.
-
-    The argument `size` is the bin size, px, and `shape` is the shape of the original image.
-    """
+    """Return the solution of an image binned by `size` px, converted to pixels of the original `shape`."""
     rows, columns = shape
     margin = [0.5 * (length - size * _squares(length, size)) for length in (columns, rows)]
     offset = np.array(margin) + 0.5 * (size - 1)

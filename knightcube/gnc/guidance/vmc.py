@@ -214,10 +214,7 @@ class HorizonSearch:
         return program, trial
 
     def _resumed(self, program: PathProgram, warm: FloatArray, asked: float, longest: float) -> Trial | None:
-        """Return the path found by a warm start, or None if the warm start fails.
-
-        If the earlier path reached a limit, the limits are imposed from the start.
-        """
+        """Return the path found by a warm start, with limits at once if `warm` exceeds them, or None."""
         start = program.beside_prey(warm, asked)
         worst = float(np.abs(program.ratios(start)).max())
         if not worst < _START_BELOW:

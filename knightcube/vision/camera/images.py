@@ -139,10 +139,7 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
 
 
 def _grey_of_planes(planes: Image) -> Image:
-    """Return the luminance (rows, columns) of three colour planes (3, rows, columns).
-
-    The luminance has the data type of the planes.
-    """
+    """Return the luminance (rows, columns), in their data type, of colour planes (3, rows, columns)."""
     grey = np.zeros(planes.shape[1:])
     for weight, plane in zip(_LUMINANCE, planes, strict=True):
         grey += weight * plane
@@ -199,10 +196,7 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
 
 
 def _header(content: bytes, name: str, begin: int) -> tuple[dict[str, str], int]:
-    """Return the values of a FITS header by keyword, as text, and the byte offset of the first pixel.
-
-    The byte with the index `begin` is the first byte of the header.
-    """
+    """Return the values of a FITS header at `begin`, by keyword, and the byte offset of the first pixel."""
     header: dict[str, str] = {}
     for place in range(begin, len(content) - CARD + 1, CARD):
         card = content[place : place + CARD].decode("ascii", errors="replace")

@@ -291,10 +291,7 @@ def coarse_nadir(
 def _bright_probability(
     tried: FloatArray, rays: FloatArray, altitude: float, sun: FloatArray | None
 ) -> FloatArray:
-    """Return the probability (d, n) that samples in directions `rays` (n, 3) are bright.
-
-    The probability is computed for each of d trial nadir directions `tried` (d, 3).
-    """
+    """Return the probability (d, n) that samples at `rays` (n, 3) are bright for nadirs `tried` (d, 3)."""
     radius = MEAN_RADIUS + UNIT_DEPTH_HEIGHT
     distance = (MEAN_RADIUS + altitude) / radius
     cosine = tried @ rays.T

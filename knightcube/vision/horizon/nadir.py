@@ -304,10 +304,7 @@ def _by_field(
     settings: HorizonSettings,
     hidden: BoolArray | None,
 ) -> tuple[list[_FieldTrial], FloatArray]:
-    """Return the best horizon of each of k trial focal lengths, and the probabilities (k,) of these lengths.
-
-    A focal length is omitted if its search finds no limb, or a limb that contradicts prior knowledge.
-    """
+    """Return the best permitted horizon of each trial focal length, and the probabilities of the lengths."""
     centre, width = 0.0, 1.0
     trials: list[_FieldTrial] = []
     weights = np.zeros(0)
@@ -346,10 +343,7 @@ def _by_field(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """One horizon search in an image, which read `read` pixels.
-
-    The horizons are in descending order of quality. An unknown altitude is in the range `altitudes`, m.
-    """
+    """One search that read `read` pixels: horizons, best first; unknown altitudes are in `altitudes`, m."""
 
     observation: Observation
     levels: Levels
@@ -595,10 +589,7 @@ class JointNadir:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """A nadir (3,), with its covariance (3, 3), rad^2, in body axes, from the image of one camera.
-
-    The horizon in this image has `edges` edges.
-    """
+    """A nadir (3,), with its covariance (3, 3), rad^2, body axes, from a horizon with `edges` edges."""
 
     camera: int
     nadir: FloatArray
