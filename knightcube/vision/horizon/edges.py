@@ -177,7 +177,7 @@ def find_edges(
         reach = np.maximum(_WINDOW, (_REACH + _TAIL) * edges.scale)
         steps = np.linspace(-1.0, 1.0, 2 * _WINDOW + 1)
         points = edges.points[:, None] + edges.towards[:, None] * (reach[:, None] * steps)[..., None]
-        edges = select(edges, ~_at(hidden, points).any(axis=1))
+        edges = select(edges, np.asarray(~_at(hidden, points).any(axis=1)))
     most = settings.most * settings.lines
     if len(edges) > most:
         edges = select(edges, np.argsort(edges.background, kind="stable")[:most])
