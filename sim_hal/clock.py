@@ -30,21 +30,6 @@ class EmulatedDevice(Protocol):
         """Process all events of the device up to `now_ns` in order, each at its own time."""
 
 
-class SerialEnd(Protocol):
-    """The emulated device's end of a serial line."""
-
-    baud_rate: int
-
-    def write(self, data: bytes, now_ns: int) -> None:
-        """Queue bytes at `now_ns`; they are sent after all bytes that are already queued."""
-
-    def read(self, now_ns: int) -> bytes:
-        """Return unread bytes from the host that have arrived by `now_ns`."""
-
-    def next_arrival_ns(self) -> int:
-        """Return the time at which the next bytes from the host arrive, or NEVER."""
-
-
 class FaultTimeline:
     """A queue of timed fault actions, with the interface of an emulated device."""
 

@@ -34,12 +34,11 @@ from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SerialPort, SpiDevice
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from sim_hal.clock import SerialEnd
 from sim_hal.emulators.coil_circuit import BridgeCircuit, CoilCircuit, CoilCondition, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.emulators.sensors import EmulatedAdis16470, EmulatedIcm20948, EmulatedLis3mdl, Measurements
-from sim_hal.emulators.serial_line import EmulatedSerialLine, PtyLine
+from sim_hal.emulators.serial_line import DeviceEnd, EmulatedSerialLine, PtyLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
 from sim_hal.settings import Simulation
@@ -76,7 +75,7 @@ class EmulatedWires:
         self.spi_devices: dict[str, SpiDevice] = {}
         self._kinds: dict[str, str] = {}
 
-    def connect(self, kind: str, device: str, baud_rate: int) -> SerialEnd:
+    def connect(self, kind: str, device: str, baud_rate: int) -> DeviceEnd:
         """Make a serial line for the device of section `kind`, and return the device's end."""
         if device in self.lines:
             raise ConfigError(f"{kind}.device", f"is {device!r}, which another device uses")
@@ -147,7 +146,7 @@ class Emulation:
     sense: Callable[[int], BodyMotion]
     supply: Callable[[int, int], tuple[float, float]]
 
-    def connect(self, device: str, baud_rate: int) -> SerialEnd:
+    def connect(self, device: str, baud_rate: int) -> DeviceEnd:
         """Make the device's serial line, and return the device's end of the line."""
         return self.wires.connect(self.kind, device, baud_rate)
 

@@ -50,7 +50,8 @@ from knightcube.astro.earth.orientation import (
     north_east_down,
 )
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
-from sim_hal.clock import NEVER, SerialEnd
+from sim_hal.clock import NEVER
+from sim_hal.emulators.serial_line import DeviceEnd
 from sim_hal.worlds.world import OrbitingWorld
 
 NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"
@@ -92,7 +93,7 @@ class EmulatedGps:
     def __init__(
         self,
         world: OrbitingWorld,
-        line: SerialEnd,
+        line: DeviceEnd,
         generator: np.random.Generator,
         errors: GpsErrors,
         now_ns: int = 0,

@@ -1,7 +1,7 @@
 """Emulated serial lines with transmission times and wire faults, in memory or on a pseudo-terminal.
 
 Each direction of a line is a `Wire`. In memory, the host's end is a `hal.interfaces.wires.SerialPort` and the
-device's end is a `sim_hal.clock.SerialEnd`. A line in memory is deterministic for a given random generator. A
+device's end is a `DeviceEnd`. A line in memory is deterministic for a given random generator. A
 `PtyLine` serves any client on a pseudo-terminal in real time at the line's baud rate. The client's baud rate
 is read from the terminal, so a wrong baud rate corrupts the bytes as on a real line.
 """
@@ -158,7 +158,7 @@ class Wire:
 
 
 class DeviceEnd:
-    """The device's end of a line, which implements `sim_hal.clock.SerialEnd`.
+    """The device's end of a line.
 
     Attributes:
         baud_rate: baud rate of the device.
@@ -172,7 +172,7 @@ class DeviceEnd:
         self._host_rate = host_rate
 
     def write(self, data: bytes, now_ns: int) -> None:
-        """Send bytes to the host, beginning at `now_ns`."""
+        """Queue bytes at `now_ns`; they are sent after all bytes that are already queued."""
         self.to_host.push(data, now_ns, self.baud_rate, self._host_rate())
 
     def read(self, now_ns: int) -> bytes:
@@ -190,7 +190,7 @@ class EmulatedSerialLine:
     Attributes:
         to_host, to_device: the wires of the two directions, each with its own faults.
         host: host's end of the line, a SerialPort.
-        device: device's end of the line, a SerialEnd.
+        device: device's end of the line.
     """
 
     def __init__(self, now_ns: Callable[[], int], baud_rate: int, rng: np.random.Generator) -> None:

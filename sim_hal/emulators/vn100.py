@@ -27,7 +27,8 @@ import numpy as np
 from hal.drivers.vn100_protocol import Checksum, OutputLayout, Sentence, build, layout_of, parse
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, from_rotation_vector, multiply, normalise
-from sim_hal.clock import NEVER, SerialEnd
+from sim_hal.clock import NEVER
+from sim_hal.emulators.serial_line import DeviceEnd
 from sim_hal.emulators.vn100_sensors import (
     BINARY_FIELDS,
     IMU_RATE_HZ,
@@ -529,7 +530,7 @@ class Vn100Emulator:
     def __init__(
         self,
         sense: Callable[[int], BodyMotion],
-        line: SerialEnd,
+        line: DeviceEnd,
         rng: np.random.Generator,
         settings: Vn100EmulatorSettings,
         now_ns: int = 0,

@@ -131,20 +131,18 @@ class I2cServer:
             while len(received) >= 4 and len(received) >= 4 + (length := _LENGTH.unpack_from(received)[0]):
                 request = bytes(received[4 : 4 + length])
                 del received[: 4 + length]
-                line.sendall(self._answer(request))
+                try:
+                    given = self._execute(request)
+                    answer = _ANSWER.pack(0, len(given)) + given
+                except OSError as error:
+                    answer = _ANSWER.pack(error.errno or errno.EIO, 0)
+                line.sendall(answer)
         except (ConnectionError, struct.error):
             chunk = b""
         if not chunk:
             self._selector.unregister(line)
             del self._received[line]
             line.close()
-
-    def _answer(self, request: bytes) -> bytes:
-        try:
-            given = self._execute(request)
-        except OSError as error:
-            return _ANSWER.pack(error.errno or errno.EIO, 0)
-        return _ANSWER.pack(0, len(given)) + given
 
     def _execute(self, request: bytes) -> bytes:
         match request[0]:

@@ -681,7 +681,20 @@ def built_craft(
     generator `errors`. Raises ConfigError like `craft_model`.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
-    return built if description is NO_ERRORS else _differing(built, description)
+    if description is NO_ERRORS:
+        return built
+    x, y, z = (np.array(built.inertia) * description.moments).tolist()
+    turn = quaternion.from_rotation_vector(description.axes)
+    columns = []
+    for index, (frame, dipole) in enumerate(zip(built.coil_frames, built.coil_dipole.T, strict=True)):
+        first = 3 * (index // 3)
+        columns.append(frame @ description.coils[:, first : first + 3] @ frame.T @ dipole)
+    return replace(
+        built,
+        inertia=(x, y, z),
+        to_principal=quaternion.multiply(built.to_principal, turn),
+        coil_dipole=np.stack(columns, axis=1),
+    )
 
 
 def craft_model(section: FreeBodySection, config: Config | None = None) -> CraftModel:
@@ -723,44 +736,24 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
     )
 
 
-def _differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
-    """Return the craft after applying the errors of its description."""
-    x, y, z = (np.array(craft.inertia) * errors.moments).tolist()
-    turn = quaternion.from_rotation_vector(errors.axes)
-    columns = []
-    for index, (frame, dipole) in enumerate(zip(craft.coil_frames, craft.coil_dipole.T, strict=True)):
-        first = 3 * (index // 3)
-        columns.append(frame @ errors.coils[:, first : first + 3] @ frame.T @ dipole)
-    return replace(
-        craft,
-        inertia=(x, y, z),
-        to_principal=quaternion.multiply(craft.to_principal, turn),
-        coil_dipole=np.stack(columns, axis=1),
-    )
+def body_inputs(
+    inputs: WorldInputs, world: str
+) -> tuple[
+    FreeBodySection, Callable[[], FloatArray], CoilSupply, int, str, int, DescriptionErrors, CraftModel
+]:
+    """Return the arguments of `FreeBody` from a configuration, with the true properties of the coils.
 
-
-def coil_supply(inputs: WorldInputs) -> CoilSupply:
-    """Return the true resistance and supply voltage of the coils of a configuration."""
-    coils, truth = inputs.config.coils, inputs.section.truth
-    return CoilSupply(truth.resistance or coils.resistance, truth.supply_voltage or coils.supply_voltage)
+    Raises ConfigError, with the name of the world, if the section `simulation.free_body` is missing.
+    """
+    section, coils, truth = inputs.section, inputs.config.coils, inputs.section.truth
+    if section.free_body is None:
+        raise ConfigError("simulation.free_body", f"is missing: {world} needs it")
+    supply = CoilSupply(truth.resistance or coils.resistance, truth.supply_voltage or coils.supply_voltage)
+    description = description_errors(inputs.config, section)
+    craft, times = craft_model(section.free_body, inputs.config), (section.utc, inputs.start_ns)
+    return section.free_body, inputs.currents, supply, section.seed, *times, description, craft
 
 
 def make(inputs: WorldInputs) -> FreeBody:
-    """Return the free body of a configuration.
-
-    Raises ConfigError if the section `simulation.free_body` is missing.
-    """
-    section, currents = inputs.section, inputs.currents
-    if section.free_body is None:
-        raise ConfigError("simulation.free_body", "is missing: the world free_body needs it")
-    supply = coil_supply(inputs)
-    return FreeBody(
-        section.free_body,
-        currents,
-        supply,
-        section.seed,
-        section.utc,
-        inputs.start_ns,
-        description_errors(inputs.config, section),
-        craft_model(section.free_body, inputs.config),
-    )
+    """Return the free body of a configuration. Raises ConfigError like `body_inputs`."""
+    return FreeBody(*body_inputs(inputs, "the world free_body"))

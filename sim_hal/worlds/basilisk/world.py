@@ -21,16 +21,15 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, UNIX_EPOCH
 from sim_hal.clock import NEVER
-from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
+from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
 from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body import (
     KNIGHTCUBE_SUPPLY,
     CoilSupply,
     CraftModel,
+    body_inputs,
     built_craft,
-    coil_supply,
-    craft_model,
     generators,
     released,
 )
@@ -221,12 +220,4 @@ def make(inputs: WorldInputs) -> BasiliskWorld:
 
     Raises ConfigError if the section `simulation.free_body` or Basilisk is missing.
     """
-    section, currents = inputs.section, inputs.currents
-    if section.free_body is None:
-        raise ConfigError("simulation.free_body", "is missing: this world needs it")
-    supply = coil_supply(inputs)
-    body, description = section.free_body, description_errors(inputs.config, section)
-    craft = craft_model(body, inputs.config)
-    return BasiliskWorld(
-        body, currents, supply, section.seed, section.utc, inputs.start_ns, description, craft
-    )
+    return BasiliskWorld(*body_inputs(inputs, "this world"))
