@@ -320,12 +320,14 @@ def test_trailed_stars_are_measured_at_mid_exposure() -> None:
     assert np.median(claims) < 0.03
 
 
-SKY = Path(__file__).parents[5].parent / "shared" / "data" / "sky"
+SKY = Path(__file__).parents[4].parent / "shared" / "data" / "sky"
 _TOLERANCE = 0.007
 """Tolerance, as a fraction of the frame's width. The lens distortion is not corrected."""
 _AMONG = 80
 
-pytestmark = pytest.mark.skipif(not SKY.is_dir(), reason="the photographs of ../shared/data/sky are missing")
+needs_photographs = pytest.mark.skipif(
+    not SKY.is_dir(), reason="the photographs of ../shared/data/sky are missing"
+)
 
 
 def catalogue_places(truth: dict[str, float], shape: tuple[int, ...]) -> FloatArray:
@@ -343,6 +345,7 @@ def catalogue_places(truth: dict[str, float], shape: tuple[int, ...]) -> FloatAr
     return places[pinhole.contains(places)][:_AMONG]
 
 
+@needs_photographs
 @pytest.mark.parametrize(
     "name",
     [
@@ -365,6 +368,7 @@ def test_nearly_all_of_the_twenty_brightest_detections_are_bright_catalogue_star
     assert survey(pixels).shape.kind is FrameKind.POINTS
 
 
+@needs_photographs
 def test_leaves_are_not_among_the_stars() -> None:
     """Leaves of a tree, in the upper right corner of the image, are not detected as stars."""
     found = detect(read_image(SKY / "tree.jpg")).stars()
@@ -374,6 +378,7 @@ def test_leaves_are_not_among_the_stars() -> None:
     assert survey(read_image(SKY / "tree.jpg")).shape.kind is not FrameKind.STREAKS
 
 
+@needs_photographs
 def test_a_noisy_raw_frame_gives_few_false_stars_and_a_dark_one_too() -> None:
     for name in ("may8_50ms_gain40_0.png", "may8_100ms_gain12_3.png"):
         assert 5 <= len(detect(read_image(SKY / name)).stars()) <= 60
