@@ -183,7 +183,7 @@ def check_single(path: Path) -> None:
 
 def main(words: list[str]) -> int:
     """Make the drop-ins for the configuration file in the arguments, and return the exit status."""
-    from flight.app.cli.check import check_values  # noqa: PLC0415 - open_bundle.py does not need the flight,
+    from flight.app.cli.run import check_values  # noqa: PLC0415 - open_bundle.py does not need the flight,
     from flight.app.flight import placing  # noqa: PLC0415 - which is slow to load
 
     path, folder = Path(words[0]), Path(words[1]) if words[1:] else None

@@ -92,7 +92,7 @@ def _text(path: Path, largest: int) -> str:
 
 
 def record(line: str) -> str:
-    """Return a line and its CRC-32, in the format of flight/link/regular_files.py."""
+    """Return a line and its CRC-32, in the format of flight/link/files/store.py."""
     crc = zlib.crc32(f"{line}\n".encode())
     return f"{line}\n{crc:08x}\n"
 

@@ -25,8 +25,7 @@ from flight.link.commands import POINT
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
 from flight.link.process.directives import NEW_KEY, PORTION
-from flight.link.telemetry.definitions import STAGES
-from flight.link.telemetry.fields import NO_YES, Field
+from flight.link.telemetry.definitions import NO_YES, STAGES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 from knightcube.gnc.guidance.pointing_target import (
     ARGUMENTS,

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 import numpy as np
 
+from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import Camera, UnitCalibration, WideCamera, driver_of
 from flight.schema.devices import camera_model as lens_of
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.schema.orbit import OrbitConfig
+from flight.schema.bodies import OrbitConfig
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.inertia import principal_axes

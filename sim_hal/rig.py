@@ -23,11 +23,10 @@ import numpy as np
 
 from flight.link.telemetry.log import FlightLog
 from flight.schema import reader as configuration
+from flight.schema.bodies import OrbitConfig, TestbedConfig
 from flight.schema.devices import coil_fields, driver_of
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
-from flight.schema.testbed import TestbedConfig
 from hal.buses.linux_wires import PySerialPort, device_file, lock_bus
 from hal.buses.system import SystemClock
 from hal.interfaces.devices import Frame, FrameSource

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.schema.devices import Battery, Winding
-from flight.schema.values import Inertia, NotNegative, Positive, Quaternion, Section
+from flight.schema.document import Inertia, NotNegative, Positive, Quaternion, Section
 from hal.interfaces.devices import MOST_COILS
 
 Vector = tuple[float, float, float]

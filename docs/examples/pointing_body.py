@@ -30,7 +30,7 @@ from flight.bodies.testbed.body import (
 )
 from flight.bodies.testbed.control import plant_of
 from flight.link import events
-from flight.link.modes import ORBITAL, Mode
+from flight.link.events import ORBITAL, Mode
 from flight.loop.body import (
     COMMANDED,
     KEPT,
@@ -44,8 +44,8 @@ from flight.loop.body import (
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services
 from flight.loop.state import Learned
+from flight.schema.bodies import TestbedConfig, as_testbed
 from flight.schema.sections import Config
-from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector

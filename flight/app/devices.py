@@ -18,6 +18,7 @@ import numpy as np
 
 from flight.app.run import RunRequest
 from flight.loop.state import state_folder
+from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import (
     SENSOR_PARTS,
     AravisDevice,
@@ -37,7 +38,6 @@ from flight.schema.devices import (
     fitted_devices,
 )
 from flight.schema.document import ConfigError, imported
-from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.linux_wires import LinuxWires, device_file
 from hal.buses.system import SystemClock

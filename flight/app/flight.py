@@ -47,14 +47,12 @@ from flight.app.service import (
 from flight.link import events
 from flight.link.commands import Channel, open_udp, open_unix
 from flight.link.telemetry.log import FlightLog, Recorder
-from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, BodyKind, FlightBody, Planner
 from flight.loop.commanding import CommandTask, OnboardParameters
-from flight.loop.control_cycle import LoopTasks
-from flight.loop.executive import JobResult, JobRunner, LockStepRunner, Worker
+from flight.loop.executive import JobResult, JobRunner, LockStepRunner, ProcessRunner, Worker
 from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams, streams_of
-from flight.loop.flight_loop import FlightLoop, FlightProgress, RunLabel, Supervisors, nothing
+from flight.loop.flight_loop import FlightLoop, FlightProgress, LoopTasks, RunLabel, Supervisors, nothing
 from flight.loop.health import (
     Board,
     BusyPeriods,
@@ -66,13 +64,19 @@ from flight.loop.health import (
     ShedLevel,
     WorkerWatch,
 )
-from flight.loop.horizon_cameras import HorizonCameraSettings, HorizonCameraTask
 from flight.loop.imaging import Imaging, ImagingSettings, ObjectTracks
 from flight.loop.modes import ModeControl, ModeSettings
-from flight.loop.navigation import Navigation, NavigationSettings, Positioning, SunSensing
+from flight.loop.navigation import (
+    HORIZON_WORKER,
+    HorizonCameraSettings,
+    HorizonCameraTask,
+    Navigation,
+    NavigationSettings,
+    Positioning,
+    SunSensing,
+)
 from flight.loop.state import Learned, StateKeeper, open_state, service_folder, state_folder
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
-from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
 from flight.schema.document import ConfigError, imported, merged_text, read_text
@@ -461,7 +465,7 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     if config.camera is not None:
         made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
     if config.wide_cameras:
-        made.append(Worker(horizon_task.WORKER, horizon_camera_job.run, vision_latency_ns, vision_timeout_ns))
+        made.append(Worker(HORIZON_WORKER, horizon_camera_job.run, vision_latency_ns, vision_timeout_ns))
     return made
 
 
@@ -538,7 +542,7 @@ def _tasks(
     if imaging is not None:
         busy.append((imaging_task.WORKER, imaging.busy_since_ns, config.executive.vision_timeout))
     if horizon_cameras is not None:
-        busy.append((horizon_task.WORKER, horizon_cameras.busy_since_ns, config.executive.vision_timeout))
+        busy.append((HORIZON_WORKER, horizon_cameras.busy_since_ns, config.executive.vision_timeout))
     watches = [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]
     health = HealthWatch(modes, drive, devices.power, watches, config.health, opened.feed, services)
     housekeeping = Housekeeping(

@@ -58,7 +58,7 @@ from flight.app.devices import corrupted_text
 from flight.app.run import RunRequest
 from flight.link import events
 from flight.link.events import EventKind
-from flight.link.regular_files import line_of, read_regular, to_record
+from flight.link.files.store import line_of, read_regular, to_record
 from flight.link.telemetry.log import Recorder
 from flight.loop.facts import EventLog
 from flight.loop.state import LARGEST_FILE, LinuxFiles, replace_file, service_folder

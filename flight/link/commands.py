@@ -28,10 +28,9 @@ from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from flight.link.modes import COMMANDABLE, Mode
-from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS
+from flight.link.events import COMMANDABLE, Mode
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
-from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     Layout,

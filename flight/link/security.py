@@ -46,8 +46,8 @@ from pathlib import Path
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
+from flight.link.files.store import locked, overwrite, read_regular
 from flight.link.frames import FrameError
-from flight.link.regular_files import locked, overwrite, read_regular
 from flight.link.telemetry.packets import crc16
 from knightcube.errors import FlightError, UsageError
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.loop.coil_monitor import CoilMonitor
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services

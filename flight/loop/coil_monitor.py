@@ -409,10 +409,7 @@ class CoilMonitor:
         self._settings = settings
         self.tumble_rate = settings.tumble_rate
         self._bounds = Bounds(
-            settings.full_current,
-            settings.current_uncertainty,
-            settings.gain_error,
-            settings.monitor_noise,
+            settings.full_current, settings.current_uncertainty, settings.gain_error, settings.monitor_noise
         )
         self._commands = CoilCommands(2 * settings.window_ns)
         self._reading_ns = -(1 << 62)

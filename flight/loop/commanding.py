@@ -35,13 +35,8 @@ from flight.link.commands import (
     problem_of,
     unpack,
 )
-from flight.link.modes import Mode
-from flight.link.telemetry.definitions import (
-    COMMAND,
-    PARAMETER_FIELDS,
-    PARAMETER_KEYS,
-    PARAMETERS,
-)
+from flight.link.events import Mode
+from flight.link.telemetry.definitions import COMMAND, PARAMETER_FIELDS, PARAMETER_KEYS, PARAMETERS
 from flight.link.telemetry.packets import Packer
 from flight.loop.executive import Cycle
 from flight.loop.facts import Services

@@ -12,18 +12,28 @@ task is reported, and the loop continues.
 The control thread submits a job and later collects its result; it never waits for a job. In a lock-step
 simulation, `LockStepRunner` runs a job at once when it is submitted, and delivers its result after the
 modelled latency in simulated time, so that the result of a flight does not depend on the speed of the
-machine. In a real-time flight, `flight.loop.worker_processes.ProcessRunner` runs jobs in separate processes.
+machine. In a real-time flight, `flight.loop.executive.ProcessRunner` runs jobs in separate processes.
 """
 
 from __future__ import annotations
 
+import mmap
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, Protocol
 
-from hal.interfaces.wires import Clock
+from flight.loop.worker import LONGEST_BYTES, SLAB_BYTES, message_length, pack_trusted, unpack_values
+from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 Outcome = Literal["done", "failed", "timed-out", "died"]
@@ -284,3 +294,348 @@ class CyclicExecutive:
         execution_ns = self._stopwatch() - begun
         group.account(execution_ns, completed)
         self._observer.ran(group, cycle, execution_ns)
+
+
+BUDGET = 10
+"""Number of consecutive unexpected exits of a worker after which restarts pause.
+
+The delays of the restarts before the pause add up to 127.5 s.
+"""
+FIRST_NS = SECOND_NS // 2
+STEADY_NS = 60 * SECOND_NS
+"""Running time (ns) after which a worker's budget of restarts is reset."""
+REST_NS = 600 * SECOND_NS
+
+
+class Attempts:
+    """Counts the unexpected exits of a worker since it last ran for more than a minute."""
+
+    def __init__(self) -> None:
+        self.deaths = 0
+
+    def died(self, lived_ns: int) -> int:
+        """Count an unexpected exit after `lived_ns` of running, and return the delay (ns) of the restart."""
+        if lived_ns >= STEADY_NS or self.is_spent:
+            self.deaths = 0
+        self.deaths += 1
+        if self.is_spent:
+            return REST_NS
+        return 0 if self.deaths == 1 else FIRST_NS << (self.deaths - 2)
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether the budget of restarts is used up; if so, restarts pause."""
+        return self.deaths >= BUDGET
+
+
+JobAnswer = tuple[Outcome, Any, str, int]
+"""A worker's answer: outcome, value, error, and execution time (ns) of the job."""
+
+MODULE = "flight.loop.worker"
+"""Name of the module that a worker process runs."""
+
+_REAPED_WITHIN_S = 1.0
+
+
+class WorkerProcess:
+    """A running worker process. Only one thread may use this object.
+
+    The attribute `ready` states whether the worker has imported its function.
+    """
+
+    def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
+        """Start the process on the given cores; an empty set permits all cores. Raises OSError."""
+        self._name = worker.name
+        self._received = bytearray()
+        self.ready = False
+        memory = os.memfd_create(f"knightcube-{worker.name}")
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            os.ftruncate(memory, SLAB_BYTES)
+            self._slab = mmap.mmap(memory, SLAB_BYTES)
+            ours.setblocking(False)
+            ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+            self._process = self._start(worker, theirs.fileno(), memory, cores)
+        except OSError:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+            os.close(memory)
+        self._socket = ours
+
+    @staticmethod
+    def _start(worker: Worker, line: int, memory: int, cores: Set[int]) -> subprocess.Popen[bytes]:
+        function = f"{worker.function.__module__}:{worker.function.__qualname__}"
+        words = [function, str(line), str(memory), str(os.getpid()), ",".join(map(str, sorted(cores)))]
+        return subprocess.Popen(
+            # With -I, as in a service, modules are not imported from the working folder or the environment.
+            [sys.executable, *(["-I"] if sys.flags.isolated else []), "-m", MODULE, *words],
+            pass_fds=(line, memory),
+            stdin=subprocess.DEVNULL,
+            # A separate process group protects the worker from Ctrl-C; the control process ends its worker.
+            # The group stays in the session of the control process. If the control process dies while a
+            # worker is stopped, the group is orphaned. The kernel then sends SIGHUP and SIGCONT to the group,
+            # which ends the stopped worker.
+            process_group=0,
+        )
+
+    @property
+    def process_id(self) -> int:
+        """The process identifier."""
+        return self._process.pid
+
+    def is_stopped(self) -> bool:
+        """Return whether a signal such as SIGSTOP has stopped the process, even during its start."""
+        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # with WNOWAIT, the process can still be reaped
+        with suppress(ChildProcessError):  # reaped already
+            return os.waitid(os.P_PID, self._process.pid, look) is not None
+        return False
+
+    def fileno(self) -> int:
+        """Return the descriptor of the socket, on which an answer can be awaited."""
+        return self._socket.fileno()
+
+    def send(self, argument: Any) -> None:
+        """Submit a job. Raises FlightError if it cannot be sent, and EOFError if the process has ended."""
+        message = pack_trusted(argument, self._slab)
+        if len(message) > LONGEST_BYTES:
+            raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
+        try:
+            sent = self._socket.send(message)
+        except ConnectionError as error:
+            raise EOFError(self._name) from error
+        if sent != len(message):
+            raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
+
+    def receive(self) -> JobAnswer | None:
+        """Return an answer that has arrived, or None.
+
+        Raises EOFError if the process has ended, and FlightError for a damaged message.
+        """
+        try:
+            while chunk := self._socket.recv(1 << 16):
+                self._received += chunk
+            raise EOFError(self._name)
+        except BlockingIOError:
+            pass
+        except ConnectionError as error:
+            raise EOFError(self._name) from error
+        while (length := message_length(self._received)) is not None and len(self._received) >= length:
+            message = bytes(self._received[:length])
+            del self._received[:length]
+            match unpack_values(message, self._slab):
+                case None:
+                    self.ready = True
+                case ("done" | "failed" as outcome, value, str(text), int(execution_ns)):
+                    return outcome, value, text, execution_ns
+                case _:
+                    raise FlightError("the answer does not belong to a job")
+        return None
+
+    def end(self) -> str:
+        """Kill the process, reap it and release its memory; return how the process ended."""
+        status = self._process.poll()
+        if status is None:
+            with suppress(subprocess.TimeoutExpired):  # the process may still be writing while it ends
+                status = self._process.wait(0.05)
+        self._process.kill()
+        with suppress(
+            subprocess.TimeoutExpired
+        ):  # a process that hangs in the kernel is reaped at a later start
+            self._process.wait(_REAPED_WITHIN_S)
+        self._socket.close()
+        self._slab.close()
+        if status is None:
+            return "killed"
+        return f"signal {-status}" if status < 0 else f"status {status}"
+
+
+START_LIMIT_NS = 60 * SECOND_NS
+"""Longest time (ns) in which a worker must import its function; otherwise it is restarted."""
+_IDLE_MS = 1000.0
+_CLOSE_S = 5.0
+
+
+class _Kept:
+    """A worker that the supervising thread keeps running, and its present job."""
+
+    def __init__(self, worker: Worker, clock: Clock, cores: Set[int]) -> None:
+        self.worker = worker
+        self.process: WorkerProcess | None = None
+        self.inbox: deque[tuple[Any, int]] = deque()
+        self.accepts = True
+        self.submitted_ns = -1
+        self._clock, self._cores = clock, cores
+        self._attempts = Attempts()
+        self._due_ns = self._begun_ns = clock.now_ns()
+        self._deaths = 0
+
+    def due_ns(self) -> int:
+        """Return the time (ns) of the worker's next timeout or restart.
+
+        Returns -1 if no timeout or restart is pending.
+        """
+        if self.process is None:
+            return self._due_ns
+        dues = [self.submitted_ns + self.worker.timeout_ns] if self.submitted_ns >= 0 else []
+        return min([*dues, *([] if self.process.ready else [self._begun_ns + START_LIMIT_NS])], default=-1)
+
+    def serve(self) -> tuple[list[JobResult], list[WorkerNews]]:
+        """Start, reap or communicate with the worker process, and return job results and state changes."""
+        now_ns = self._clock.now_ns()
+        try:
+            if self.process is None:
+                if now_ns < self._due_ns:
+                    # The job was accepted while the process was ending.
+                    return self._lose("died", "the worker is not running", now_ns), []
+                self._begun_ns = now_ns
+                self.process = WorkerProcess(self.worker, self._cores)
+            return self._talk(self.process, now_ns)
+        except EOFError:
+            return self._bury("died", "the worker's process ended", now_ns)
+        except TimeoutError as error:
+            return self._bury("timed-out", str(error), now_ns)
+        except Exception as error:  # noqa: BLE001 - containment boundary: the worker runner
+            return self._bury("died", f"{type(error).__name__}: {error}", now_ns)
+
+    def _talk(self, process: WorkerProcess, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
+        news, results = [], []
+        was_ready = process.ready
+        answer = process.receive()
+        if process.ready and not was_ready:
+            self.accepts = True
+            if self._deaths:
+                news.append(WorkerNews(self.worker.name, WorkerChange.READY, "runs again"))
+        if answer is not None and self.submitted_ns >= 0:
+            results.append(JobResult(self.worker.name, *answer[:3], self.submitted_ns, now_ns, answer[3]))
+            self.submitted_ns = -1
+        if self.inbox:
+            argument, submitted_ns = self.inbox.popleft()
+            self.submitted_ns = submitted_ns
+            try:
+                process.send(argument)
+            except (EOFError, OSError):
+                raise
+            except Exception as error:  # noqa: BLE001 - containment boundary: the worker runner
+                results += self._lose("failed", f"{type(error).__name__}: {error}", now_ns)
+        self._check(process, now_ns)
+        return results, news
+
+    def _check(self, process: WorkerProcess, now_ns: int) -> None:
+        """Raise TimeoutError for a worker that is stopped, late with its job, or late with its start."""
+        if process.is_stopped():
+            raise TimeoutError("stopped by a signal")
+        if self.submitted_ns >= 0 and now_ns - self.submitted_ns > self.worker.timeout_ns:
+            raise TimeoutError(f"no result within {self.worker.timeout_ns * 1e-9:g} s")
+        if not process.ready and now_ns - self._begun_ns > START_LIMIT_NS:
+            raise TimeoutError(f"not ready within {START_LIMIT_NS * 1e-9:g} s")
+
+    def _bury(self, outcome: Outcome, text: str, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
+        """Reap a failed process, and set the time of the next start."""
+        self.accepts = False
+        process, self.process = self.process, None
+        if process is not None:
+            ended = process.end()
+            text = f"{text}, {ended}" if outcome == "died" else text
+        results = self._lose(outcome, text, now_ns)
+        self._deaths += 1
+        wait_ns = self._attempts.died(now_ns - self._begun_ns)
+        self._due_ns = self._clock.now_ns() + wait_ns
+        news = [WorkerNews(self.worker.name, WorkerChange.DIED, f"{text}; starts in {wait_ns * 1e-9:g} s")]
+        if self._attempts.is_spent:
+            spent = f"died {self._attempts.deaths} times in a row; not restarted for {REST_NS * 1e-9:g} s"
+            news.append(WorkerNews(self.worker.name, WorkerChange.SPENT, spent))
+        return results, news
+
+    def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
+        """Return failed results for all lost jobs: the running job and the waiting jobs."""
+        lost = [self.submitted_ns] if self.submitted_ns >= 0 else []
+        while self.inbox:
+            lost.append(self.inbox.popleft()[1])
+        self.submitted_ns = -1
+        return [JobResult(self.worker.name, outcome, None, text, t, now_ns, now_ns - t) for t in lost]
+
+
+class ProcessRunner:
+    """A JobRunner whose workers are processes. Only the control thread may call the methods of this class."""
+
+    borrowed_ns = 0
+
+    def __init__(self, clock: Clock, workers: Sequence[Worker], cores: Set[int] = frozenset()) -> None:
+        """Start the workers on the given cores; an empty set permits all cores."""
+        self._clock = clock
+        self._kept = {worker.name: _Kept(worker, clock, cores) for worker in workers}
+        self._busy: set[str] = set()
+        self._results: deque[JobResult] = deque()
+        self._news: deque[WorkerNews] = deque()
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._supervise, name="workers", daemon=True)
+        self._thread.start()
+
+    def submit(self, worker: str, argument: Any) -> bool:
+        """Submit a job, and return False if the worker is busy or not yet ready after a restart."""
+        kept = self._kept[worker]
+        if worker in self._busy or not kept.accepts:
+            return False
+        self._busy.add(worker)
+        kept.inbox.append((argument, self._clock.now_ns()))
+        os.eventfd_write(self._bell, 1)
+        return True
+
+    def collect(self) -> list[JobResult]:
+        """Return the results that have arrived since the last call. Never waits."""
+        results = []
+        while self._results:
+            results.append(self._results.popleft())
+            self._busy.discard(results[-1].worker)
+        return results
+
+    def news(self) -> list[WorkerNews]:
+        """Return the unexpected exits and restarts of workers since the last call. Never waits."""
+        return [self._news.popleft() for _ in range(len(self._news))]
+
+    def close(self) -> None:
+        """Kill the workers. Safe to call twice."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        os.eventfd_write(self._bell, 1)
+        self._thread.join(_CLOSE_S)
+        if not self._thread.is_alive():
+            os.close(self._bell)
+
+    def process_identifiers(self) -> dict[str, int]:
+        """Return the process identifier of each running worker."""
+        running = [(name, kept.process) for name, kept in self._kept.items()]
+        return {name: process.process_id for name, process in running if process is not None}
+
+    def _supervise(self) -> None:
+        """Serve the workers until `close` is called.
+
+        The kernel kills the workers when the thread that started them ends.
+        """
+        while not self._closing.is_set():
+            for kept in self._kept.values():
+                results, news = kept.serve()
+                self._news.extend(news)
+                self._results.extend(results)
+            self._wait()
+        for kept in self._kept.values():
+            if kept.process is not None:
+                kept.process.end()
+
+    def _wait(self) -> None:
+        """Wait for a job, an answer, or the next time at which a worker is due."""
+        poll = select.poll()
+        poll.register(self._bell, select.POLLIN)
+        for kept in self._kept.values():
+            if kept.process is not None:
+                poll.register(kept.process, select.POLLIN)
+        now_ns = self._clock.now_ns()
+        dues = [due_ns for kept in self._kept.values() if (due_ns := kept.due_ns()) >= 0]
+        wait_ms = min([_IDLE_MS, *(1e-6 * (due_ns - now_ns) + 1.0 for due_ns in dues)])
+        poll.poll(max(wait_ms, 0.0))
+        with suppress(BlockingIOError):
+            os.eventfd_read(self._bell)

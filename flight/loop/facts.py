@@ -23,8 +23,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from flight.link import events
-from flight.link.events import EVENTS, EventKind, Reaction
-from flight.link.modes import STEERING, Mode
+from flight.link.events import EVENTS, STEERING, EventKind, Mode, Reaction
 from flight.link.telemetry.log import Recorder
 from flight.loop.executive import JobRunner
 from flight.schema.sections import CONTROL_RATE_HZ, Config
@@ -158,14 +157,7 @@ WIDE_FALSE = Fact("wide-false", events.WIDE_FALSE, events.WIDE_TRUSTED, after=3)
 COIL_4_BROKEN, COIL_5_BROKEN, COIL_6_BROKEN = (
     Fact(f"coil-{name}-broken", events.COIL_BROKEN, latching=True) for name in COIL_NAMES[3:]
 )
-COILS_BROKEN = (
-    COIL_X_BROKEN,
-    COIL_Y_BROKEN,
-    COIL_Z_BROKEN,
-    COIL_4_BROKEN,
-    COIL_5_BROKEN,
-    COIL_6_BROKEN,
-)
+COILS_BROKEN = (COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, COIL_4_BROKEN, COIL_5_BROKEN, COIL_6_BROKEN)
 """Conditions that are active while a coil is diagnosed as broken, in the order of the coils."""
 FIELD_EXTRAPOLATED = Fact("field-extrapolated", events.FIELD_EXTRAPOLATED)
 GYRO_LOST = Fact("gyro-lost", events.GYRO_LOST, events.GYRO_RECOVERED, after=4, mended_after=4)

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from flight.link import events
-from flight.link.events import EventKind, Reaction
-from flight.link.modes import ORBITAL, POINTING, STEERING, Mode
+from flight.link.events import ORBITAL, POINTING, STEERING, EventKind, Mode, Reaction
 from flight.link.telemetry.definitions import MODE
 from flight.loop import facts
 from flight.loop.body import BodyTargets, FlightBody, Target

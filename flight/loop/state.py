@@ -47,7 +47,7 @@ from msgspec import Meta
 
 from flight.link import events
 from flight.link.events import EventKind
-from flight.link.regular_files import line_of, make_lasting, read_regular, to_record
+from flight.link.files.store import line_of, make_lasting, read_regular, to_record
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock
@@ -672,11 +672,7 @@ def service_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def open_state(
-    config: Config,
-    environment: Mapping[str, str],
-    clock: Clock,
-    stack: ExitStack,
-    runs: Sequence[Path] = (),
+    config: Config, environment: Mapping[str, str], clock: Clock, stack: ExitStack, runs: Sequence[Path] = ()
 ) -> StateKeeper | None:
     """Open the stored state and count this boot, or return None if no state is stored.
 

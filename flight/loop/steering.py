@@ -266,10 +266,7 @@ class Steering:
             self._drive.send(wanted.currents, lambda: field(estimate), testable=True)
             adrift = not following and control.paths.is_adrift(now_ns)
         self._facts.update(
-            facts.HOLDING,
-            adrift,
-            now_ns,
-            "no newer path: holding the attitude at the end of the last path",
+            facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last path"
         )
         return self._steered(state, now_ns, reference, dipole, saturated)
 

@@ -21,12 +21,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from flight.schema.document import ConfigError, Document, imported
-from flight.schema.values import (
+from flight.schema.document import (
     Address,
     BaudRate,
     Bus,
     Channel,
+    ConfigError,
+    Document,
     DriverName,
     Estimator,
     NotNegative,
@@ -37,6 +38,7 @@ from flight.schema.values import (
     Sign,
     SignedAxis,
     Vector,
+    imported,
 )
 from hal.interfaces.wires import Rig
 from knightcube.astro.arrays import BoolArray, FloatArray
@@ -296,10 +298,7 @@ def coil_fields(config: Any) -> FloatArray | None:
         strength, area = (
             (coil.strength(), coil.area)
             if plant is None
-            else (
-                plant.coil_turns * plant.coil_area,
-                plant.coil_area,
-            )
+            else (plant.coil_turns * plant.coil_area, plant.coil_area)
         )
         fields.append(coil_field(strength * coil.direction(), -np.array(coil.position), area))
     return np.array(fields)
@@ -732,12 +731,7 @@ def _ours(kind: str, section: type[Any], name: str, **more: Any) -> Driver:
     return Driver(kind, section, emulate=emulate, **functions, **more)
 
 
-VN100 = _ours(
-    "inertial_unit",
-    InertialUnitSection,
-    "vn100",
-    check=later("flight.app.devices:unit_settings"),
-)
+VN100 = _ours("inertial_unit", InertialUnitSection, "vn100", check=later("flight.app.devices:unit_settings"))
 SENSORS = _ours("inertial_unit", SensorsSection, "sensors")
 MAGNETOMETER = _ours("magnetometer", MagnetometerSection, "sensors")
 PCA9685 = _ours(

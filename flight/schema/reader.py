@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from flight.schema.bodies import Craft, ExclusionCones, OrbitConfig, TestbedConfig, as_testbed
 from flight.schema.devices import (
     AravisDevice,
     Camera,
@@ -29,11 +30,17 @@ from flight.schema.devices import (
     structure_mask,
     with_drivers,
 )
-from flight.schema.document import ConfigError, Document, convert, read_document, read_text
-from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
+from flight.schema.document import (
+    ConfigError,
+    Document,
+    Quaternion,
+    Vector,
+    check_aim,
+    convert,
+    read_document,
+    read_text,
+)
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
-from flight.schema.testbed import TestbedConfig, as_testbed
-from flight.schema.values import Quaternion, Vector, check_aim
 from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError

@@ -23,7 +23,7 @@ from flight.schema.devices import (
     SolarStringsSection,
     WideCamera,
 )
-from flight.schema.values import (
+from flight.schema.document import (
     Q2,
     Aim,
     CallSign,

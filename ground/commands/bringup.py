@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.cli.check import check_values
+from flight.app.cli.run import check_values
 from flight.app.devices import emulated_bench, linux_rig, real_rig
 from flight.app.run import RunRequest
 from flight.app.service import requested_config, start_guardian

@@ -19,6 +19,7 @@ from typing import Any
 from flight.app.cli.run import progress_on, seed_number
 from flight.app.run import RunRequest
 from flight.schema import reader as configuration
+from flight.schema.bodies import OrbitConfig, TestbedConfig
 from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig
 from flight.schema.testbed import TestbedConfig

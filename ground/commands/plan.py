@@ -14,6 +14,7 @@ import numpy as np
 
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
+from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive, print_result, utc

@@ -33,6 +33,8 @@ from flight.link.telemetry.definitions import (
     PARAMETER_KEYS,
     PARAMETERS,
     VERIFICATION,
+    Field,
+    Packet,
 )
 from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS

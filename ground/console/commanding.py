@@ -29,8 +29,7 @@ from flight.link.process.directives import KINDS, LIST, SCHEDULE, ListFiles, Sen
 from flight.link.process.downlink import LIVE
 from flight.link.process.filing import LISTING
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
-from flight.link.telemetry.definitions import VERIFICATION
-from flight.link.telemetry.fields import Field
+from flight.link.telemetry.definitions import VERIFICATION, Field
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Layout, Packer, PacketArray, TelemetryError
 from flight.schema.document import merged_text, read_text

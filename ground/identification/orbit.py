@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from flight.bodies.orbit.body import filter_settings
+from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import Camera, camera_model
-from flight.schema.orbit import OrbitConfig
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.inertia import inertia_problem

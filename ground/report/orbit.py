@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.link import events
-from flight.link.modes import POINTING, Mode
+from flight.link.events import POINTING, Mode
 from flight.link.telemetry.packets import PacketArray
 from flight.schema.devices import FAST, Camera
 from flight.schema.orbit import OrbitConfig

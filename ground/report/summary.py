@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import SHED
 from flight.link.telemetry.packets import PacketArray
 from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
+from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.identification.orbit import learned_lens
 from ground.report import signals
 from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements, star_camera

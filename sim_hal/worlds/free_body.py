@@ -29,10 +29,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig
+from flight.schema.bodies import OrbitConfig
+from flight.schema.document import ConfigError, inertia_matrix
 from flight.schema.sections import Config
-from flight.schema.values import inertia_matrix
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray

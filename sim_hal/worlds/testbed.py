@@ -20,9 +20,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flight.schema.bodies import OrbitConfig, TestbedConfig, as_testbed
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig
-from flight.schema.testbed import TestbedConfig, as_testbed
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
 from sim_hal.settings import CageTruth, Disturbances, Simulation

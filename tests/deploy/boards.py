@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flight import __version__
-from flight.link.regular_files import to_record
+from flight.link.files.store import to_record
 from tests.deploy.scripts import DEPLOY, ROOT, TESTBED
 
 FIRST, SECOND = f"{__version__}+1", f"{__version__}+2"

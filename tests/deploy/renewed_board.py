@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 from unittest.mock import patch
 
-from flight.link.process.renewal import decoded, encoded
+from flight.link.process.filing import decoded, encoded
 from ground.commands.renewal import artefact, make_signing_keys, sign
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import ROOT, changed_testbed, script

@@ -8,7 +8,7 @@ from pathlib import Path
 from flight.app.flight import fly
 from flight.app.run import RunRequest
 from flight.app.service import FlownConfig, accepted_config
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.process.directives import Activate, Listing
 from flight.schema.reader import parse
 from ground.link.commanding import sha256_of

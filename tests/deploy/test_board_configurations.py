@@ -10,7 +10,7 @@ import yaml
 
 from flight.app.cli import main
 from flight.schema import reader
-from flight.schema.orbit import OrbitConfig
+from flight.schema.bodies import OrbitConfig
 from tests.deploy.scripts import DEPLOY, ROOT, board_dropin, dropin
 
 TESTBED, ORBIT = (ROOT / "config" / f"board_{name}.yaml" for name in ("testbed", "orbit"))

@@ -12,7 +12,7 @@ import pytest
 
 from flight import __version__
 from flight.app.service import NAME, NOTE, TRIALS, FlownRelease
-from flight.link.regular_files import line_of, to_record
+from flight.link.files.store import line_of, to_record
 from tests.deploy.boards import FIRST, SECOND, FakeBoard
 from tests.deploy.scripts import script
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.process.renewal import decoded, encoded
+from flight.link.process.filing import decoded, encoded
 from ground.commands.renewal import replace_signing_key
 from tests.deploy.boards import FIRST
 from tests.deploy.renewed_board import RenewedBoard

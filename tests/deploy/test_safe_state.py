@@ -14,7 +14,7 @@ import pytest
 
 from flight.link.commands import LAYOUTS as COMMANDS
 from flight.link.commands import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from ground.link.commanding import exchange

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.schema.orbit import as_orbit
+from flight.schema.bodies import as_orbit
 from flight.schema.reader import load, parse
 from tests.docs.blocks import blocks
 from tests.ground.commands.in_process import command

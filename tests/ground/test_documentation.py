@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from flight.link.telemetry.definitions import HEALTH
-from flight.link.telemetry.fields import Field, Limits, Packet
+from flight.link.telemetry.definitions import HEALTH, Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
 from ground import documentation
 from tests.flight.link.telemetry.samples import plain_contents

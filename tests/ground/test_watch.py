@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import ATTITUDE, EVENT, FACTS, HEALTH, LINK, MODE, PACKETS
-from flight.link.telemetry.fields import Packet
+from flight.link.telemetry.definitions import ATTITUDE, EVENT, FACTS, HEALTH, LINK, MODE, PACKETS, Packet
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Packer, PacketArray
 from ground.commands import station

@@ -17,8 +17,7 @@ from flight.link.events import Severity
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import DIRECTIVES, NEW_KEY, PORTION
 from flight.link.telemetry import definitions
-from flight.link.telemetry.definitions import PACKETS
-from flight.link.telemetry.fields import Field, Limits, Packet
+from flight.link.telemetry.definitions import PACKETS, Field, Limits, Packet
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, compile_layouts, crc16
 from flight.loop.body import SteeringState
 from flight.loop.facts import FACTS, StreamState

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
+from flight.schema.bodies import TestbedConfig
 from flight.schema.sections import Commands, CommandStep
-from flight.schema.testbed import TestbedConfig
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Release, Simulation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.bodies import OrbitConfig, as_orbit
 from ground.telemetry import Run
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray

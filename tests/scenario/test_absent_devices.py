@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.app.devices import open_devices
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from hal.interfaces.errors import NotResponding
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.rig import LockStep, opened_lockstep

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.link.commands import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import decode
 from tests.scenario.answers import said

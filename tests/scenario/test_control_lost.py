@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from flight.schema.testbed import Step, TestbedConfig
+from flight.schema.bodies import Step, TestbedConfig
 from ground import report
 from ground.report import steps as report_steps
 from knightcube.astro.quaternion import from_rotation_vector, multiply

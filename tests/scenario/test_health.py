@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.loop.facts import FACTS, IMU_POOR, TASK_FAILING, StreamState
 from flight.loop.health import ResourceSample
 from ground.telemetry import Run

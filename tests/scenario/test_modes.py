@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from flight.loop.state import Notices, StateKeeper, StateStore
 from flight.schema import reader as configuration
-from flight.schema.testbed import Step
+from flight.schema.bodies import Step
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SOUND, LineFaults

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.telemetry.definitions import PACKETS
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import PACKETS, Field, Packet
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import to_text
 from flight.loop.executive import RateGroup

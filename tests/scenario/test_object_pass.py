@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from flight.schema import reader as configuration
-from flight.schema.orbit import as_orbit
+from flight.schema.bodies import as_orbit
 from ground.messages import write_tracking_data
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray

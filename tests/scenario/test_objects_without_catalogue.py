@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
+from flight.schema.bodies import as_orbit
 from flight.schema.devices import ObjectTracking, StarTrackerSection
 from flight.schema.document import FOLDER
-from flight.schema.orbit import as_orbit
 from ground.messages import orbits_of
 from ground.telemetry import Run
 from sim_hal.settings import Simulation

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
+from flight.schema.bodies import OrbitConfig
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise
 from ground.telemetry import Run

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.orbit import TargetStep
+from flight.schema.bodies import TargetStep
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between

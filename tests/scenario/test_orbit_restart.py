@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from flight.schema import reader as configuration
+from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import CameraAccuracy
-from flight.schema.orbit import OrbitConfig
 from ground.telemetry import Run
 from sim_hal.settings import Simulation
 from tests.scenario.orbit_flights import GYRO_BIAS, navigating, skyward

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run

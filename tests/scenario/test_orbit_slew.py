@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from flight.loop.coil_monitor import CoilMonitor
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, TargetStep
+from flight.schema.bodies import OrbitConfig, TargetStep
 from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
 from knightcube.gnc.control import pointing_law

@@ -15,7 +15,7 @@ import pytest
 from flight.bodies.testbed import body as testbed
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.testbed import Step
+from flight.schema.bodies import Step
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance import vmc as plan_job
 from knightcube.gnc.guidance.plant import PolynomialPath

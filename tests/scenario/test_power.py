@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.devices import Battery, LowBattery, Power

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
+from flight.schema.bodies import as_orbit
 from flight.schema.document import FOLDER
 from flight.schema.orbit import as_orbit
 from knightcube.astro.quaternion import angle_between

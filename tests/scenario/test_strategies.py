@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from flight.schema.testbed import Step, TestbedConfig
+from flight.schema.bodies import Step, TestbedConfig
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.plant import angle_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from flight.schema.orbit import as_orbit
+from flight.schema.bodies import as_orbit
 from ground.report.orbit import COARSE, attitude_errors
 from ground.telemetry import Run
 from tests.scenario.orbit_flights import orbit_config, world

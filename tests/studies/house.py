@@ -28,9 +28,8 @@ import numpy as np
 
 from flight.app import flight as application
 from flight.app.run import RunRequest
-from flight.loop.control_cycle import ControlCycle
 from flight.loop.executive import Cycle, LockStepRunner
-from flight.loop.flight_loop import FlightLoop
+from flight.loop.flight_loop import ControlCycle, FlightLoop
 from knightcube import StarTracker
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.command import Json, command, say

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flight.schema import reader as configuration
-from flight.schema.orbit import as_orbit
+from flight.schema.bodies import as_orbit
 from ground.report.figures import DPI
 from ground.telemetry import Run, read_run
 from knightcube.astro.arrays import FloatArray

@@ -16,8 +16,8 @@ from flight.app.flight import fly
 from flight.app.run import RunRequest
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
+from flight.schema.bodies import as_testbed
 from flight.schema.devices import camera_model
-from flight.schema.testbed import as_testbed
 from ground.pictures import draw_horizon, draw_solution
 from ground.report import draw, draw_path
 from ground.telemetry import read_run

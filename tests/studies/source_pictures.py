@@ -33,7 +33,7 @@ from matplotlib.figure import Figure
 
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
-from flight.schema.testbed import as_testbed
+from flight.schema.bodies import as_testbed
 from ground.campaigns.runner import fly as fly_campaign
 from ground.report import panels
 from ground.report.figures import path_figure

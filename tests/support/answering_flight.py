@@ -9,7 +9,7 @@ import weakref
 from pathlib import Path
 
 from flight.link.commands import LONGEST
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 

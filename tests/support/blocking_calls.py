@@ -17,7 +17,7 @@ from typing import Any
 from unittest.mock import patch
 
 from flight.app.cli import main
-from flight.loop.control_cycle import ControlCycle
+from flight.loop.flight_loop import ControlCycle
 from tests.support.flights import CONFIG
 
 ROOT = str(CONFIG.parents[1])

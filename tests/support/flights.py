@@ -13,8 +13,8 @@ from flight.app.flight import next_whole_second
 from flight.link.telemetry.packets import to_text
 from flight.loop.flight_loop import FlightLoop, RunLabel
 from flight.schema import reader as configuration
+from flight.schema.bodies import TestbedConfig, as_testbed
 from flight.schema.sections import Commands, CommandStep, Config, Modes
-from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import Run, read_run
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.rig import LockStep, opened_lockstep, with_host_faults

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight.schema.testbed import TestbedConfig
+from flight.schema.bodies import TestbedConfig
 from knightcube.gnc.guidance.plant import SingleAxisPlant, angle_of
 from sim_hal.settings import Simulation
 from tests.support.collocation_oracle import Slew, solve

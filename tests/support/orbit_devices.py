@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flight.schema import reader
+from flight.schema.bodies import TestbedConfig
 from flight.schema.devices import Gps, SolarString, SolarStringsSection, WideCamera
-from flight.schema.testbed import TestbedConfig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FreeBodySection, OrbitSection, Simulation, TipOff

@@ -19,13 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.fields import Packet
+from flight.link.telemetry.definitions import Packet
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from flight.schema import reader as configuration
+from flight.schema.bodies import OrbitConfig, TestbedConfig, as_orbit
 from flight.schema.document import config_path
-from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Commands, CommandStep, Config
-from flight.schema.testbed import TestbedConfig
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry, Simulation
 from tests.support.flights import demo_config, demo_world, fly, thesis_config

@@ -13,8 +13,16 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from flight.schema.document import ConfigError, convert, read_document, read_text
-from flight.schema.values import NotNegative, Positive, Quaternion, Section
+from flight.schema.document import (
+    ConfigError,
+    NotNegative,
+    Positive,
+    Quaternion,
+    Section,
+    convert,
+    read_document,
+    read_text,
+)
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 

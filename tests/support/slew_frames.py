@@ -8,7 +8,7 @@ import numpy as np
 
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from flight.schema.bodies import OrbitConfig, TargetStep, as_orbit
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply

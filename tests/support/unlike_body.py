@@ -11,7 +11,7 @@ import numpy as np
 from flight.link import events
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.bodies import OrbitConfig, as_orbit
 from ground.telemetry import Run
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.settings import CraftSection, FaultEntry, Simulation

@@ -18,7 +18,7 @@ from typing import Any
 import space_packet_parser as other
 from space_packet_parser.xtce.definitions import XtcePacketDefinition
 
-from flight.link.telemetry.fields import Field
+from flight.link.telemetry.definitions import Field
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, to_text
 from ground.telemetry import scan

@@ -1,4 +1,4 @@
-"""The command line: each command is a module; a user error prints one line and gives exit status 2.
+"""The command line: a user error prints one line and gives exit status 2.
 
 Only the module of the requested command is imported, because a flight computer does not need the other
 commands. A command finishes its work even if its output is not read: if its pipe is closed (`| head`), if its
@@ -78,11 +78,11 @@ GROUPS = {
 """Headings of the groups of commands in `--help`."""
 
 COMMANDS = {
-    "run": ("fly", "fly a configuration"),
-    "link": ("operate", "connect flight software and ground by protected frames"),
-    "check": ("fly", "check a configuration and its devices before a flight"),
+    "run": ("fly", "fly a configuration", "run:configure"),
+    "link": ("operate", "connect flight software and ground by protected frames", "link:configure"),
+    "check": ("fly", "check a configuration and its devices before a flight", "run:configure_check"),
 }
-"""Group and purpose of each command of the flight application; entry points in `ENTRY_POINTS` add more."""
+"""Group, purpose and MODULE:FUNCTION of the commands on board; entry points in `ENTRY_POINTS` add more."""
 
 ENTRY_POINTS = "knightcube.commands"
 """Name of the entry point group; each entry point is a table of commands that a package adds."""
@@ -191,7 +191,7 @@ def _overview(available: Mapping[str, tuple[str, str, str]]) -> str:
 
 def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     """Return group, purpose and MODULE:FUNCTION of each command; search other packages only if needed."""
-    own = {name: (*about, f"{__name__}.{name}:configure") for name, about in COMMANDS.items()}
+    own = _full_names(COMMANDS, __name__)
     if words and words[0] in own:
         return own
     from importlib import metadata  # noqa: PLC0415 - takes half as long to load as the other modules together
@@ -200,12 +200,12 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     for found in metadata.entry_points(group=ENTRY_POINTS):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
             continue  # the package ground is not installed on a flight computer
-        table: dict[str, tuple[str, str, str]] = found.load()
-        others |= {
-            name: (group, purpose, f"{found.module}.{target}")
-            for name, (group, purpose, target) in table.items()
-        }
+        others |= _full_names(found.load(), found.module)
     return own | others
+
+
+def _full_names(table: dict[str, tuple[str, str, str]], package: str) -> dict[str, tuple[str, str, str]]:
+    return {name: (group, purpose, f"{package}.{at}") for name, (group, purpose, at) in table.items()}
 
 
 def _complain(message: str, status: int) -> int:

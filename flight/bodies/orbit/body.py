@@ -16,7 +16,14 @@ import numpy as np
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
 from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
 from flight.bodies.orbit.environment import LATEST_WITNESS_NS, EstimatedEnvironment, Witness
-from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.filter import (
+    BODY,
+    COIL_FACTORS,
+    OrbitFilter,
+    OrbitFilterSettings,
+    learned_of,
+    start_from,
+)
 from flight.bodies.orbit.guidance import (
     LearnedBody,
     ObjectAim,
@@ -26,11 +33,10 @@ from flight.bodies.orbit.guidance import (
     PointingTargets,
     Sensor,
 )
-from flight.bodies.orbit.learned_states import BODY, COIL_FACTORS, learned_of, start_from
 from flight.bodies.streak_methods import corner_estimator
 from flight.link import events
-from flight.link.modes import TESTBED, Mode
-from flight.link.telemetry.definitions import DESCRIPTION, NAVIGATION, SPIN
+from flight.link.events import TESTBED, Mode
+from flight.link.telemetry.definitions import DESCRIPTION, NAVIGATION, SEPARATE_ATTITUDES, SPIN
 from flight.loop import facts
 from flight.loop.body import (
     BodyControl,
@@ -48,13 +54,14 @@ from flight.loop.coil_response import ResponseSettings
 from flight.loop.coil_self_test import SelfTestSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned
+from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.devices import SolarStringsSection, camera_model
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import GpsReading, ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.attitude.solvers import VectorObservation
 from knightcube.astro.earth.disturbance import mean_density
 from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements
 from knightcube.astro.quaternion import attitude_matrix
@@ -67,6 +74,7 @@ from knightcube.gnc.control.pointing_table import PointingWeights
 from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.error_state import Role
 from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
     RATE,
     AttitudeMeasurement,
     Estimate,
@@ -78,6 +86,7 @@ from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 from knightcube.gnc.guidance.attitude_law import BodyAxes
 from knightcube.gnc.tracker import Track
+from knightcube.reference.sensor_fusion import GyroBiasFilter, KnownAttitude, SeparateDetermination
 from knightcube.vision.solar_cells import SolarStringModel
 
 SPIN_EVERY = 10
@@ -255,7 +264,7 @@ class SatelliteEstimation(BodyEstimation):
                 config.wide_cameras, self.orbit_filter, self.environment, self._sun
             )
             if config.estimation.compare is not None:
-                from flight.bodies.orbit.comparison import ComparedFeed  # noqa: PLC0415 - seldom needed
+                from flight.bodies.orbit.body import ComparedFeed  # noqa: PLC0415 - seldom needed
 
                 compared = ComparedFeed(self.feed, self.orbit_filter, config, services)
                 self.feed, self.horizon_cameras.compare = compared, compared.compare
@@ -645,3 +654,57 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
         absent=config.coils.absent,
     )
     return CoilMonitor(settings)
+
+
+class ComparedFeed:
+    """Passes readings to the flight filter and to the compared method; implements `ReadingFeed`."""
+
+    def __init__(
+        self, feed: ReadingFeed, filter_: OrbitFilter, config: OrbitConfig, services: Services
+    ) -> None:
+        unit, section = config.inertial_unit, config.estimation
+        noise = unit.rate_noise / np.sqrt(unit.rate_hz)
+        self._feed, self._filter, self._services = feed, filter_, services
+        self._method = SeparateDetermination(GyroBiasFilter(noise, section.bias_start, section.bias_walk))
+
+    def accept(self, reading: ImuReading) -> ReadingAgreement:
+        """Pass a reading to both methods."""
+        if reading.has_rate:
+            self._method.gyro(reading.time_ns, reading.rate)
+        return self._feed.accept(reading)
+
+    def begin(self, attitude: AttitudeMeasurement) -> bool:
+        """Start the flight filter from a star fix, which the compared method does not use."""
+        return self._feed.begin(attitude)
+
+    def compare(
+        self,
+        time_ns: int,
+        sun: VectorObservation | None,
+        nadir: VectorObservation | None,
+        field: VectorObservation | None,
+    ) -> None:
+        """Determine the attitude at `time_ns` from the directions of the sensors, and record it."""
+        found = self._method.update(time_ns, sun, nadir, field)
+        past = self._filter.past(time_ns) if self._filter.runs else None
+        flown = KnownAttitude()
+        if past is not None:
+            flown = KnownAttitude(past.quaternion, past.covariance[ATTITUDE, ATTITUDE])
+        named = {
+            "cameras": found.cameras,
+            "magnetometer": found.magnetometer,
+            "fused": found.fused,
+            "filtered": found.filtered,
+            "flown": flown,
+        }
+        values = {name: one.quaternion.tolist() for name, one in named.items()}
+        sigmas = {f"{name}_sigma": one.sigma for name, one in named.items()}
+        recorder = self._services.recorder
+        recorder.record(
+            SEPARATE_ATTITUDES,
+            self._services.clock.now_ns(),
+            middle_ns=time_ns - recorder.epoch_ns,
+            gyro_bias=found.bias.tolist(),
+            **values,
+            **sigmas,
+        )

@@ -29,12 +29,7 @@ from knightcube.astro.earth.disturbance import Pressures, pressures
 from knightcube.astro.earth.ephemeris import STEP, Ephemeris, predict
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.geomagnetism import extrapolation_sigma, field
-from knightcube.astro.earth.orbit_knowledge import (
-    GpsFix,
-    OrbitError,
-    OrbitState,
-    TwoLineElements,
-)
+from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, earth_velocity, sunlit_share
 from knightcube.gnc.estimation.free_filter import FilterEnvironment

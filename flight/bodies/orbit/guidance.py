@@ -36,13 +36,7 @@ from knightcube.astro.earth.disturbance import box_areas
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.control.pointing_job import (
-    STEADY,
-    ObjectDirection,
-    PointingJob,
-    RunningSlew,
-    SlewRequest,
-)
+from knightcube.gnc.control.pointing_job import STEADY, ObjectDirection, PointingJob, RunningSlew, SlewRequest
 from knightcube.gnc.control.pointing_law import PathRecovery, PointingLaw
 from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights
 from knightcube.gnc.estimation.estimate import Estimate

@@ -29,7 +29,7 @@ from flight.bodies.testbed.control import (
     plant_of,
 )
 from flight.link import events
-from flight.link.modes import ORBITAL, Mode
+from flight.link.events import ORBITAL, Mode
 from flight.link.telemetry.definitions import CONTROL, TARGET
 from flight.loop.body import (
     KEPT,
@@ -46,8 +46,8 @@ from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned, start_from
+from flight.schema.bodies import TestbedConfig, as_testbed
 from flight.schema.sections import CONTROL_RATE_HZ, Config
-from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray

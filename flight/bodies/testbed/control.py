@@ -37,8 +37,8 @@ from flight.link.telemetry.definitions import MAX_NODES, PLAN
 from flight.loop.body import COMMANDED, KEPT, PLANNER, CoilCommand, Target, Tracker
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services
+from flight.schema.bodies import Cage, Control, Identification, TestbedConfig
 from flight.schema.document import ConfigError
-from flight.schema.testbed import Cage, Control, Identification, TestbedConfig
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
@@ -381,12 +381,7 @@ class Planning:
             return
         plan: StepPlan = result.value
         verdict = self._guidance.offer(
-            plan,
-            job.origin_ns,
-            now_ns,
-            angle_of(job.start_q2),
-            job.start_rate,
-            job.plant.disturbance,
+            plan, job.origin_ns, now_ns, angle_of(job.start_q2), job.start_rate, job.plant.disturbance
         )
         reason = verdict.reason
         if reason:
@@ -527,10 +522,7 @@ class BdotLaw:
 
 
 def controller_of(
-    section: Control,
-    plant: SingleAxisPlant,
-    period: float,
-    identification: Identification,
+    section: Control, plant: SingleAxisPlant, period: float, identification: Identification
 ) -> AngleController:
     """Return the controller that `section` selects for `plant`, with a control period in s."""
     if section.tracker == "excitation":
@@ -598,8 +590,7 @@ class CageField:
         least = self._weakest(clock.now_ns())
         if least < weakest:
             raise ConfigError(
-                "plant.field",
-                f"is {weakest:g}: must not exceed {least:.3g} T, the weakest field of the cage",
+                "plant.field", f"is {weakest:g}: must not exceed {least:.3g} T, the weakest field of the cage"
             )
 
     def at(self, now_ns: int) -> FloatArray:
@@ -672,12 +663,7 @@ class CageTracker:
     """Converts the torque that another tracker requests from coil x into currents in the coils x and z."""
 
     def __init__(
-        self,
-        inner: Tracker,
-        reader: ThreadReader,
-        plant: SingleAxisPlant,
-        field: CageField,
-        dipole: float,
+        self, inner: Tracker, reader: ThreadReader, plant: SingleAxisPlant, field: CageField, dipole: float
     ) -> None:
         """`inner` is a tracker for the constant field of `plant`.
 

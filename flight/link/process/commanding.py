@@ -30,9 +30,9 @@ import msgspec
 from msgspec import Meta
 
 from flight.link.commands import ChangeMode, Command, CommandError, Point, Slew, command_of_words
-from flight.link.modes import Mode
+from flight.link.events import Mode
+from flight.link.files.store import line_of, overwrite, read_regular, to_record
 from flight.link.process.directives import LONGEST_COMMAND, SCHEDULE, Deletion, Listing, Scheduled
-from flight.link.regular_files import line_of, overwrite, read_regular, to_record
 from flight.link.security import COPIES
 from flight.link.telemetry.definitions import COMMAND, HEALTH, MODE
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk

@@ -10,7 +10,7 @@ from flight.link.commands import CommandError, command_of_words, telecommand
 from flight.link.files.store import LONGEST_NAME
 from flight.link.files.transfer import FOREIGN, GROUND
 from flight.link.security import KEY_BYTES
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import Field, Packet
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     Layout,
@@ -54,10 +54,7 @@ CANCEL_FILE = telecommand(
     Field("number", "u4", "-", "number of the transfer at the sending entity"),
 )
 SUSPEND_FILE = telecommand(
-    "suspend-file",
-    0x229,
-    "Suspend a transfer until it is resumed, even across restarts",
-    *CANCEL_FILE.fields,
+    "suspend-file", 0x229, "Suspend a transfer until it is resumed, even across restarts", *CANCEL_FILE.fields
 )
 RESUME_FILE = telecommand("resume-file", 0x22A, "Resume a suspended transfer", *CANCEL_FILE.fields)
 USE_FILE = telecommand(

@@ -26,12 +26,7 @@ from flight.link.coding import LONGEST_CLTU, FrameDecoder, Framing, LinkCodes
 from flight.link.commands import CommandError, CommandPacker
 from flight.link.files.store import files_folder
 from flight.link.files.units import UP, is_unit
-from flight.link.frames import (
-    TELECOMMAND_HEADER,
-    TELECOMMAND_MASK,
-    TELEMETRY_MASK,
-    open_telecommand,
-)
+from flight.link.frames import TELECOMMAND_HEADER, TELECOMMAND_MASK, TELEMETRY_MASK, open_telecommand
 from flight.link.process import directives
 from flight.link.process.commanding import (
     ControlLine,
@@ -62,8 +57,7 @@ from flight.link.process.directives import (
     Withdraw,
 )
 from flight.link.process.downlink import Downlink, LogFollower, Playback, time_of
-from flight.link.process.filing import Filing, values_of
-from flight.link.process.renewal import STATUS, Renewal
+from flight.link.process.filing import STATUS, Filing, Renewal, values_of
 from flight.link.security import (
     COMMAND_SPIS,
     TELEMETRY_SPIS,
@@ -75,8 +69,7 @@ from flight.link.security import (
     Vault,
     may_change,
 )
-from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION
-from flight.link.telemetry.fields import Packet
+from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
@@ -583,10 +576,7 @@ class Station:
         return self._unpacked + self._downlink.displaced
 
     def run(
-        self,
-        ended: Callable[[], bool],
-        complain: Callable[[str], object],
-        alive: Callable[[], object],
+        self, ended: Callable[[], bool], complain: Callable[[str], object], alive: Callable[[], object]
     ) -> None:
         """Run until `ended` returns true.
 

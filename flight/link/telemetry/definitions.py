@@ -10,42 +10,118 @@ bounds of the configuration schema.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
-from flight.link.events import Severity
-from flight.link.modes import Mode
-from flight.link.telemetry.fields import Alarms, Field, Level, Limits, Packet, States, counter, flag
+from flight.link.events import Mode, Severity
 from hal.interfaces.devices import COIL_NAMES, MOST_COILS
 from knightcube.gnc.guidance.plant import Q2_LIMIT
 
+Range = tuple[float, float]
+States = tuple[tuple[int, str], ...]
+NO_YES: States = ((0, "no"), (1, "yes"))
+Level = Literal["warning", "fault"]
+Alarms = tuple[tuple[int, Level], ...]
 
-def _parameter(key: str, unit: str, low: float, high: float, meaning: str) -> Field:
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Nominal ranges (low, high) of a value. A value outside its range causes a warning or a fault."""
+
+    warning: Range | None = None
+    fault: Range | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """Definition of one field of a packet. Numbers are big-endian in the packet.
+
+    Attributes:
+        kind: numpy type code (f8, f4, u1, u2, u4, u8, i8), or S<n> for n bytes of UTF-8 text.
+        count: number of values; a field with more than one value is an array.
+        states: numbers and names of the states of an enumerated field.
+        bits: numbers and names of the bits of a bit field, of which several can be set.
+        alarms: states or set bits that are reported as a warning or a fault.
+        limits: nominal ranges of a numeric field without states.
+        valid: allowed range (low, high) of a command argument.
+        wraps: whether the field is a counter that continues at 0 after its largest number.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    meaning: str
+    count: int = 1
+    states: States = ()
+    alarms: Alarms = ()
+    limits: Limits | None = None
+    valid: Range | None = None
+    wraps: bool = False
+    bits: States = ()
+
+
+def counter(name: str, meaning: str) -> Field:
+    """Return the definition of a counter field, which wraps at the end of its range."""
+    return Field(name, "u4", "-", meaning, wraps=True)
+
+
+def flag(name: str, meaning: str) -> Field:
+    """Return the definition of a Boolean field with the states no and yes."""
+    return Field(name, "u1", "-", meaning, states=NO_YES)
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """Definition of a packet: name, application process identifier (APID), rate and fields.
+
+    The text `hazard` states the harm that a telecommand can cause. The text is empty for a harmless packet.
+    """
+
+    name: str
+    apid: int
+    rate: str
+    meaning: str
+    fields: tuple[Field, ...]
+    version: int = 1
+    telecommand: bool = False
+    hazard: str = ""
+
+
+def _real(name: str, unit: str, meaning: str, count: int = 1, limits: Limits | None = None) -> Field:
+    return Field(name, "f8", unit, meaning, count, limits=limits)
+
+
+def _sigma(name: str, unit: str, meaning: str, count: int = 1) -> Field:
+    return Field(name, "f4", unit, meaning, count)
+
+
+def _estimated(name: str, unit: str, meaning: str, count: int) -> tuple[Field, Field]:
+    return _real(name, unit, meaning, count), _sigma(f"{name}_sigma", unit, _ONE_SIGMA + name, count)
+
+
+def _limit(key: str, unit: str, low: float, high: float, meaning: str) -> Field:
     return Field(key.replace(".", "_", 1), "f8", unit, f"{key}: {meaning}", valid=(low, high))
 
 
 PARAMETER_FIELDS: tuple[Field, ...] = (
-    _parameter("modes.arrived_angle", "rad", 1e-4, 0.5, "largest angle error of a completed slew"),
-    _parameter("modes.arrived_rate", "rad/s", 1e-5, 0.5, "largest rate error of a completed slew"),
-    _parameter(
+    _limit("modes.arrived_angle", "rad", 1e-4, 0.5, "largest angle error of a completed slew"),
+    _limit("modes.arrived_rate", "rad/s", 1e-5, 0.5, "largest rate error of a completed slew"),
+    _limit(
         "modes.arrived_for", "s", 0.1, 600.0, "time within the limits of angle and rate that completes a slew"
     ),
-    _parameter("modes.slew_limit", "s", 1.0, 1e5, "time after which a slew is late"),
-    _parameter(
-        "modes.hold_error", "rad", 1e-3, math.pi, "angle error above which an attitude cannot be held"
-    ),
-    _parameter("modes.hold_patience", "s", 0.1, 3600.0, "time above `hold_error` after which a hold fails"),
-    _parameter("modes.tumble_rate", "rad/s", 1e-3, 10.0, "rate above which the body is detumbled"),
-    _parameter("modes.blind_limit", "s", 1.0, 1e5, "time without an estimate after which the mode is safe"),
-    _parameter("modes.known_for", "s", 0.1, 3600.0, "duration of a known attitude that ends acquisition"),
-    _parameter("modes.lost_for", "s", 0.1, 3600.0, "time without an attitude after which acquisition starts"),
-    _parameter("health.cpu_share", "-", 0.01, 64.0, "largest processor load of the control process"),
-    _parameter("health.memory", "B", 1e6, 1e12, "largest memory of all flight processes"),
-    _parameter("health.memory_slope", "B/h", 1e3, 1e12, "largest growth of the memory of all processes"),
-    _parameter("health.disk_free", "B", 1.0, 1e13, "smallest free disk space"),
-    _parameter("health.temperature", "degree C", -40.0, 150.0, "board temperature that causes a warning"),
-    _parameter(
-        "health.hottest", "degree C", -40.0, 150.0, "board temperature at which the mode changes to safe"
-    ),
+    _limit("modes.slew_limit", "s", 1.0, 1e5, "time after which a slew is late"),
+    _limit("modes.hold_error", "rad", 1e-3, math.pi, "angle error above which an attitude cannot be held"),
+    _limit("modes.hold_patience", "s", 0.1, 3600.0, "time above `hold_error` after which a hold fails"),
+    _limit("modes.tumble_rate", "rad/s", 1e-3, 10.0, "rate above which the body is detumbled"),
+    _limit("modes.blind_limit", "s", 1.0, 1e5, "time without an estimate after which the mode is safe"),
+    _limit("modes.known_for", "s", 0.1, 3600.0, "duration of a known attitude that ends acquisition"),
+    _limit("modes.lost_for", "s", 0.1, 3600.0, "time without an attitude after which acquisition starts"),
+    _limit("health.cpu_share", "-", 0.01, 64.0, "largest processor load of the control process"),
+    _limit("health.memory", "B", 1e6, 1e12, "largest memory of all flight processes"),
+    _limit("health.memory_slope", "B/h", 1e3, 1e12, "largest growth of the memory of all processes"),
+    _limit("health.disk_free", "B", 1.0, 1e13, "smallest free disk space"),
+    _limit("health.temperature", "degree C", -40.0, 150.0, "board temperature that causes a warning"),
+    _limit("health.hottest", "degree C", -40.0, 150.0, "board temperature at which the mode changes to safe"),
 )
 """Definitions of the parameter fields, in the order of the parameter packets."""
 
@@ -59,9 +135,8 @@ MODES: States = tuple((int(mode), mode.label) for mode in Mode)
 SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
 """How the control loop uses the coils (`flight.loop.body.SteeringState`)."""
-STREAMS: States = tuple(
-    enumerate(("not-fitted", "never", "stale", "invalid", "slow", "good", "no-reading-yet"))
-)
+_QUALITIES = "not-fitted never stale invalid slow good no-reading-yet"
+STREAMS: States = tuple(enumerate(_QUALITIES.split()))
 """Quality levels of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 """Accuracy levels of the attitude estimate (`flight.bodies.orbit.body`)."""
@@ -89,17 +164,11 @@ _NAMES = """
     field-extrapolated gyro-lost! battery-low battery-very-low battery-critical! battery-monitor-lost
     bus-monitor-lost
 """
-_FACTS: tuple[tuple[str, Level], ...] = tuple(
-    (name.rstrip("!"), "fault" if name.endswith("!") else "warning") for name in _NAMES.split()
+"""Detected conditions, in the order of `flight.loop.facts`; an exclamation mark marks a fault."""
+FACTS: States = tuple((bit, name.rstrip("!")) for bit, name in enumerate(_NAMES.split()))
+FACT_ALARMS: Alarms = tuple(
+    (bit, "fault" if name.endswith("!") else "warning") for bit, name in enumerate(_NAMES.split())
 )
-"""Conditions that the monitors detect, in the order of `flight.loop.facts`, each with its severity.
-
-In `_NAMES`, an exclamation mark follows the name of a fault; the other conditions are warnings.
-"""
-FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))
-FACT_ALARMS: Alarms = tuple((bit, level) for bit, (_, level) in enumerate(_FACTS))
-
-
 RUN = Packet(
     "run",
     0x101,
@@ -114,10 +183,10 @@ RUN = Packet(
         flag("simulated", "whether the devices are emulated"),
         flag("realtime", "whether the run uses the machine's clock; no means lock-step simulation"),
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
-        Field("duration", "f8", "s", "planned duration of the run; NaN for an unlimited run"),
-        Field("coil_resistance", "f8", "ohm", "resistance of the first three coils; NaN if not fitted", 3),
-        Field("supply_voltage", "f8", "V", "configured coil supply voltage, after the losses of the bridges"),
-        Field("current_limit", "f8", "A", "largest permitted current of a coil"),
+        _real("duration", "s", "planned duration of the run; NaN for an unlimited run"),
+        _real("coil_resistance", "ohm", "resistance of the first three coils; NaN if not fitted", 3),
+        _real("supply_voltage", "V", "configured coil supply voltage, after the losses of the bridges"),
+        _real("current_limit", "A", "largest permitted current of a coil"),
     ),
 )
 
@@ -148,9 +217,9 @@ HOUSEKEEPING = Packet(
         counter("imu_out_of_range", "packets of the inertial unit with values out of range"),
         counter("imu_not_finite", "packets of the inertial unit with NaN or infinity"),
         counter("coil_faults", "failed transactions with the PWM chip"),
-        Field("coil_voltage", "f8", "V", "measured supply voltage of the bridges; NaN if unknown"),
-        Field("coil_current", "f8", "A", "measured supply current of the coils; NaN if unknown"),
-        Field("coil_power", "f8", "W", "measured supply power of the coils; NaN if unknown"),
+        _real("coil_voltage", "V", "measured supply voltage of the bridges; NaN if unknown"),
+        _real("coil_current", "A", "measured supply current of the coils; NaN if unknown"),
+        _real("coil_power", "W", "measured supply power of the coils; NaN if unknown"),
         counter("plans_accepted", "plans flown since start"),
         counter("plans_refused", "plans rejected since start"),
         counter("frames", "frames received since start"),
@@ -168,7 +237,7 @@ HEALTH = Packet(
     "Mode, streams of readings, monitored conditions and resources of the board",
     (
         Field("mode", "u1", "-", "current mode", states=MODES, alarms=SAFE_ALARM),
-        Field("mode_age", "f8", "s", "time in this mode"),
+        _real("mode_age", "s", "time in this mode"),
         Field("imu", "u1", "-", "readings of the inertial unit", states=STREAMS, alarms=STREAM_ALARMS),
         Field("field", "u1", "-", "readings of the magnetometer", states=STREAMS, alarms=STREAM_ALARMS),
         Field("coils", "u1", "-", "acknowledgements of the coils", states=STREAMS, alarms=STREAM_ALARMS),
@@ -179,17 +248,12 @@ HEALTH = Packet(
         counter("fed", "number of times the watchdog was reset"),
         counter("slips", "control cycles skipped since start"),
         counter("clock_steps", "number of changes of the wall clock"),
-        Field("cpu_share", "f8", "-", "processor load of the control process; NaN if unknown"),
-        Field("resident", "f8", "B", "resident memory of the control process; NaN if unknown"),
-        Field(
-            "proportional",
-            "f8",
-            "B",
-            "memory (proportional set size) of all flight processes; NaN if unknown",
-        ),
-        Field("memory_slope", "f8", "B/s", "growth of the memory (proportional set size); NaN if unknown"),
-        Field("disk_free", "f8", "B", "free disk space for the flight log; NaN if unknown"),
-        Field("temperature", "f8", "deg C", "highest temperature of the board; NaN if unknown"),
+        _real("cpu_share", "-", "processor load of the control process; NaN if unknown"),
+        _real("resident", "B", "resident memory of the control process; NaN if unknown"),
+        _real("proportional", "B", "memory (proportional set size) of all flight processes; NaN if unknown"),
+        _real("memory_slope", "B/s", "growth of the memory (proportional set size); NaN if unknown"),
+        _real("disk_free", "B", "free disk space for the flight log; NaN if unknown"),
+        _real("temperature", "deg C", "highest temperature of the board; NaN if unknown"),
     ),
 )
 
@@ -225,7 +289,6 @@ COMMAND = Packet(
     ),
 )
 
-
 _DRAWN = "%s; positive while the battery discharges"
 POWER = Packet(
     "power",
@@ -239,8 +302,8 @@ POWER = Packet(
         Field("battery_current", "f4", "A", _DRAWN % "current out of the battery"),
         Field("bus_voltage", "f4", "V", "voltage of the bus"),
         Field("bus_current", "f4", "A", "current of all loads"),
-        Field("energy_in", "f8", "J", "energy into the battery since start"),
-        Field("energy_out", "f8", "J", "energy out of the battery since start"),
+        _real("energy_in", "J", "energy into the battery since start"),
+        _real("energy_out", "J", "energy out of the battery since start"),
     ),
 )
 MAX_NODES = 40
@@ -258,10 +321,10 @@ IMU = Packet(
     (
         Field("sample_time_ns", "i8", "ns", "mission time of the sample"),
         Field("device_time_ns", "u8", "ns", "time of the unit's own clock"),
-        Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last", 4),
-        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("field", "f8", "T", "magnetic field, body axes", 3),
-        Field("acceleration", "f8", "m/s^2", "specific force, body axes", 3),
+        _real("quaternion", "-", "rotation of reference frame into body, scalar last", 4),
+        _real("rate", "rad/s", "body rate, body axes", 3),
+        _real("field", "T", "magnetic field, body axes", 3),
+        _real("acceleration", "m/s^2", "specific force, body axes", 3),
     ),
 )
 
@@ -273,19 +336,19 @@ CONTROL = Packet(
     (
         Field("cycle", "u8", "-", "number of the control cycle since start, including skipped cycles"),
         Field("state", "u1", "-", "use of the coils", states=STEERING),
-        Field("estimate_age", "f8", "s", "age of the newest measurement in the estimate"),
-        Field("angle", "f8", "rad", "estimated rotation angle about the thread"),
-        Field("q2", "f8", "-", "estimated second quaternion component"),
-        Field("rate", "f8", "rad/s", "estimated rate about the thread"),
-        Field("angle_sigma", "f8", "rad", "standard deviation of the angle"),
-        Field("rate_sigma", "f8", "rad/s", "standard deviation of the rate"),
-        Field("target_q2", "f8", "-", "commanded final q2", limits=_Q2),
-        Field("path_q2", "f8", "-", "current q2 of the path", limits=_Q2),
-        Field("path_rate", "f8", "rad/s", "current rate of the path"),
-        Field("path_acceleration", "f8", "rad/s^2", "current angular acceleration of the path"),
+        _real("estimate_age", "s", "age of the newest measurement in the estimate"),
+        _real("angle", "rad", "estimated rotation angle about the thread"),
+        _real("q2", "-", "estimated second quaternion component"),
+        _real("rate", "rad/s", "estimated rate about the thread"),
+        _real("angle_sigma", "rad", "standard deviation of the angle"),
+        _real("rate_sigma", "rad/s", "standard deviation of the rate"),
+        _real("target_q2", "-", "commanded final q2", limits=_Q2),
+        _real("path_q2", "-", "current q2 of the path", limits=_Q2),
+        _real("path_rate", "rad/s", "current rate of the path"),
+        _real("path_acceleration", "rad/s^2", "current angular acceleration of the path"),
         counter("plan", "number of the plan in use, 0 for none"),
-        Field("current_command", "f8", "A", _WANTED, 3),
-        Field("current_written", "f8", "A", _WRITTEN, 3),
+        _real("current_command", "A", _WANTED, 3),
+        _real("current_written", "A", _WRITTEN, 3),
         flag("saturated", "whether the current of a coil was limited"),
     ),
     version=2,
@@ -298,13 +361,13 @@ ATTITUDE = Packet(
     "Attitude estimate, path, target and dipole of any body",
     (
         Field("mode", "u1", "-", "current mode", states=MODES),
-        Field("quaternion", "f8", "-", "estimated rotation of reference frame into body, scalar last", 4),
-        Field("rate", "f8", "rad/s", "estimated body rate, body axes", 3),
-        Field("angle_sigma", "f4", "rad", "standard deviation of the attitude about the body axes", 3),
-        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate", 3),
-        Field("wanted", "f8", "-", "current attitude of the path; NaN without a path", 4),
-        Field("wanted_rate", "f8", "rad/s", "current rate of the path, body axes", 3),
-        Field("target", "f8", "-", "target attitude; NaN without a target", 4),
+        _real("quaternion", "-", "estimated rotation of reference frame into body, scalar last", 4),
+        _real("rate", "rad/s", "estimated body rate, body axes", 3),
+        _sigma("angle_sigma", "rad", "standard deviation of the attitude about the body axes", 3),
+        _sigma("rate_sigma", "rad/s", "standard deviation of the rate", 3),
+        _real("wanted", "-", "current attitude of the path; NaN without a path", 4),
+        _real("wanted_rate", "rad/s", "current rate of the path, body axes", 3),
+        _real("target", "-", "target attitude; NaN without a target", 4),
         Field("dipole", "f4", "A m^2", "commanded dipole of the coils, body axes", 3),
     ),
 )
@@ -329,8 +392,8 @@ TARGET = Packet(
     "A new commanded attitude",
     (
         counter("index", "number of the step, counted from 0, or of a commanded slew, counted from 1001"),
-        Field("q2", "f8", "-", "commanded final q2", limits=_Q2),
-        Field("rate", "f8", "rad/s", "commanded final rate"),
+        _real("q2", "-", "commanded final q2", limits=_Q2),
+        _real("rate", "rad/s", "commanded final rate"),
     ),
     version=2,
 )
@@ -345,7 +408,7 @@ MODE = Packet(
         Field("mode", "u1", "-", "mode after the change", states=MODES),
         Field("trigger", "S32", "-", "trigger of the change (flight.loop.modes)"),
         Field("reason", "S96", "-", "event or values that caused the trigger"),
-        Field("target_q2", "f8", "-", "target q2 of a hold or slew; NaN if not known yet"),
+        _real("target_q2", "-", "target q2 of a hold or slew; NaN if not known yet"),
     ),
 )
 
@@ -359,16 +422,16 @@ PLAN = Packet(
         flag("accepted", "whether the plan is flown"),
         Field("status", "S32", "-", "optimal, stretched, or the reason of the rejection"),
         Field("origin_ns", "i8", "ns", "mission time of the start of the path"),
-        Field("horizon_asked", "f8", "s", "requested horizon"),
-        Field("horizon", "f8", "s", "planned horizon"),
-        Field("start_q2", "f8", "-", "q2 at the start of the path"),
-        Field("start_rate", "f8", "rad/s", "rate at the start of the path"),
-        Field("target_q2", "f8", "-", "q2 at the end of the path"),
-        Field("cost", "f8", "J", "planned integral of R I^2 over the path"),
-        Field("peak_current", "f8", "A", "largest current on and between the nodes"),
+        _real("horizon_asked", "s", "requested horizon"),
+        _real("horizon", "s", "planned horizon"),
+        _real("start_q2", "-", "q2 at the start of the path"),
+        _real("start_rate", "rad/s", "rate at the start of the path"),
+        _real("target_q2", "-", "q2 at the end of the path"),
+        _real("cost", "J", "planned integral of R I^2 over the path"),
+        _real("peak_current", "A", "largest current on and between the nodes"),
         Field("evaluations", "u4", "-", "number of evaluations of the cost function"),
         Field("nodes", "u1", "-", "number of nodes of the path"),
-        Field("node_q2", "f8", "-", "q2 at the Legendre-Gauss-Lobatto nodes; NaN if unused", MAX_NODES),
+        _real("node_q2", "-", "q2 at the Legendre-Gauss-Lobatto nodes; NaN if unused", MAX_NODES),
     ),
 )
 
@@ -378,11 +441,11 @@ TRUTH = Packet(
     "40 Hz, simulation only",
     "True state of the simulated world, which sim_hal writes to a separate log",
     (
-        Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last", 4),
-        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("current", "f8", "A", "true mean currents of the first three coils", 3),
-        Field("energy", "f8", "J", "integral of R I^2 over all coils since mission time zero"),
-        Field("supply_energy", "f8", "J", "integral of V |I| over all coils since mission time zero"),
+        _real("quaternion", "-", "rotation of reference frame into body, scalar last", 4),
+        _real("rate", "rad/s", "body rate, body axes", 3),
+        _real("current", "A", "true mean currents of the first three coils", 3),
+        _real("energy", "J", "integral of R I^2 over all coils since mission time zero"),
+        _real("supply_energy", "J", "integral of V |I| over all coils since mission time zero"),
     ),
 )
 
@@ -409,7 +472,6 @@ TRUE_COIL_CURRENTS = Packet(
     (Field("current", "f4", "A", "true mean currents" + _ABSENT, MOST_COILS),),
 )
 
-
 SPIN = Packet(
     "spin",
     0x115,
@@ -417,9 +479,9 @@ SPIN = Packet(
     "Rate of a satellite in orbit from the magnetometer alone",
     (
         flag("known", "whether enough samples of the field agree for a valid rate"),
-        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate about its worst axis"),
-        Field("field", "f8", "T", "magnetic field, body axes", 3),
+        _real("rate", "rad/s", "body rate, body axes", 3),
+        _sigma("rate_sigma", "rad/s", "standard deviation of the rate about its worst axis"),
+        _real("field", "T", "magnetic field, body axes", 3),
         counter("restarts", "number of restarts because the samples contradicted the rate"),
         Field("dipole", "f4", "A m^2", "commanded dipole of the coils, body axes", 3),
     ),
@@ -438,9 +500,9 @@ NAVIGATION = Packet(
         counter("refused", "rejected measurements, including those of replays"),
         counter("fixes_refused", "GPS fixes that contradict the known orbit"),
         counter("restarts", "number of times the estimate was discarded and restarted"),
-        Field("gyro_bias", "f8", "rad/s", "gyro bias, body axes; NaN before the first estimate", 3),
-        Field("field_bias", "f8", "T", "magnetometer bias, body axes", 3),
-        Field("residual_dipole", "f8", "A m^2", "residual dipole in the current sunlight, body axes", 3),
+        _real("gyro_bias", "rad/s", "gyro bias, body axes; NaN before the first estimate", 3),
+        _real("field_bias", "T", "magnetometer bias, body axes", 3),
+        _real("residual_dipole", "A m^2", "residual dipole in the current sunlight, body axes", 3),
     ),
 )
 
@@ -458,34 +520,24 @@ DESCRIPTION = Packet(
     "0.1 Hz",
     "Estimated inertia, coils and sensors of a satellite in orbit, with their standard deviations",
     (
-        Field("inertia", "f8", "kg m^2", _INERTIA, 6),
-        Field("inertia_sigma", "f4", "kg m^2", _ONE_SIGMA + "inertia", 6),
-        Field("coils", "f8", "-", _COILS, 9),
-        Field("coils_sigma", "f4", "-", _ONE_SIGMA + "coils", 9),
-        Field("gyro", "f8", "-", _GYRO, 9),
-        Field("gyro_sigma", "f4", "-", _ONE_SIGMA + "gyro", 9),
-        Field("field", "f8", "-", _FIELD, 9),
-        Field("field_sigma", "f4", "-", _ONE_SIGMA + "field", 9),
-        Field("camera", "f8", "rad", _CAMERA, 3),
-        Field("camera_sigma", "f4", "rad", _ONE_SIGMA + "camera", 3),
-        Field("camera_attitude_sigma", "f4", "rad", _ONE_SIGMA + "the star camera's attitude, body axes", 3),
-        Field("inertia_ratio_sigma", "f4", "-", _ONE_SIGMA + "inertia divided by its trace", 6),
-        Field(
+        *_estimated("inertia", "kg m^2", _INERTIA, 6),
+        *_estimated("coils", "-", _COILS, 9),
+        *_estimated("gyro", "-", _GYRO, 9),
+        *_estimated("field", "-", _FIELD, 9),
+        *_estimated("camera", "rad", _CAMERA, 3),
+        _sigma("camera_attitude_sigma", "rad", _ONE_SIGMA + "the star camera's attitude, body axes", 3),
+        _sigma("inertia_ratio_sigma", "-", _ONE_SIGMA + "inertia divided by its trace", 6),
+        _sigma(
             "coils_ratio_sigma",
-            "f4",
             "-",
             _ONE_SIGMA
             + "coils times the trace of the configured inertia, divided by that of the estimated inertia",
             9,
         ),
-        Field("gyro_bias", "f8", "rad/s", "gyro bias, body axes", 3),
-        Field("gyro_bias_sigma", "f4", "rad/s", _ONE_SIGMA + "gyro_bias", 3),
-        Field("field_bias", "f8", "T", "magnetometer bias, body axes", 3),
-        Field("field_bias_sigma", "f4", "T", _ONE_SIGMA + "field_bias", 3),
-        Field("dipole", "f8", "A m^2", "residual dipole in shadow, body axes", 3),
-        Field("dipole_sigma", "f4", "A m^2", _ONE_SIGMA + "dipole", 3),
-        Field("sunlit_dipole", "f8", "A m^2", "increase of the residual dipole in sunlight, body axes", 3),
-        Field("sunlit_dipole_sigma", "f4", "A m^2", _ONE_SIGMA + "sunlit_dipole", 3),
+        *_estimated("gyro_bias", "rad/s", "gyro bias, body axes", 3),
+        *_estimated("field_bias", "T", "magnetometer bias, body axes", 3),
+        *_estimated("dipole", "A m^2", "residual dipole in shadow, body axes", 3),
+        *_estimated("sunlit_dipole", "A m^2", "increase of the residual dipole in sunlight, body axes", 3),
     ),
 )
 
@@ -496,13 +548,13 @@ FIX = Packet(
     "Fix of the GPS receiver of a satellite in orbit",
     (
         Field("utc_ns", "i8", "ns", "UTC of the fix since 1970"),
-        Field("position", "f8", "m", "geocentric position, ITRS", 3),
-        Field("velocity", "f8", "m/s", "velocity with respect to the ground, ITRS", 3),
+        _real("position", "m", "geocentric position, ITRS", 3),
+        _real("velocity", "m/s", "velocity with respect to the ground, ITRS", 3),
         Field("sigma", "f4", "m", "standard deviation of the position per axis; NaN if unknown"),
-        Field("velocity_sigma", "f4", "m/s", "standard deviation of the velocity per axis; NaN if unknown"),
+        _sigma("velocity_sigma", "m/s", "standard deviation of the velocity per axis; NaN if unknown"),
         Field("satellites", "u1", "-", "number of GPS satellites"),
         flag("used", "whether the orbit was updated"),
-        Field("clock_off", "f8", "s", "host's UTC minus the UTC of the newest used fix; NaN before a fix"),
+        _real("clock_off", "s", "host's UTC minus the UTC of the newest used fix; NaN before a fix"),
     ),
     version=2,
 )
@@ -536,12 +588,12 @@ DIRECTIONS = Packet(
     (
         Field("middle_ns", "i8", "ns", "mission time of the middle of the exposures"),
         Field("frames", "u1", "-", "bit mask of the cameras whose frames were read"),
-        Field("sun", "f8", "-", "direction of the Sun, body axes; NaN if unknown", 3),
-        Field("sun_sigma", "f4", "rad", "standard deviation of the Sun's direction per axis; NaN if unknown"),
+        _real("sun", "-", "direction of the Sun, body axes; NaN if unknown", 3),
+        _sigma("sun_sigma", "rad", "standard deviation of the Sun's direction per axis; NaN if unknown"),
         Field("sun_cameras", "u1", "-", "bit mask of the cameras that show the Sun; 0 if from solar cells"),
         flag("sun_used", "whether the estimate used the Sun's direction"),
-        Field("nadir", "f8", "-", "direction of nadir, body axes; NaN if unknown", 3),
-        Field("nadir_sigma", "f4", "rad", "standard deviation of nadir per axis; NaN if unknown"),
+        _real("nadir", "-", "direction of nadir, body axes; NaN if unknown", 3),
+        _sigma("nadir_sigma", "rad", "standard deviation of nadir per axis; NaN if unknown"),
         Field(
             "nadir_cameras",
             "u1",
@@ -559,26 +611,19 @@ SEPARATE_ATTITUDES = Packet(
     "Attitudes determined as by Meller et al., for comparison; quaternions rotate ICRS into body axes",
     (
         Field("middle_ns", "i8", "ns", "mission time of the attitudes"),
-        Field("cameras", "f8", "-", "attitude from Sun and nadir, scalar last; NaN if unknown", 4),
-        Field("cameras_sigma", "f4", "rad", "standard deviation per axis of the attitude from Sun and nadir"),
-        Field("magnetometer", "f8", "-", "attitude from the magnetometer, scalar last; NaN if unknown", 4),
-        Field(
-            "magnetometer_sigma",
-            "f4",
-            "rad",
-            "standard deviation per axis of the attitude from the magnetometer",
+        _real("cameras", "-", "attitude from Sun and nadir, scalar last; NaN if unknown", 4),
+        _sigma("cameras_sigma", "rad", "standard deviation per axis of the attitude from Sun and nadir"),
+        _real("magnetometer", "-", "attitude from the magnetometer, scalar last; NaN if unknown", 4),
+        _sigma(
+            "magnetometer_sigma", "rad", "standard deviation per axis of the attitude from the magnetometer"
         ),
-        Field("fused", "f8", "-", "mean of both attitudes, scalar last; NaN if unknown", 4),
-        Field("fused_sigma", "f4", "rad", "standard deviation of the mean of both attitudes per axis"),
-        Field("filtered", "f8", "-", "attitude of the filter with the gyros, scalar last; NaN if unknown", 4),
-        Field("filtered_sigma", "f4", "rad", "standard deviation of the filter's attitude per axis"),
-        Field("gyro_bias", "f8", "rad/s", "gyro bias that the filter estimates, body axes", 3),
-        Field(
-            "flown", "f8", "-", "attitude estimate that is used for control, scalar last; NaN if unknown", 4
-        ),
-        Field(
-            "flown_sigma", "f4", "rad", "standard deviation per axis of the attitude that is used for control"
-        ),
+        _real("fused", "-", "mean of both attitudes, scalar last; NaN if unknown", 4),
+        _sigma("fused_sigma", "rad", "standard deviation of the mean of both attitudes per axis"),
+        _real("filtered", "-", "attitude of the filter with the gyros, scalar last; NaN if unknown", 4),
+        _sigma("filtered_sigma", "rad", "standard deviation of the filter's attitude per axis"),
+        _real("gyro_bias", "rad/s", "gyro bias that the filter estimates, body axes", 3),
+        _real("flown", "-", "attitude estimate that is used for control, scalar last; NaN if unknown", 4),
+        _sigma("flown_sigma", "rad", "standard deviation per axis of the attitude that is used for control"),
     ),
 )
 
@@ -588,18 +633,18 @@ ORBIT_TRUTH = Packet(
     "1 Hz, simulation of an orbit only",
     "True environment and torques of the simulated satellite, which sim_hal writes; NaN if unknown",
     (
-        Field("utc", "f8", "day", "Julian date UTC of the simulated world"),
-        Field("position", "f8", "m", "geocentric position, ICRS", 3),
-        Field("velocity", "f8", "m/s", "geocentric velocity, ICRS", 3),
-        Field("field", "f8", "T", "magnetic field of the Earth, ICRS", 3),
-        Field("sun", "f8", "-", "direction of the Sun, ICRS", 3),
-        Field("sunlit", "f8", "-", "visible fraction of the Sun's disc"),
-        Field("residual_dipole", "f8", "A m^2", "true residual dipole, body axes", 3),
-        Field("coil_torque", "f8", "N m", "torque of the coils, body axes", 3),
-        Field("dipole_torque", "f8", "N m", "torque of the residual dipole, body axes", 3),
-        Field("gravity_torque", "f8", "N m", "torque of the gravity gradient, body axes", 3),
-        Field("drag_torque", "f8", "N m", "torque of air drag, body axes", 3),
-        Field("sunlight_torque", "f8", "N m", "torque of solar pressure, body axes", 3),
+        _real("utc", "day", "Julian date UTC of the simulated world"),
+        _real("position", "m", "geocentric position, ICRS", 3),
+        _real("velocity", "m/s", "geocentric velocity, ICRS", 3),
+        _real("field", "T", "magnetic field of the Earth, ICRS", 3),
+        _real("sun", "-", "direction of the Sun, ICRS", 3),
+        _real("sunlit", "-", "visible fraction of the Sun's disc"),
+        _real("residual_dipole", "A m^2", "true residual dipole, body axes", 3),
+        _real("coil_torque", "N m", "torque of the coils, body axes", 3),
+        _real("dipole_torque", "N m", "torque of the residual dipole, body axes", 3),
+        _real("gravity_torque", "N m", "torque of the gravity gradient, body axes", 3),
+        _real("drag_torque", "N m", "torque of air drag, body axes", 3),
+        _real("sunlight_torque", "N m", "torque of solar pressure, body axes", 3),
     ),
 )
 
@@ -609,14 +654,13 @@ TRUE_DESCRIPTION = Packet(
     "at the start, simulation of an orbit only",
     "True inertia, coils and sensors of the simulated satellite, which sim_hal writes",
     (
-        Field("inertia", "f8", "kg m^2", _INERTIA, 6),
-        Field("coils", "f8", "-", _TRUE_COILS, 9),
-        Field("gyro", "f8", "-", _GYRO, 9),
-        Field("field", "f8", "-", _FIELD, 9),
-        Field("camera", "f8", "rad", _CAMERA, 3),
+        _real("inertia", "kg m^2", _INERTIA, 6),
+        _real("coils", "-", _TRUE_COILS, 9),
+        _real("gyro", "-", _GYRO, 9),
+        _real("field", "-", _FIELD, 9),
+        _real("camera", "rad", _CAMERA, 3),
     ),
 )
-
 
 _COVARIANCE = "covariance xx yy zz xy xz yz, body axes; NaN if unknown"
 STREAK = Packet(
@@ -627,14 +671,14 @@ STREAK = Packet(
     (
         counter("sequence", "frame number of the camera"),
         Field("exposure_start_ns", "i8", "ns", "mission time of the start of the exposure"),
-        Field("exposure", "f8", "s", "exposure time"),
+        _real("exposure", "s", "exposure time"),
         Field("status", "S32", "-", "rate, ambiguous, too-short, too-few, failed, black, saturated, frozen"),
         Field("streaks", "u2", "-", "streaks found"),
         Field("used", "u2", "-", "streaks used in the rate"),
-        Field("length", "f8", "px", "median length of the streaks"),
-        Field("rate", "f8", "rad/s", "mean body rate over the exposure, body axes; NaN if unknown", 3),
-        Field("covariance", "f8", "rad^2/s^2", _COVARIANCE, 6),
-        Field("residual", "f8", "rad", "rms residual of the end points; NaN without a result"),
+        _real("length", "px", "median length of the streaks"),
+        _real("rate", "rad/s", "mean body rate over the exposure, body axes; NaN if unknown", 3),
+        _real("covariance", "rad^2/s^2", _COVARIANCE, 6),
+        _real("residual", "rad", "rms residual of the end points; NaN without a result"),
         flag("accepted", "whether the estimate used the rate"),
     ),
 )
@@ -653,11 +697,9 @@ STARS = Packet(
         ),
         Field("found", "u2", "-", "detected stars"),
         Field("matched", "u2", "-", "detected stars that match guide stars"),
-        Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last or NaN", 4),
-        Field("covariance", "f8", "rad^2", _COVARIANCE, 6),
-        Field(
-            "log10_false_alarm", "f8", "-", "log10 of the expected number of chance matches in the whole sky"
-        ),
+        _real("quaternion", "-", "rotation of reference frame into body, scalar last or NaN", 4),
+        _real("covariance", "rad^2", _COVARIANCE, 6),
+        _real("log10_false_alarm", "-", "log10 of the expected number of chance matches in the whole sky"),
         flag("accepted", "whether the estimate used the attitude"),
     ),
 )
@@ -671,15 +713,14 @@ LENS = Packet(
         counter("sequence", "frame number of the camera"),
         Field("frames", "u4", "-", "frames from which the lens was learned"),
         Field("contradictions", "u4", "-", "frames that have contradicted the learned lens"),
-        Field("focal_length", "f8", "px", "focal length"),
-        Field("centre", "f8", "px", "pixel (x, y) of the optical axis", 2),
-        Field("distortion", "f8", "-", "coefficients k1 and k2 of the radial distortion", 2),
-        Field("line_time", "f8", "s", "delay between the exposures of successive rows"),
-        Field("psf_sigma", "f8", "px", "standard deviation of the point spread"),
-        Field("sigma", "f8", "-", _ONE_SIGMA + "the seven values above, each in its unit", 7),
-        Field(
+        _real("focal_length", "px", "focal length"),
+        _real("centre", "px", "pixel (x, y) of the optical axis", 2),
+        _real("distortion", "-", "coefficients k1 and k2 of the radial distortion", 2),
+        _real("line_time", "s", "delay between the exposures of successive rows"),
+        _real("psf_sigma", "px", "standard deviation of the point spread"),
+        _real("sigma", "-", _ONE_SIGMA + "the seven values above, each in its unit", 7),
+        _real(
             "corner_sigma",
-            "f8",
             "-",
             "relative standard deviation of the distance of an image corner from the centre",
         ),
@@ -714,25 +755,22 @@ TRACK = Packet(
         Field("middle_ns", "i8", "ns", "mission time of the middle of the exposure"),
         flag("seen", "whether the frame shows the object; no means predicted"),
         Field("sightings", "u4", "-", "sightings since the start of the track"),
-        Field("measured", "f8", "-", "measured direction in this frame; NaN if not detected", 3),
-        Field(
-            "measured_sigma", "f8", "rad", "standard deviation per axis, with the attitude error; NaN if none"
-        ),
-        Field("direction", "f8", "-", "estimated direction to the object", 3),
-        Field("rate", "f8", "rad/s", "rate of change of the direction", 3),
-        Field("acceleration", "f8", "rad/s^2", "acceleration perpendicular to the direction", 3),
-        Field("covariance", "f8", "rad^2", "covariance xx yy zz xy xz yz of the direction", 6),
-        Field("rate_covariance", "f8", "rad^2/s^2", "covariance xx yy zz xy xz yz of the rate", 6),
-        Field("magnitude", "f8", "mag", "mean magnitude V of the last sightings; NaN if unknown"),
-        Field("magnitude_sigma", "f8", "mag", "standard deviation of the magnitude; NaN if unknown"),
-        Field("place", "f8", "m", "geocentric position of the camera; NaN if unknown", 3),
-        Field("velocity", "f8", "m/s", "geocentric velocity of the camera; NaN if unknown", 3),
-        Field("place_sigma", "f8", "m", "standard deviation of the position per axis"),
+        _real("measured", "-", "measured direction in this frame; NaN if not detected", 3),
+        _real("measured_sigma", "rad", "standard deviation per axis, with the attitude error; NaN if none"),
+        _real("direction", "-", "estimated direction to the object", 3),
+        _real("rate", "rad/s", "rate of change of the direction", 3),
+        _real("acceleration", "rad/s^2", "acceleration perpendicular to the direction", 3),
+        _real("covariance", "rad^2", "covariance xx yy zz xy xz yz of the direction", 6),
+        _real("rate_covariance", "rad^2/s^2", "covariance xx yy zz xy xz yz of the rate", 6),
+        _real("magnitude", "mag", "mean magnitude V of the last sightings; NaN if unknown"),
+        _real("magnitude_sigma", "mag", "standard deviation of the magnitude; NaN if unknown"),
+        _real("place", "m", "geocentric position of the camera; NaN if unknown", 3),
+        _real("velocity", "m/s", "geocentric velocity of the camera; NaN if unknown", 3),
+        _real("place_sigma", "m", "standard deviation of the position per axis"),
         flag("relative", "whether the attitude of this frame is estimated without identified stars"),
     ),
     version=3,
 )
-
 
 PARAMETERS = Packet(
     "parameters",
@@ -747,7 +785,6 @@ PARAMETERS = Packet(
         *(replace(field, valid=None) for field in PARAMETER_FIELDS),
     ),
 )
-
 
 LINK = Packet(
     "link",
@@ -817,7 +854,6 @@ TRANSFER = Packet(
     ),
 )
 
-
 _LATENESS = Limits(fault=(0.0, 0.0125))
 """Nominal range of the delay (s) of a control cycle, which is skipped if delayed by half its period."""
 _EXECUTION = Limits(warning=(0.0, 0.0125), fault=(0.0, 0.025))
@@ -829,8 +865,8 @@ CYCLE_TIMING = Packet(
     "Start and duration of a control cycle on the machine's clock",
     (
         Field("cycle", "u8", "-", "number of the control cycle"),
-        Field("lateness", "f8", "s", "delay of the start of the cycle", limits=_LATENESS),
-        Field("execution", "f8", "s", "duration of the cycle", limits=_EXECUTION),
+        _real("lateness", "s", "delay of the start of the cycle", limits=_LATENESS),
+        _real("execution", "s", "duration of the cycle", limits=_EXECUTION),
     ),
     version=2,
 )
@@ -842,12 +878,12 @@ RATE_GROUP = Packet(
     "Statistics of a rate group of the executive since start",
     (
         Field("name", "S16", "-", "name of the rate group"),
-        Field("period", "f8", "s", "period of the rate group"),
+        _real("period", "s", "period of the rate group"),
         counter("cycles", "cycles that ran"),
         counter("slips", "cycles that were skipped"),
         counter("overruns", "cycles longer than the period"),
-        Field("mean", "f8", "s", "mean execution time"),
-        Field("max", "f8", "s", "longest execution time"),
+        _real("mean", "s", "mean execution time"),
+        _real("max", "s", "longest execution time"),
     ),
 )
 
@@ -858,16 +894,14 @@ JOB_TIMING = Packet(
     "Duration and outcome of a worker's job",
     (
         Field("name", "S16", "-", "name of the worker"),
-        Field("execution", "f8", "s", "duration of the job"),
+        _real("execution", "s", "duration of the job"),
         Field("outcome", "S16", "-", "outcome: done, failed, timed-out or died"),
     ),
 )
-
 
 PACKETS: tuple[Packet, ...] = (
     RUN, IMU, CONTROL, ATTITUDE, COIL_CURRENTS, SPIN, NAVIGATION, DESCRIPTION, FIX, GPS_LINK, DIRECTIONS,
     SEPARATE_ATTITUDES, TARGET, MODE, PLAN, STREAK, STARS, LENS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING,
     HEALTH, WORKLOAD, POWER, COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS,
-    ORBIT_TRUTH,
-    TRUE_DESCRIPTION, TRUE_POWER, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
+    ORBIT_TRUTH, TRUE_DESCRIPTION, TRUE_POWER, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
 )  # fmt: skip

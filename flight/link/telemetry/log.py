@@ -28,9 +28,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flight.link.events import COMMANDED, EventKind
-from flight.link.regular_files import make_lasting
-from flight.link.telemetry.definitions import ATTITUDE, CONTROL, EVENT, HEALTH, HOUSEKEEPING, RUN
-from flight.link.telemetry.fields import Packet
+from flight.link.files.store import make_lasting
+from flight.link.telemetry.definitions import ATTITUDE, CONTROL, EVENT, HEALTH, HOUSEKEEPING, RUN, Packet
 from flight.link.telemetry.packets import Packer, TelemetryError
 from hal.interfaces.wires import Clock
 from knightcube.errors import UsageError

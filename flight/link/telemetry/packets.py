@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.definitions import PACKETS
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import PACKETS, Field, Packet
 from knightcube.errors import FlightError
 
 PacketArray = npt.NDArray[np.void]

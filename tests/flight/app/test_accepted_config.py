@@ -22,8 +22,8 @@ from flight.app.service import (
 )
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
+from flight.schema.bodies import as_testbed
 from flight.schema.document import ConfigError, UnreadConfigError
-from flight.schema.testbed import as_testbed
 from ground.telemetry import read_run
 from sim_hal.faults.host import corrupted
 from tests.hal.guardian.live_flight import write_config

@@ -16,7 +16,7 @@ import pytest
 from flight.app import service
 from flight.app.service import Collector, EndingSignals, FlownRelease, Supervision
 from flight.link import events
-from flight.link.regular_files import line_of, to_record
+from flight.link.files.store import line_of, to_record
 from hal.interfaces.guardian import GuardianNews
 
 MS = 1_000_000

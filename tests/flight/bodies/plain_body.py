@@ -10,8 +10,8 @@ from flight.bodies.testbed.body import TESTBED
 from flight.loop.body import BodyKind, CoilCommand, FlightBody, Reference
 from flight.loop.facts import Services
 from flight.loop.state import Learned
+from flight.schema.bodies import as_testbed
 from flight.schema.sections import Config
-from flight.schema.testbed import as_testbed
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.estimate import Estimate

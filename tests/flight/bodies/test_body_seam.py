@@ -9,10 +9,10 @@ import pytest
 from msgspec import structs
 
 from flight.app.flight import body_kind
-from flight.loop.control_cycle import ATTITUDE_EVERY
+from flight.loop.flight_loop import ATTITUDE_EVERY
 from flight.schema import reader
+from flight.schema.bodies import as_testbed
 from flight.schema.document import ConfigError
-from flight.schema.testbed import as_testbed
 from ground.telemetry import Run
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
 from knightcube.gnc.guidance.plant import Q2_LIMIT

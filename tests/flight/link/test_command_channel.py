@@ -32,7 +32,7 @@ from flight.link.commands import (
     open_unix,
     unpack,
 )
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 from ground.link.commanding import exchange

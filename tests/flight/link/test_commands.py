@@ -25,7 +25,7 @@ from flight.link.commands import (
     Slew,
     unpack,
 )
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
 from flight.link.telemetry.packets import crc16

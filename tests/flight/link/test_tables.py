@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from flight.link import commands, events, modes
-from flight.link.events import EVENTS, EventKind, Reaction, Severity
-from flight.link.modes import Mode
+from flight.link import commands, events
+from flight.link.events import EVENTS, EventKind, Mode, Reaction, Severity
 from flight.link.process import directives
-from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS
-from flight.link.telemetry.fields import Packet
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Packet
 from tests.flight.link.published import COMMANDS, DIRECTIVES, PARAMETERS, published_events
 
 
@@ -37,12 +35,12 @@ def test_an_event_is_only_noted_unless_its_row_names_a_reaction() -> None:
 def test_modes_keep_their_numbers_and_only_some_can_be_commanded() -> None:
     names = ["boot", "safe", "detumble", "hold", "slew", "testbed-demo", "acquire", "sun", "point"]
     assert [(int(mode), mode.label) for mode in Mode] == list(enumerate(names))
-    assert [mode.label for mode in modes.COMMANDABLE] == [
+    assert [mode.label for mode in events.COMMANDABLE] == [
         "safe", "detumble", "hold", "slew", "testbed-demo", "sun", "point",
     ]  # fmt: skip
-    assert {mode.label for mode in modes.POINTING} == {"sun", "point"}
-    assert {mode.label for mode in modes.ORBITAL} == {"sun", "point", "acquire"}
-    assert {mode.label for mode in modes.STEERING} == {"sun", "point", "hold", "slew", "testbed-demo"}
+    assert {mode.label for mode in events.POINTING} == {"sun", "point"}
+    assert {mode.label for mode in events.ORBITAL} == {"sun", "point", "acquire"}
+    assert {mode.label for mode in events.STEERING} == {"sun", "point", "hold", "slew", "testbed-demo"}
 
 
 @pytest.mark.parametrize("mode", Mode)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, cast
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.loop.facts import EventLog, Facts
 from flight.loop.modes import ModeControl, ModeSettings
 from flight.schema.sections import Modes

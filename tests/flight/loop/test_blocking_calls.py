@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from flight.link.commands import DatagramChannel
-from flight.link.regular_files import make_lasting
+from flight.link.files.store import make_lasting
 from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
 from tests.support.blocking_calls import BlockingCalls
 
@@ -18,7 +18,7 @@ _LOCK = "a lock that its holder releases without a call of the operating system"
 ALLOWED = {
     "hal/buses/system.py:SystemClock.sleep_until_ns": ("time.sleep", "waits for the next cycle, as intended"),
     "flight/link/commands.py:_identity": ("posix.lstat", "a file in /run, which is in memory"),
-    "flight/loop/worker_processes.py:ProcessRunner.submit": ("posix.eventfd_write", "does not block"),
+    "flight/loop/executive.py:ProcessRunner.submit": ("posix.eventfd_write", "does not block"),
     "hal/guardian.py:GuardianLine.beat": ("_socket.socket.send", "MSG_DONTWAIT"),
     "hal/guardian.py:GuardianLine._receive": ("_socket.socket.recv", "MSG_DONTWAIT"),
     "hal/buses/system.py:ThreadTicker.kick": ("_thread.", _LOCK),
@@ -65,7 +65,7 @@ def test_a_call_that_waits_for_the_disk_or_a_socket_is_found(tmp_path: Path) -> 
     channel.poll()
     calls.stop()
     channel.close()
-    assert ("flight/link/regular_files.py:make_lasting", "posix.fsync") in calls.found
+    assert ("flight/link/files/store.py:make_lasting", "posix.fsync") in calls.found
     assert ("flight/link/commands.py:DatagramChannel.poll", "_socket.socket.recvfrom") in calls.found
 
 

@@ -10,12 +10,12 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from flight.link.modes import STEERING, Mode
+from flight.link.events import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE, COIL_CURRENTS
-from flight.loop import horizon_cameras, imaging
+from flight.loop import imaging, navigation
 from flight.loop.body import PLANNER, ControlOutput
-from flight.loop.control_cycle import ATTITUDE_EVERY, ControlCycle
 from flight.loop.executive import Cycle
+from flight.loop.flight_loop import ATTITUDE_EVERY, ControlCycle
 from flight.loop.navigation import CurrentValidity
 from hal.interfaces.devices import MOST_COILS, CoilState
 
@@ -212,7 +212,7 @@ def test_the_result_of_a_worker_goes_to_its_task_and_a_camera_s_updates_the_esti
     bench = Bench(Mode.HOLD)
     better: Any = SimpleNamespace(**vars(ESTIMATE))
     bench.tasks.navigation.estimate.side_effect = [ESTIMATE, ESTIMATE, better]
-    made = bench.results(PLANNER, imaging.WORKER, horizon_cameras.WORKER)
+    made = bench.results(PLANNER, imaging.WORKER, navigation.HORIZON_WORKER)
     output = bench.run()
     for task, result in zip(
         (bench.control.planner, bench.tasks.imaging, bench.tasks.horizon_cameras), made, strict=True
@@ -228,7 +228,7 @@ def test_the_result_of_a_worker_goes_to_its_task_and_a_camera_s_updates_the_esti
 def test_without_cameras_their_results_are_ignored() -> None:
     bench = Bench(Mode.HOLD)
     bench.tasks.imaging = bench.tasks.horizon_cameras = None
-    bench.results(imaging.WORKER, horizon_cameras.WORKER)
+    bench.results(imaging.WORKER, navigation.HORIZON_WORKER)
     assert bench.run().mode is Mode.HOLD
 
 

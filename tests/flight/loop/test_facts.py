@@ -14,8 +14,7 @@ from dataclasses import replace
 import pytest
 
 from flight.link import events
-from flight.link.events import EventKind
-from flight.link.modes import Mode
+from flight.link.events import EventKind, Mode
 from flight.loop import facts
 from flight.loop.facts import (
     FACTS,

@@ -12,7 +12,7 @@ from flight.link import events
 from flight.loop import facts
 from flight.loop.executive import JobResult
 from flight.loop.facts import Services
-from flight.loop.horizon_cameras import WORKER, HorizonCameraSettings, HorizonCameraTask
+from flight.loop.navigation import WORKER, HorizonCameraSettings, HorizonCameraTask
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS

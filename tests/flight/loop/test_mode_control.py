@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.loop import facts
 from flight.loop.modes import AttitudeWatch, Trigger
 from flight.schema.document import ConfigError

@@ -6,8 +6,7 @@ from itertools import product
 
 import pytest
 
-from flight.link.events import Reaction
-from flight.link.modes import Mode
+from flight.link.events import Mode, Reaction
 from flight.loop.facts import FACTS
 from flight.loop.modes import (
     COMMANDS,

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.telemetry.definitions import GPS_LINK
-from flight.link.telemetry.fields import Packet
+from flight.link.telemetry.definitions import GPS_LINK, Packet
 from flight.link.telemetry.log import Recorder
 from flight.loop.body import FixVerdict
 from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import POWER
 from flight.loop.power import PowerTask, Sheddable
 from flight.schema.devices import Battery, Power

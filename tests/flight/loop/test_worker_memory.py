@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flight.loop.executive import Worker
-from flight.loop.worker_processes import ProcessRunner
+from flight.loop.executive import ProcessRunner, Worker
 from hal.buses.system import SystemClock
 from tests.support import process_watch
 from tests.support.process_watch import MIB

@@ -14,8 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.loop.executive import JobResult, JobRunner, LockStepRunner, Worker, WorkerChange, WorkerNews
-from flight.loop.worker_processes import BUDGET, STEADY_NS, Attempts, ProcessRunner
+from flight.loop.executive import (
+    BUDGET,
+    STEADY_NS,
+    Attempts,
+    JobResult,
+    JobRunner,
+    LockStepRunner,
+    ProcessRunner,
+    Worker,
+    WorkerChange,
+    WorkerNews,
+)
 from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
@@ -194,7 +204,7 @@ def test_restarts_come_at_growing_intervals_within_a_budget_and_a_new_one_after_
 _ORPHANED = """
 import sys, time
 from flight.loop.executive import Worker
-from flight.loop.worker_processes import ProcessRunner
+from flight.loop.executive import ProcessRunner
 from hal.buses.system import SystemClock
 from hal.buses.system import worker_cores
 from hal.interfaces.wires import SECOND_NS
@@ -224,7 +234,7 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
 _STARTED = """
 import os, signal, time
 from flight.loop.executive import Worker
-from flight.loop.worker_processes import WorkerProcess
+from flight.loop.executive import WorkerProcess
 from tests.flight.loop.odd_jobs import hang
 process = WorkerProcess(Worker("hang", hang, 0, 10**12)).process_id
 os.kill(process, signal.SIGSTOP)

@@ -16,10 +16,9 @@ from flight.bodies.orbit.body import filter_settings
 from flight.link.commands import Point
 from flight.loop.commanding import command_of
 from flight.schema import reader
+from flight.schema.bodies import as_orbit, as_testbed
 from flight.schema.devices import camera_knowledge
 from flight.schema.document import ConfigError, read_document, to_yaml
-from flight.schema.orbit import as_orbit
-from flight.schema.testbed import as_testbed
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.vision.camera.lens import EXACT
 from sim_hal.assembly import camera_model

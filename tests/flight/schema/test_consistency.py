@@ -11,8 +11,8 @@ import pytest
 
 from flight.app.devices import check_settings
 from flight.link.commands import CommandPacker, Ping, open_udp
+from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.reader import load, parse, peer_networks, simulation_section
 from sim_hal.settings import Simulation
 from tests.support.flights import CONFIG

@@ -19,36 +19,36 @@ import flight
 import hal
 import knightcube
 import sim_hal
-from flight.schema import devices, orbit, sections, testbed
+from flight.schema import bodies, devices, sections
 from hal.interfaces.wires import SECOND_NS
 from tests.support.section_defaults import defaults_of
 
 OF_CAMERA = (devices.Camera, devices.StarTrackerSection)
 SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
-    "AdaptiveSettings": (testbed.Control,),
+    "AdaptiveSettings": (bodies.Control,),
     "AravisSettings": (devices.AravisDevice, devices.Camera),
     "CoilDriveSettings": (devices.Coils,),
     "CoilSettings": (devices.Coils,),
     "CoilMonitorSettings": (devices.Coils, devices.PowerMonitorSection),
-    "DetumblerSettings": (testbed.BdotDetumble, testbed.Plant),
-    "ExcitationSettings": (testbed.Identification,),
-    "FieldDetumblerSettings": (orbit.FieldDetumble,),
-    "FieldRateSettings": (orbit.FieldDetumble, orbit.Craft),
-    "FilterSettings": (testbed.ThreadEstimation,),
+    "DetumblerSettings": (bodies.BdotDetumble, bodies.Plant),
+    "ExcitationSettings": (bodies.Identification,),
+    "FieldDetumblerSettings": (bodies.FieldDetumble,),
+    "FieldRateSettings": (bodies.FieldDetumble, bodies.Craft),
+    "FilterSettings": (bodies.ThreadEstimation,),
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
     "ModeSettings": (sections.Modes, sections.Detumble),
     "NavigationSettings": (devices.InertialUnitSection, sections.Estimation),
-    "OrbitFilterSettings": (orbit.OrbitEstimation, orbit.Craft),
-    "PidSettings": (testbed.PidGains,),
-    "PlanningSettings": (testbed.Guidance,),
-    "ResponseSettings": (testbed.Plant, devices.InertialUnitSection),
-    "SelfTestSettings": (orbit.PointingSection, devices.Coils),
+    "OrbitFilterSettings": (bodies.OrbitEstimation, bodies.Craft),
+    "PidSettings": (bodies.PidGains,),
+    "PlanningSettings": (bodies.Guidance,),
+    "ResponseSettings": (bodies.Plant, devices.InertialUnitSection),
+    "SelfTestSettings": (bodies.PointingSection, devices.Coils),
     "ObjectMeasurementSettings": (devices.ObjectTracking,),
     "SolveSettings": OF_CAMERA,
     "StationSettings": (sections.Link,),
     "StreakSettings": OF_CAMERA,
-    "SunAcquisitionSettings": (orbit.PointingSection, orbit.Craft),
+    "SunAcquisitionSettings": (bodies.PointingSection, bodies.Craft),
     "TrackSettings": (devices.ObjectTracking,),
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),
@@ -149,4 +149,4 @@ def test_a_default_that_differs_is_found() -> None:
 def test_the_defaults_are_the_published_ones() -> None:
     """The defaults are unchanged, because a configuration that omits a key depends on its default."""
     published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
-    assert json.loads(json.dumps(defaults_of(devices, orbit, sections, testbed))) == published
+    assert json.loads(json.dumps(defaults_of(devices, sections, bodies))) == published

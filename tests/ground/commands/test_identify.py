@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from flight.schema.bodies import as_testbed
 from flight.schema.reader import parse
-from flight.schema.testbed import as_testbed
 from ground import report
 from ground.commands import identify
 from tests.ground.commands.in_process import command

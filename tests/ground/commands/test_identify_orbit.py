@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flight.schema.bodies import as_orbit
 from flight.schema.devices import camera_model
-from flight.schema.orbit import as_orbit
 from flight.schema.reader import load
 from ground.identification.orbit import fragment, learned_description
 from ground.telemetry import read_run

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.reader import load
 from ground.satellite_description import (
     QUESTIONS,

@@ -13,9 +13,9 @@ from typing import Any, cast
 import pytest
 
 from flight.link.commands import ChangeMode, Ping, Point, Slew, command_of_words, crc_of, unpack
+from flight.link.events import Mode
 from flight.link.files.store import Store
 from flight.link.files.transfer import Progress
-from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import (
@@ -39,8 +39,8 @@ from flight.link.telemetry.definitions import (
     PARAMETER_KEYS,
     PARAMETERS,
     VERIFICATION,
+    Packet,
 )
-from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import satellite
 from ground.link.commanding import FileSession

@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from flight.link import events
-from flight.link.modes import Mode
-from flight.link.telemetry.definitions import CONTROL, EVENT, HEALTH, MODE
-from flight.link.telemetry.fields import Packet
+from flight.link.events import Mode
+from flight.link.telemetry.definitions import CONTROL, EVENT, HEALTH, MODE, Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import station
 from ground.telemetry import decode

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from flight.link.commands import ChangeMode, CommandPacker
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from ground.console import commanding
 from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles
 from ground.xtce import TELECOMMANDS

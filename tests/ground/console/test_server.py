@@ -17,7 +17,7 @@ from aiohttp.test_utils import TestClient
 
 from flight.link import commands
 from flight.link.commands import COMMANDS, POINT, Command, crc_of
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
 from ground.console.commanding import CommandForms, RunFiles

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flight.link.commands import ChangeMode, CommandPacker, Ping
+from flight.link.events import Mode
 from flight.link.files.units import DOWN, SEGMENT_BYTES, UP, UnitPacker
-from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import HEADER_BYTES, Packer
 from ground.link.gateway import CommandStream, StreamError, new_token

@@ -18,8 +18,8 @@ from typing import cast
 import pytest
 
 from flight.link.commands import ChangeMode, CommandPacker, Ping
+from flight.link.events import Mode
 from flight.link.files.units import UP, UnitPacker
-from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import Packer
 from ground.link import gateway as module

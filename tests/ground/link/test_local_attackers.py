@@ -26,8 +26,8 @@ from typing import Any
 import pytest
 
 from flight.link.commands import ChangeMode, CommandPacker, Ping
+from flight.link.events import Mode
 from flight.link.frames import TELECOMMAND_MASK
-from flight.link.modes import Mode
 from flight.link.process.station import parser_of
 from flight.link.security import COMMAND_SPIS, Gate, Vault
 from ground.link.gateway import token_path

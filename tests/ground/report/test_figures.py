@@ -11,7 +11,7 @@ import pytest
 
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
-from flight.schema.testbed import as_testbed
+from flight.schema.bodies import as_testbed
 from ground.report import draw, draw_path
 from ground.telemetry import read_run
 from knightcube.errors import UsageError

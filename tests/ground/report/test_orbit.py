@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry import definitions as table
 from flight.link.telemetry.definitions import ORBIT_TRUTH, SPIN
 from flight.link.telemetry.fields import Packet

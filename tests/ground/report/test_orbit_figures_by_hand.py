@@ -10,9 +10,9 @@ import pytest
 from msgspec.structs import replace
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.schema import reader as configuration
-from flight.schema.orbit import Requirements, as_orbit
+from flight.schema.bodies import Requirements, as_orbit
 from ground.report import orbit
 from ground.report.signals import PowerHistory
 from knightcube.astro.quaternion import from_rotation_vector

@@ -13,7 +13,7 @@ from flight.app.flight import next_whole_second
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.schema import reader as configuration
-from flight.schema.testbed import TestbedConfig
+from flight.schema.bodies import TestbedConfig
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.current_monitors import Ina219
 from hal.drivers.pca9685 import Pca9685

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.schema.testbed import as_testbed
+from flight.schema.bodies import as_testbed
 from sim_hal.worlds.world import BodyMotion, WorldInputs, WorldTruth, about_thread
 
 RATE = 0.05

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 from flight.bodies.orbit.body import filter_settings
 from flight.schema import reader
+from flight.schema.bodies import as_orbit
 from flight.schema.document import ConfigError
-from flight.schema.orbit import as_orbit
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER

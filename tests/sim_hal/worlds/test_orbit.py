@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+from flight.schema.bodies import LARGEST_FIELD, LEAST_FIELD
 from flight.schema.document import ConfigError
-from flight.schema.orbit import LARGEST_FIELD, LEAST_FIELD
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flight.schema import reader
+from flight.schema.bodies import as_testbed
 from flight.schema.document import config_path
-from flight.schema.testbed import as_testbed
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
 from sim_hal.worlds.testbed import Testbed, TestbedModel, helmholtz_field

@@ -27,8 +27,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from flight.link.commands import CommandPacker, DatagramChannel, Ping, open_unix, unpack
+from flight.link.events import Mode
 from flight.link.frames import TELECOMMAND_HEADER, TELEMETRY_HEADER
-from flight.link.modes import Mode
 from flight.link.process.commanding import ControlLine, Sent, Timetable
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings

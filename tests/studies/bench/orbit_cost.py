@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 import yaml
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import Run, read_run
 from tests.pace import ORDINARY_PACE_S, pace_s

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
 from flight.loop.state import StateStore, StoredState
 from ground.campaigns.runner import Case, Result, Summary, summary

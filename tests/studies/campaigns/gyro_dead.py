@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.schema import reader as configuration
 from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.report.orbit import attitude_errors, pointing_errors

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
-from flight.link.modes import POINTING, Mode
+from flight.link.events import POINTING, Mode
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.campaigns.runner import Case, Result, Summary, summary

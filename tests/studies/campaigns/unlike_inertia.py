@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.campaigns.runner import Case, Result, Summary, summary

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.telemetry.definitions import EVENT, IMU, RUN, TARGET
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import EVENT, IMU, RUN, TARGET, Field, Packet
 from flight.link.telemetry.packets import Packer, compile_layouts
 from knightcube.errors import UsageError
 from tests.studies.same_bytes.__main__ import main, run_all, table

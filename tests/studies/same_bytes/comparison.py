@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import Field, Packet
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import HEADER_BYTES, Layout, compile_layouts, to_text
 from knightcube.errors import UsageError

@@ -19,4 +19,4 @@ def test_the_commands_are_the_published_ones() -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_has_its_published_arguments(name: str) -> None:
     """The published arguments do not change, because users' scripts and systemd units depend on them."""
-    assert arguments_of(f"flight.app.cli.{name}:configure") == PUBLISHED[name]
+    assert arguments_of(f"flight.app.cli.{COMMANDS[name][2]}") == PUBLISHED[name]

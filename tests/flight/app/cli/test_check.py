@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flight.app.cli.check import flight_problems
+from flight.app.cli.run import flight_problems
 from flight.app.run import RunResult
 from flight.loop.flight_loop import FlightEnding
 from tests.ground.commands.in_process import command

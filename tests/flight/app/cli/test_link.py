@@ -28,7 +28,7 @@ from flight.app.cli.link import self_test
 from flight.app.service import FlownRelease
 from flight.link.coding import LinkCodes
 from flight.link.commands import PING, CommandPacker, Ping, open_unix
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, VERIFICATION

@@ -18,7 +18,7 @@ from flight.bodies.orbit.environment import (
 )
 from flight.loop.navigation import GPS_DELAY_NS
 from flight.schema import reader as configuration
-from flight.schema.orbit import as_orbit
+from flight.schema.bodies import as_orbit
 from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray

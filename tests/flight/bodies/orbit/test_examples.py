@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
+from flight.schema.bodies import as_orbit
 from flight.schema.devices import Winding
 from flight.schema.document import FOLDER
-from flight.schema.orbit import as_orbit
 from sim_hal.settings import FaultEntry, Simulation
 from tests.support.flights import fly
 from tests.support.unlike_body import without_cameras

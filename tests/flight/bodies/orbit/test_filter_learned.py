@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from flight.bodies.orbit.body import OrbitView
-from flight.bodies.orbit.learned_states import (
+from flight.bodies.orbit.filter import (
     BODY,
     ERRORS,
     LEARNED_AT,
@@ -19,7 +19,7 @@ from flight.bodies.orbit.learned_states import (
     start_from,
 )
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.loop.state import Learned, StoredState, decode, encode
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.estimate import Knowledge

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.steps import DipoleHistory, OpenStep, RateByField
+from flight.bodies.orbit.propagation import DipoleHistory, OpenStep, RateByField
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.earth.disturbance import Pressures

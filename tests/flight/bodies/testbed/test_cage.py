@@ -10,8 +10,8 @@ import pytest
 from flight.bodies.testbed.control import CageField, CageTracker, ThreadEstimate, local_frame, plant_of
 from flight.loop.body import CoilCommand
 from flight.schema import reader as configuration
+from flight.schema.bodies import Cage, TestbedConfig, as_testbed
 from flight.schema.document import ConfigError, config_path
-from flight.schema.testbed import Cage, TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix

@@ -8,10 +8,10 @@ from typing import Any
 
 from flight.link.coding import LinkCodes
 from flight.link.commands import open_unix
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.process.commanding import ControlLine, Report, Sent
 from flight.link.process.downlink import LogFollower
-from flight.link.process.renewal import STATUS
+from flight.link.process.filing import STATUS
 from flight.link.process.station import TURN_NS, Station, StationSettings
 from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, LINK, MODE, VERIFICATION

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
-from flight.link.process.renewal import Renewal, decoded, encoded
+from flight.link.process.filing import Renewal, decoded, encoded
 from flight.link.telemetry.definitions import EVENT, FIX
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds

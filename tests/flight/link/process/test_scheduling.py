@@ -23,7 +23,8 @@ from flight.link.commands import (
     unpack,
     words_of,
 )
-from flight.link.modes import Mode
+from flight.link.events import Mode
+from flight.link.files.store import overwrite
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import (
     LATEST_NS,
@@ -36,7 +37,6 @@ from flight.link.process.commanding import (
     TimetableError,
 )
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
-from flight.link.regular_files import overwrite
 from flight.link.telemetry.definitions import RUN
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from flight.link.commands import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.process import directives, station
 from flight.link.process.directives import NewKey, Play, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from flight.link.telemetry.definitions import CYCLE_TIMING
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import CYCLE_TIMING, Field, Packet
 from flight.link.telemetry.packets import Packer
 
 _BITS = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64}

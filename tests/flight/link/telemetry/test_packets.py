@@ -18,8 +18,7 @@ from spacepackets.ccsds.spacepacket import (
 )
 
 from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
-from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, PACKETS, TARGET
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, PACKETS, TARGET, Field, Packet
 from flight.link.telemetry.packets import (
     LAYOUTS,
     SEQUENCE_MODULUS,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.bodies.testbed.control import controller_of
-from flight.schema.testbed import Control, Identification
+from flight.schema.bodies import Control, Identification
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis import AngleController, LqTracker
 from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant
