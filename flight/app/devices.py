@@ -215,7 +215,7 @@ def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> An
 
 
 def _dated(rig: Rig, config: Config) -> Rig:
-    """Return the rig with an earliest plausible date that follows from the two-line elements' epoch."""
+    """Return the rig with the earliest plausible date, from the epoch of the two-line elements."""
     if isinstance(config, OrbitConfig) and config.elements is not None:
         with suppress(UsageError):  # invalid elements are reported when the body is built
             days = TwoLineElements(*config.elements).epoch - UNIX_EPOCH
@@ -253,10 +253,8 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     Raises ConfigError. Raises DeviceError for missing hardware, unless `patient` is true: the flight then
     waits for the hardware.
     """
-    rig, off = (
-        real_rig(config, stack, patient, exclusive=True),
-        driver_of("coils", config.coils).off(config.coils),
-    )
+    rig = real_rig(config, stack, patient, exclusive=True)
+    off = driver_of("coils", config.coils).off(config.coils)
     if not off:
         raise ConfigError("coils.driver", "gives no I2C writes (`off`) for the guardian to stop the coils")
     bus = rig.wires.i2c()
@@ -298,6 +296,17 @@ def open_camera(
 
 # Functions of the built-in drivers, to which the driver registrations refer (`flight.schema.devices`).
 
+def _serial_device(section: InertialUnitSection | Gps) -> Sequence[str]:
+    return (section.device,)
+
+
+def _own_bus(section: Coils | PowerMonitorSection | SolarStringsSection) -> Sequence[str]:
+    return () if section.bus is None else (device_file(section.bus),)
+
+
+files_vn100 = files_ublox = files_nmea = _serial_device
+files_pca9685 = files_drv8830 = files_ina219 = files_ads1115 = _own_bus
+
 _CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
 _LISTENED_NS = 2_500_000_000
 _LOOK_NS = 20_000_000
@@ -326,11 +335,6 @@ def open_vn100(rig: Rig, unit: InertialUnitSection) -> Vn100:
 def probe_vn100(rig: Rig, unit: InertialUnitSection) -> str:
     """Ask a VN-100 for its model number. Raises DeviceError."""
     return f"answers: {open_vn100(rig, unit).model()}"
-
-
-def files_vn100(unit: InertialUnitSection) -> Sequence[str]:
-    """Return the serial device."""
-    return (unit.device,)
 
 
 def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
@@ -412,11 +416,6 @@ def probe_pca9685(rig: Rig, coils: Coils) -> str:
     return _read_chips(rig, coils.bus, MODE1, coils.address)
 
 
-def files_pca9685(coils: Coils) -> Sequence[str]:
-    """Return the I2C bus."""
-    return (device_file(coils.bus),)
-
-
 def off_pca9685(coils: Coils) -> Sequence[tuple[int, int, int]]:
     """Return the write that switches all outputs off."""
     return ((coils.address, ALL_LED_OFF_H, FULL),)
@@ -443,9 +442,6 @@ def _bridges(coils: Coils) -> range:
     return range(coils.address, coils.address + len(coils.slots))
 
 
-files_drv8830: Callable[[Coils], Sequence[str]] = files_pca9685
-
-
 def open_ina219(rig: Rig, monitor: PowerMonitorSection) -> Ina219:
     """Return the driver of an INA219."""
     bus, largest = rig.wires.i2c(monitor.bus), monitor.maximum_current
@@ -460,11 +456,6 @@ def check_ina219(monitor: PowerMonitorSection) -> int:
 def probe_ina219(rig: Rig, monitor: PowerMonitorSection) -> str:
     """Read a register of the current monitor. Raises NotResponding."""
     return _read_chips(rig, monitor.bus, CONFIG, monitor.address)
-
-
-def files_ina219(monitor: PowerMonitorSection) -> Sequence[str]:
-    """Return the I2C bus, if it is not the bus of the coils."""
-    return () if monitor.bus is None else (device_file(monitor.bus),)
 
 
 def open_ublox(rig: Rig, gps: Gps) -> GpsReceiver:
@@ -485,19 +476,13 @@ def probe_ublox(rig: Rig, gps: Gps) -> str:
     raise NotResponding(gps.device, f"{silence}: check power, the cable and the baud rate")
 
 
-def files_ublox(gps: Gps) -> Sequence[str]:
-    """Return the serial device."""
-    return (gps.device,)
-
-
 def open_nmea(rig: Rig, gps: Gps) -> GpsReceiver:
     """Return the driver of a receiver that sends NMEA 0183 sentences by itself."""
     port = rig.wires.serial(gps.device, gps.baud_rate)
     return NmeaReceiver(port, rig.clock, max(EARLIEST_NS, rig.earliest_utc_ns))
 
 
-probe_nmea: Callable[[Rig, Gps], str] = probe_ublox
-files_nmea: Callable[[Gps], Sequence[str]] = files_ublox
+probe_nmea = probe_ublox
 
 
 def open_ads1115(rig: Rig, section: SolarStringsSection) -> AdsSolarStrings:
@@ -511,11 +496,6 @@ def probe_ads1115(rig: Rig, section: SolarStringsSection) -> str:
     """Read a register of each converter. Raises NotResponding."""
     addresses = sorted({string.address for string in section.strings})
     return _read_chips(rig, section.bus, ADS1115_CONFIG, *addresses)
-
-
-def files_ads1115(section: SolarStringsSection) -> Sequence[str]:
-    """Return the I2C bus, if it is not the bus of the coils."""
-    return () if section.bus is None else (device_file(section.bus),)
 
 
 def open_v4l2(rig: Rig, camera: Camera | WideCamera) -> V4l2Camera:
@@ -558,7 +538,7 @@ def files_v4l2(camera: Camera | WideCamera) -> Sequence[str]:
     return (camera.device.path,) if isinstance(camera.device, V4l2Device) else ()
 
 
-files_aravis: Callable[[Camera | WideCamera], Sequence[str]] = files_v4l2
+files_aravis = files_v4l2
 
 
 def _read_chips(rig: Rig, bus: int | str | None, register: int, *addresses: int) -> str:

@@ -202,10 +202,7 @@ class _Judged:
 class _Opened:
     """A flight that is ready to begin."""
 
-    request: RunRequest
-    text: str
-    merged: str
-    config: Config
+    judged: _Judged
     rig: Rig
     loop: FlightLoop
     log: FlightLog
@@ -221,7 +218,7 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
     """
     with EndingSignals() as signals, ExitStack() as stack:
         opened = _start(request, signals, stack)
-        loop, rig, config, text = opened.loop, opened.rig, opened.config, opened.text
+        loop, rig, judged = opened.loop, opened.rig, opened.judged
         if progress is not None:
             loop.watch(progress)
         release = FlownRelease(os.environ)
@@ -231,7 +228,8 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
             loop.note(events.RETURNED, note)
         if rig.realtime:
             release.serve(rig.clock, stack)
-        label = RunLabel(opened.merged, rig.seed, config.simulation is not None, rig.realtime)
+        simulated = judged.config.simulation is not None
+        label = RunLabel(judged.merged, rig.seed, simulated, rig.realtime)
         epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
         rig.release(epoch_ns)
         signals.end(loop)
@@ -242,8 +240,8 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
         late = None
         with suppress(OSError):  # the emulated devices have ended before the flight
             late = rig.lateness() if rig.lateness is not None else None
-    faults = () if config.simulation is None else injected_faults(opened.request, text)
-    folder, error = opened.request.out, opened.log.error()
+    faults = injected_faults(judged.request, judged.text) if simulated else ()
+    folder, error = judged.request.out, opened.log.error()
     return RunResult(folder, reason, signals.received, error, ending, loop.restart, faults, late)
 
 
@@ -302,7 +300,7 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
     elif chosen.accepted and rig.realtime and (folder := service_folder(os.environ)) is not None:
         stack.callback(FlownConfig(judged.merged, folder).serve(rig.clock).stop)
     unflown.pop_all()
-    return _Opened(request, text, judged.merged, config, rig, loop, log)
+    return _Opened(replace(judged, request=request), rig, loop, log)
 
 
 @contextmanager

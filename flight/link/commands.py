@@ -13,7 +13,6 @@ that the filter can inspect begin with the UDP header for UDP sockets, and with 
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import socket
@@ -30,7 +29,6 @@ from typing import Any, ClassVar, Protocol
 
 from flight.link.events import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet
-from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     Layout,
@@ -133,7 +131,7 @@ LOAD_PARAMETERS = telecommand(
         "CRC-32 of the table to be replaced; the command is refused if another table is in use",
     ),
     Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
-    *PARAMETERS,
+    *PARAMETER_FIELDS,
     hazard="changes the limits at which the satellite detumbles, stops or warns",
 )
 DUMP_PARAMETERS = telecommand("dump-parameters", 0x211, "Report the table of parameters in use")
@@ -156,8 +154,8 @@ class MalformedError(CommandError):
     """
 
 
-class _Plain:
-    """Command class whose attributes have the same names as the fields of its packet."""
+class _Command:
+    """Command, whose attributes have the names of the fields of its packet unless it overrides `fields`."""
 
     __slots__ = ()
     packet: ClassVar[Packet]
@@ -167,17 +165,20 @@ class _Plain:
         """Values of the packet's fields by field name."""
         return {field.name: getattr(self, field.name) for field in self.packet.fields}
 
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return str(self)
+
 
 @dataclass(frozen=True, slots=True)
-class Ping(_Plain):
+class Ping(_Command):
     """Command that requests an answer with the same number."""
 
     number: int = 0
     packet = PING
 
-    @property
-    def text(self) -> str:
-        """The command as printable text."""
+    def __str__(self) -> str:
         return f"ping {self.number}"
 
 
@@ -205,33 +206,29 @@ class ChangeMode:
 
 
 @dataclass(frozen=True, slots=True)
-class Slew(_Plain):
+class Slew(_Command):
     """Command to slew to an attitude."""
 
     q2: float
     packet = SLEW
 
-    @property
-    def text(self) -> str:
-        """The command as printable text."""
+    def __str__(self) -> str:
         return f"slew to q2 {self.q2:+.4f}" if math.isfinite(self.q2) else "slew"
 
 
 @dataclass(frozen=True, slots=True)
-class Clear(_Plain):
+class Clear(_Command):
     """Command to clear a latched event, so that the event can be raised again."""
 
     event: str
     packet = CLEAR
 
-    @property
-    def text(self) -> str:
-        """The command as printable text."""
+    def __str__(self) -> str:
         return f"clear {shown(self.event)}"
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class Point(_Command):
     """Command to point to a target."""
 
     target: PointingTarget
@@ -247,14 +244,12 @@ class Point:
             "roll": math.nan if target.roll is None else target.roll,
         }
 
-    @property
-    def text(self) -> str:
-        """The command as printable text."""
+    def __str__(self) -> str:
         return f"point {self.target.text}"
 
 
 @dataclass(frozen=True, slots=True)
-class LoadParameters:
+class LoadParameters(_Command):
     """Command to replace the parameter table.
 
     Attributes:
@@ -277,21 +272,17 @@ class LoadParameters:
         named = {field.name: value for field, value in zip(PARAMETER_FIELDS, self.values, strict=True)}
         return {"replaced": self.replaced, "crc": crc_of(self.values), **named}
 
-    @property
-    def text(self) -> str:
-        """The command as printable text."""
+    def __str__(self) -> str:
         return f"load-parameters {crc_of(self.values):08x} replacing {self.replaced:08x}"
 
 
 @dataclass(frozen=True, slots=True)
-class DumpParameters(_Plain):
+class DumpParameters(_Command):
     """Command to report the parameter table in use."""
 
     packet = DUMP_PARAMETERS
 
-    @property
-    def text(self) -> str:
-        """The command as printable text."""
+    def __str__(self) -> str:
         return "dump-parameters"
 
 
@@ -299,10 +290,7 @@ Command = Ping | ChangeMode | Slew | Clear | Point | LoadParameters | DumpParame
 
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the pointing target in the fields of a POINT packet. A roll of NaN means a free roll angle.
-
-    Raises CommandError for fields that do not define a target.
-    """
+    """Return the pointing target in the fields of a POINT packet. Raises CommandError."""
     goal = Goal(number)
     try:
         counts = NUMBERS.get(goal, (0,))
@@ -315,10 +303,7 @@ def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
 
 
 def _table(fields: Mapping[str, Any]) -> LoadParameters:
-    """Return the parameter table in the fields of a packet.
-
-    Raises CommandError if the table's CRC is wrong.
-    """
+    """Return the parameter table in the fields of a packet. Raises CommandError for a wrong CRC."""
     values = tuple(fields[field.name] for field in PARAMETER_FIELDS)
     if fields["crc"] != crc_of(values):
         raise CommandError(f"crc = {fields['crc']:08x}, but the CRC of the values is {crc_of(values):08x}")
@@ -620,7 +605,7 @@ class DatagramChannel:
     def answer(self, data: bytes, sender: Any) -> None:
         """Send an answer to a sender if it has an address."""
         if sender:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 self._socket.sendto(data, sender)
 
     def close(self) -> None:
@@ -628,7 +613,7 @@ class DatagramChannel:
         self._socket.close()
         self._closed = True
         if self._path is not None and self._file is not None and _identity(self._path) == self._file:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 self._path.unlink()
 
     def _look(self, path: Path) -> None:
@@ -669,7 +654,7 @@ def _bound_unix(path: Path) -> socket.socket:
     """Return a UNIX datagram socket bound to `path`. Raises OSError if the socket cannot be bound."""
     bound = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
-        with contextlib.suppress(FileNotFoundError):
+        with suppress(FileNotFoundError):
             if not stat.S_ISSOCK(path.lstat().st_mode):
                 raise OSError("a file that is not a socket has this path")
             if _is_served(path):

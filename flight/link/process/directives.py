@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from flight.link.commands import CommandError, command_of_words, telecommand
 from flight.link.files.store import LONGEST_NAME
@@ -37,71 +37,54 @@ _ENTITY = Field(
     "entity", "u2", "-", "receiving entity", states=((GROUND, "ground"), (FOREIGN, "another-ground-station"))
 )
 _NAME = Field("name", f"S{LONGEST_NAME}", "-", "name in the list of files, such as received/elements/tle.txt")
-
-LIST_FILES = telecommand(
-    "list-files",
-    0x223,
-    "Send the list of files on board, as the file listing.json",
-    _ENTITY,
-    Field("under", f"S{LONGEST_NAME}", "-", "prefix of the listed names; an empty prefix lists all files"),
-)
-SEND_FILE = telecommand("send-file", 0x224, "Send a file down, or the missing parts of it", _ENTITY, _NAME)
-CANCEL_FILE = telecommand(
-    "cancel-file",
-    0x225,
-    "End a transfer and delete the received part of the file",
-    Field("source", "u2", "-", "sending entity, as in the packet transfer"),
-    Field("number", "u4", "-", "number of the transfer at the sending entity"),
-)
-SUSPEND_FILE = telecommand(
-    "suspend-file", 0x229, "Suspend a transfer until it is resumed, even across restarts", *CANCEL_FILE.fields
-)
-RESUME_FILE = telecommand("resume-file", 0x22A, "Resume a suspended transfer", *CANCEL_FILE.fields)
-USE_FILE = telecommand(
-    "use-file",
-    0x226,
-    "Check the SHA-256 of a received file and select it for use by the board",
-    _NAME,
-    Field("sum", "u1", "-", "SHA-256 of the file", SUM_BYTES),
-    hazard="the board may use the file from now on",
-)
-DELETE_FILE = telecommand("delete-file", 0x227, "Delete a received file", _NAME, hazard="deletes the file")
 _KIND = Field("kind", "u1", "-", "kind of the artefact", states=tuple(enumerate(KINDS)))
-ACTIVATE = telecommand(
-    "activate",
-    0x2B0,
-    "Start the trial of a received, signed artefact; unless it is confirmed, the previous artefact returns",
-    _NAME,
-    Field("sum", "u1", "-", "SHA-256 of the bundle", SUM_BYTES),
-    Field("hours", "f4", "h", "powered time within which the ground must confirm"),
-    Field("despite_faults", "u1", "-", "1 if the trial continues after a fault that the flight reports"),
-    hazard="restarts flight and link with another configuration or release",
-)
-CONFIRM = telecommand("confirm", 0x2B1, "End the trial of an artefact and keep the artefact", _KIND)
-WITHDRAW = telecommand(
-    "withdraw",
-    0x2B2,
-    "End the trial of an artefact, or return to the previous configuration or release",
-    _KIND,
-    hazard="restarts flight and link with another configuration or release",
-)
 PARTS = ("flight", "link", "board")
-RESTART = telecommand(
-    "restart",
-    0x2B3,
-    "Restart the flight, the link or the whole board within 10 s",
-    Field("part", "u1", "-", "part to restart", states=tuple(enumerate(PARTS))),
-    hazard="ends the running flight or the link; after a restart of the board both begin again",
-)
-PLAY = telecommand(
-    "play",
-    0x2A0,
-    "Play back an interval of the archive",
-    Field("run", "u4", "-", "number of the run; 0 for the newest"),
-    Field("begin", "f8", "s", "mission time of the first packet"),
-    Field("end", "f8", "s", "mission time of the last packet"),
-)
-STOP = telecommand("stop-playback", 0x2A1, "End the playback")
+_RESTARTS = "restarts flight and link with another configuration or release"
+
+
+class _Directive:
+    """Directive whose attributes have the names of the fields of its packet.
+
+    The text `says` describes the directive; `{0}` stands for the directive.
+    """
+
+    __slots__ = ()
+    packet: ClassVar[Packet]
+    says: ClassVar[str]
+
+    def __str__(self) -> str:
+        return self.says.format(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Play(_Directive):
+    """Directive to play back telemetry from mission time `begin` to `end` (s) of the run with a number."""
+
+    run: int
+    begin: float
+    end: float
+    packet = telecommand(
+        "play",
+        0x2A0,
+        "Play back an interval of the archive",
+        Field("run", "u4", "-", "number of the run; 0 for the newest"),
+        Field("begin", "f8", "s", "mission time of the first packet"),
+        Field("end", "f8", "s", "mission time of the last packet"),
+    )
+
+    def __str__(self) -> str:
+        run = f"run {self.run}" if self.run else "the newest run"
+        return f"play {run} from {self.begin:g} to {self.end:g} s"
+
+
+@dataclass(frozen=True, slots=True)
+class Stop(_Directive):
+    """Directive to stop the playback."""
+
+    packet = telecommand("stop-playback", 0x2A1, "End the playback")
+    says = "stop playback"
+
+
 NEW_KEY = telecommand(
     "new-key",
     0x2A2,
@@ -110,6 +93,19 @@ NEW_KEY = telecommand(
     Field("generation", "u4", "-", "generation of the new key, one above the old generation"),
     Field("key", "u1", "-", "new key of AES-256", KEY_BYTES),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class NewKey(_Directive):
+    """Directive to change the key of an SPI."""
+
+    spi: int
+    generation: int
+    key: bytes = field(repr=False)
+    packet = NEW_KEY
+    says = "new key of SPI {0.spi}, generation {0.generation}"
+
+
 PORTION = telecommand(
     "portion",
     0x2A3,
@@ -118,189 +114,17 @@ PORTION = telecommand(
     Field("number", "u1", "-", "number of this portion, 1 to `total`, in this order"),
     Field("data", "u1", "-", "bytes of the packet; zeros fill the last portion", _PORTION_BYTES),
 )
-SCHEDULE = telecommand(
-    "schedule",
-    0x220,
-    "Execute a command at a time in UTC, also after a restart",
-    Field("at", f"S{_LONGEST_UTC}", "-", "time in UTC, such as 2026-11-23T21:00:00"),
-    Field(
-        "words",
-        f"S{LONGEST_COMMAND}",
-        "-",
-        "command in words, such as slew 0.2 or point ground 52.5deg 13.4deg roll 90deg",
-    ),
-    hazard="executes the command later",
-)
-UNSCHEDULE = telecommand(
-    "unschedule", 0x221, "Delete a scheduled command", Field("number", "u4", "-", "its number; 0 deletes all")
-)
-LIST = telecommand("list-schedule", 0x222, "Report each scheduled command")
 
 
 @dataclass(frozen=True, slots=True)
-class ListFiles:
-    """Directive to send the list of files to a CFDP entity."""
-
-    under: str = ""
-    entity: int = GROUND
-
-    def __str__(self) -> str:
-        return f"list files {self.under}".rstrip()
-
-
-@dataclass(frozen=True, slots=True)
-class SendFile:
-    """Directive to send a file to a CFDP entity."""
-
-    name: str
-    entity: int = GROUND
-
-    def __str__(self) -> str:
-        return f"send {self.name}"
-
-
-@dataclass(frozen=True, slots=True)
-class _OnTransfer:
-    """Directive about a file transfer, identified by sending entity and transaction number."""
-
-    source: int
-    number: int
-
-    def __str__(self) -> str:
-        verb = type(self).__name__.removesuffix("File").lower()
-        return f"{verb} transfer {self.number} of entity {self.source}"
-
-
-class CancelFile(_OnTransfer):
-    """Directive to cancel a file transfer."""
-
-
-class SuspendFile(_OnTransfer):
-    """Directive to suspend a file transfer."""
-
-
-class ResumeFile(_OnTransfer):
-    """Directive to resume a suspended file transfer."""
-
-
-@dataclass(frozen=True, slots=True)
-class UseFile:
-    """Directive to select a received file for use if its SHA-256 is `sum`."""
-
-    name: str
-    sum: bytes
-
-    def __str__(self) -> str:
-        return f"use {self.name}"
-
-
-@dataclass(frozen=True, slots=True)
-class Activate:
-    """Directive to try the received bundle `name` of a signed artefact (docs/fly/renewal.md).
-
-    Attributes:
-        name: name of the bundle in the list of files.
-        sum: SHA-256 of the bundle.
-        hours: powered time (h) within which the ground must confirm the artefact.
-        despite_faults: 1 if the trial continues after a fault that the flight reports.
-    """
-
-    name: str
-    sum: bytes
-    hours: float
-    despite_faults: int
-
-    def __str__(self) -> str:
-        return f"activate {self.name} for {self.hours:g} h"
-
-
-@dataclass(frozen=True, slots=True)
-class _OnRenewal:
-    """Directive about the trial of an update. The attribute `kind` is an index of `KINDS`."""
-
-    kind: int
-
-    def __str__(self) -> str:
-        return f"{type(self).__name__.lower()} {KINDS[self.kind]}"
-
-
-class Confirm(_OnRenewal):
-    """Directive to end a trial in favour of the new artefact."""
-
-
-class Withdraw(_OnRenewal):
-    """Directive to return to the previous configuration or release."""
-
-
-@dataclass(frozen=True, slots=True)
-class Restart:
-    """Directive to restart a part of the satellite. The attribute `part` is an index of `PARTS`."""
-
-    part: int
-
-    def __str__(self) -> str:
-        return f"restart {PARTS[self.part]}"
-
-
-@dataclass(frozen=True, slots=True)
-class DeleteFile:
-    """Directive to delete a received file."""
-
-    name: str
-
-    def __str__(self) -> str:
-        return f"delete {self.name}"
-
-
-@dataclass(frozen=True, slots=True)
-class Play:
-    """Directive to play back recorded telemetry.
-
-    Attributes:
-        run: number of the run, 0 for the newest run.
-        begin: mission time of the first packet, s.
-        end: mission time of the last packet, s.
-    """
-
-    run: int
-    begin: float
-    end: float
-
-    def __str__(self) -> str:
-        run = f"run {self.run}" if self.run else "the newest run"
-        return f"play {run} from {self.begin:g} to {self.end:g} s"
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """Directive to stop the playback."""
-
-    def __str__(self) -> str:
-        return "stop playback"
-
-
-@dataclass(frozen=True, slots=True)
-class NewKey:
-    """Directive to change the key of an SPI."""
-
-    spi: int
-    generation: int
-    key: bytes = field(repr=False)
-
-    def __str__(self) -> str:
-        return f"new key of SPI {self.spi}, generation {self.generation}"
-
-
-@dataclass(frozen=True, slots=True)
-class Portion:
+class Portion(_Directive):
     """Directive that carries one segment of a packet: the segment `number` of `total` segments."""
 
     total: int
     number: int
     data: bytes
-
-    def __str__(self) -> str:
-        return f"portion {self.number} of {self.total}"
+    packet = PORTION
+    says = "portion {0.number} of {0.total}"
 
 
 class Joiner:
@@ -326,12 +150,24 @@ class Joiner:
         return whole[: int.from_bytes(whole[4:HEADER_BYTES], "big") + HEADER_BYTES + 1]
 
 
+_WORDS = "command in words, such as slew 0.2 or point ground 52.5deg 13.4deg roll 90deg"
+SCHEDULE = telecommand(
+    "schedule",
+    0x220,
+    "Execute a command at a time in UTC, also after a restart",
+    Field("at", f"S{_LONGEST_UTC}", "-", "time in UTC, such as 2026-11-23T21:00:00"),
+    Field("words", f"S{LONGEST_COMMAND}", "-", _WORDS),
+    hazard="executes the command later",
+)
+
+
 @dataclass(frozen=True, slots=True)
-class Scheduled:
+class Scheduled(_Directive):
     """Directive to execute a command, given in words, at a UTC in ISO 8601 format."""
 
     at: str
     words: str
+    packet = SCHEDULE
 
     def __str__(self) -> str:
         try:
@@ -342,21 +178,196 @@ class Scheduled:
 
 
 @dataclass(frozen=True, slots=True)
-class Deletion:
+class Deletion(_Directive):
     """Directive to delete a scheduled command. The number 0 deletes all scheduled commands."""
 
     number: int
+    packet = telecommand(
+        "unschedule",
+        0x221,
+        "Delete a scheduled command",
+        Field("number", "u4", "-", "its number; 0 deletes all"),
+    )
 
     def __str__(self) -> str:
         return f"delete scheduled command {self.number}" if self.number else "delete all scheduled commands"
 
 
+LIST = telecommand("list-schedule", 0x222, "Report each scheduled command")
+
+
 @dataclass(frozen=True, slots=True)
-class Listing:
+class Listing(_Directive):
     """Directive to report all scheduled commands."""
 
+    packet = LIST
+    says = "list scheduled commands"
+
+
+@dataclass(frozen=True, slots=True)
+class ListFiles(_Directive):
+    """Directive to send the list of files to a CFDP entity."""
+
+    under: str = ""
+    entity: int = GROUND
+    packet = telecommand(
+        "list-files",
+        0x223,
+        "Send the list of files on board, as the file listing.json",
+        _ENTITY,
+        Field(
+            "under", f"S{LONGEST_NAME}", "-", "prefix of the listed names; an empty prefix lists all files"
+        ),
+    )
+
     def __str__(self) -> str:
-        return "list scheduled commands"
+        return f"list files {self.under}".rstrip()
+
+
+SEND_FILE = telecommand("send-file", 0x224, "Send a file down, or the missing parts of it", _ENTITY, _NAME)
+
+
+@dataclass(frozen=True, slots=True)
+class SendFile(_Directive):
+    """Directive to send a file to a CFDP entity."""
+
+    name: str
+    entity: int = GROUND
+    packet = SEND_FILE
+    says = "send {0.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class _OnTransfer(_Directive):
+    """Directive about a file transfer, identified by sending entity and transaction number."""
+
+    source: int
+    number: int
+
+
+class CancelFile(_OnTransfer):
+    """Directive to cancel a file transfer."""
+
+    packet = telecommand(
+        "cancel-file",
+        0x225,
+        "End a transfer and delete the received part of the file",
+        Field("source", "u2", "-", "sending entity, as in the packet transfer"),
+        Field("number", "u4", "-", "number of the transfer at the sending entity"),
+    )
+    says = "cancel transfer {0.number} of entity {0.source}"
+
+
+class SuspendFile(_OnTransfer):
+    """Directive to suspend a file transfer."""
+
+    packet = telecommand(
+        "suspend-file",
+        0x229,
+        "Suspend a transfer until it is resumed, even across restarts",
+        *CancelFile.packet.fields,
+    )
+    says = "suspend transfer {0.number} of entity {0.source}"
+
+
+class ResumeFile(_OnTransfer):
+    """Directive to resume a suspended file transfer."""
+
+    packet = telecommand("resume-file", 0x22A, "Resume a suspended transfer", *CancelFile.packet.fields)
+    says = "resume transfer {0.number} of entity {0.source}"
+
+
+@dataclass(frozen=True, slots=True)
+class UseFile(_Directive):
+    """Directive to select a received file for use if its SHA-256 is `sum`."""
+
+    name: str
+    sum: bytes
+    packet = telecommand(
+        "use-file",
+        0x226,
+        "Check the SHA-256 of a received file and select it for use by the board",
+        _NAME,
+        Field("sum", "u1", "-", "SHA-256 of the file", SUM_BYTES),
+        hazard="the board may use the file from now on",
+    )
+    says = "use {0.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class DeleteFile(_Directive):
+    """Directive to delete a received file."""
+
+    name: str
+    packet = telecommand("delete-file", 0x227, "Delete a received file", _NAME, hazard="deletes the file")
+    says = "delete {0.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Activate(_Directive):
+    """Directive to try the received bundle `name` of a signed artefact (docs/fly/renewal.md)."""
+
+    name: str
+    sum: bytes
+    hours: float
+    despite_faults: int
+    packet = telecommand(
+        "activate",
+        0x2B0,
+        "Start the trial of a received, signed artefact; "
+        "unless it is confirmed, the previous artefact returns",
+        _NAME,
+        Field("sum", "u1", "-", "SHA-256 of the bundle", SUM_BYTES),
+        Field("hours", "f4", "h", "powered time within which the ground must confirm"),
+        Field("despite_faults", "u1", "-", "1 if the trial continues after a fault that the flight reports"),
+        hazard=_RESTARTS,
+    )
+    says = "activate {0.name} for {0.hours:g} h"
+
+
+@dataclass(frozen=True, slots=True)
+class _OnRenewal(_Directive):
+    """Directive about the trial of an update. The attribute `kind` is an index of `KINDS`."""
+
+    kind: int
+
+    def __str__(self) -> str:
+        return f"{type(self).__name__.lower()} {KINDS[self.kind]}"
+
+
+class Confirm(_OnRenewal):
+    """Directive to end a trial in favour of the new artefact."""
+
+    packet = telecommand("confirm", 0x2B1, "End the trial of an artefact and keep the artefact", _KIND)
+
+
+class Withdraw(_OnRenewal):
+    """Directive to return to the previous configuration or release."""
+
+    packet = telecommand(
+        "withdraw",
+        0x2B2,
+        "End the trial of an artefact, or return to the previous configuration or release",
+        _KIND,
+        hazard=_RESTARTS,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Restart(_Directive):
+    """Directive to restart a part of the satellite. The attribute `part` is an index of `PARTS`."""
+
+    part: int
+    packet = telecommand(
+        "restart",
+        0x2B3,
+        "Restart the flight, the link or the whole board within 10 s",
+        Field("part", "u1", "-", "part to restart", states=tuple(enumerate(PARTS))),
+        hazard="ends the running flight or the link; after a restart of the board both begin again",
+    )
+
+    def __str__(self) -> str:
+        return f"restart {PARTS[self.part]}"
 
 
 FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
@@ -365,37 +376,20 @@ Privileged = Activate | Confirm | Withdraw | Restart
 Executable = Play | Stop | NewKey | Scheduled | Deletion | Listing | Privileged | FileDirective
 Directive = Portion | Executable
 
-_PACKETS: dict[type[Any], Packet] = {
-    Play: PLAY,
-    Stop: STOP,
-    NewKey: NEW_KEY,
-    Portion: PORTION,
-    Scheduled: SCHEDULE,
-    Deletion: UNSCHEDULE,
-    Listing: LIST,
-    ListFiles: LIST_FILES,
-    SendFile: SEND_FILE,
-    CancelFile: CANCEL_FILE,
-    SuspendFile: SUSPEND_FILE,
-    ResumeFile: RESUME_FILE,
-    UseFile: USE_FILE,
-    DeleteFile: DELETE_FILE,
-    Activate: ACTIVATE,
-    Confirm: CONFIRM,
-    Withdraw: WITHDRAW,
-    Restart: RESTART,
-}
-"""Packet definition of each directive class. Packet fields and class attributes have the same names."""
-_KINDS = {packet.name: kind for kind, packet in _PACKETS.items()}
+_CLASSES: tuple[type[Directive], ...] = (
+    Play, Stop, NewKey, Portion, Scheduled, Deletion, Listing, ListFiles, SendFile, CancelFile, SuspendFile,
+    ResumeFile, UseFile, DeleteFile, Activate, Confirm, Withdraw, Restart,
+)  # fmt: skip
+_BY_NAME = {kind.packet.name: kind for kind in _CLASSES}
 
-DIRECTIVES: tuple[Packet, ...] = tuple(_PACKETS.values())
+DIRECTIVES: tuple[Packet, ...] = tuple(kind.packet for kind in _CLASSES)
 LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 
 def name_of(directive: Directive) -> str:
     """Return the name of the packet that carries a directive."""
-    return _PACKETS[type(directive)].name
+    return directive.packet.name
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
@@ -403,7 +397,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
     Raises CommandError for values that do not fit into the packet.
     """
-    packet, values = _PACKETS[type(directive)], dict[str, Any]()
+    packet, values = directive.packet, dict[str, Any]()
     for one in packet.fields:
         value = getattr(directive, one.name)
         if isinstance(value, str) and len(value.encode()) >= int(one.kind[1:]):
@@ -446,7 +440,7 @@ def unpack(data: bytes) -> Directive | None:
             values[one.name] = to_text(raw)
         else:
             values[one.name] = bytes(raw.tolist()) if one.count > 1 else raw.item()
-    directive: Directive = _KINDS[layout.packet.name](**values)
+    directive: Directive = _BY_NAME[layout.packet.name](**values)
     if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
         raise CommandError(f"the end {directive.end:g} s must not be before the begin {directive.begin:g} s")
     if values.get("part", 0) >= len(PARTS):

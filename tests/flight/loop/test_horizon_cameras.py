@@ -12,7 +12,7 @@ from flight.link import events
 from flight.loop import facts
 from flight.loop.executive import JobResult
 from flight.loop.facts import Services
-from flight.loop.navigation import WORKER, HorizonCameraSettings, HorizonCameraTask
+from flight.loop.navigation import HORIZON_WORKER, HorizonCameraSettings, HorizonCameraTask
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS
@@ -61,7 +61,7 @@ class Bench:
         self.cameras = [Camera(self), Camera(self)]
         recorder = SimpleNamespace(epoch_ns=0, record=lambda *_, **fields: self.records.append(fields))
         services = SimpleNamespace(
-            jobs=SimpleNamespace(submit=lambda worker, _: worker == WORKER and not self.busy),
+            jobs=SimpleNamespace(submit=lambda worker, _: worker == HORIZON_WORKER and not self.busy),
             recorder=recorder,
             events=SimpleNamespace(report=lambda kind, *_: self.reports.append(kind)),
             facts=SimpleNamespace(update=self._update),
@@ -87,7 +87,7 @@ class Bench:
         found = HorizonCameraResult(sun, None, false=self.denied)
         for _ in range(seconds):
             if self.task.busy_since_ns() is not None:
-                self.task.finish(JobResult(WORKER, "done", found, "", 0, 0, 0), self.now_ns)
+                self.task.finish(JobResult(HORIZON_WORKER, "done", found, "", 0, 0, 0), self.now_ns)
             self.task.run(self.now_ns)
             self.now_ns += SECOND_NS
 
