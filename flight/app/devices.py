@@ -296,6 +296,7 @@ def open_camera(
 
 # Functions of the built-in drivers, to which the driver registrations refer (`flight.schema.devices`).
 
+
 def _serial_device(section: InertialUnitSection | Gps) -> Sequence[str]:
     return (section.device,)
 

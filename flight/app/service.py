@@ -400,14 +400,10 @@ class Supervision:
         The service manager shows the text `status` once the flight is ready. The function `settle` is called
         once, when all parts of the flight exist, before READY is reported.
         """
-        self._guardian = guardian
-        self._overseer = overseer
-        self._clock = clock
+        self._guardian, self._overseer, self._clock = guardian, overseer, clock
         # A separate event log is used, because the loop does not exist yet, and no event needs a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
-        self._status = status
-        self._coils = coils
-        self._settle = settle
+        self._status, self._coils, self._settle = status, coils, settle
         self._ready = False
         self._notes: list[tuple[EventKind, str]] = []
 

@@ -297,8 +297,7 @@ class CltuStream:
 
         The function `count` receives the number of corrected bits of each valid frame.
         """
-        self._kind = kind
-        self._count = count
+        self._kind, self._count = kind, count
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:
@@ -400,8 +399,7 @@ class KissStream:
 
     def __init__(self, decode: Callable[[bytes], bytes], ax25: bool) -> None:
         """Decode frames by the function `decode`, after removing AX.25 headers if `ax25` is true."""
-        self._decode = decode
-        self._ax25 = ax25
+        self._decode, self._ax25 = decode, ax25
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:

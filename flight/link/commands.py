@@ -574,8 +574,7 @@ class DatagramChannel:
         """
         self.name = name
         self._socket = bound
-        self._path = path
-        self._peers = peers
+        self._path, self._peers = path, peers
         self._polls = 0
         self._news = ""
         self._closed = False

@@ -111,8 +111,7 @@ class TelemetryFramer:
         """Make frames that each contain `data_bytes` bytes of packets."""
         self._first = spacecraft << 4 | channel << 1
         self._room = data_bytes
-        self._master = master
-        self._seal = seal
+        self._master, self._seal = master, seal
         self._count = 0
         self._data = bytearray()
         self._starts: list[int] = []  # offsets of the waiting packets in `_data`
@@ -275,9 +274,7 @@ class FrameStream:
             decode: function that returns the frame in the bytes after a sync marker.
             wrong_bits: maximum number of wrong bits in a sync marker directly after a valid frame.
         """
-        self._length_of = length_of
-        self._header_bytes = header_bytes
-        self._decode = decode
+        self._length_of, self._header_bytes, self._decode = length_of, header_bytes, decode
         self._wrong_bits = wrong_bits
         self._follows = False  # whether the data follow directly after a frame with a correct CRC
         self._data = b""

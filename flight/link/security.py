@@ -373,9 +373,7 @@ class RefusedError(FlightError):
 
     def __init__(self, cause: Refusal, spi: int = 0, counter: int | None = None) -> None:
         super().__init__(cause.value)
-        self.cause = cause
-        self.spi = spi
-        self.counter = counter
+        self.cause, self.spi, self.counter = cause, spi, counter
 
 
 @dataclass(frozen=True, slots=True)
@@ -416,12 +414,8 @@ class Gate:
         station receives telemetry with such a value of `store_every`. Telemetry can be authenticated without
         being `encrypted`.
         """
-        self._vault = vault
-        self._parse = parse
-        self._mask = mask
-        self._window = window
-        self._store_every = store_every
-        self._encrypted = encrypted
+        self._vault, self._parse, self._mask, self._window = vault, parse, mask, window
+        self._store_every, self._encrypted = store_every, encrypted
         self._ciphers: dict[tuple[int, int], AESGCM] = {}
         self._open: dict[int, Association | None] = {spi: vault.read(spi) for spi in spis}
         for entry in self._open.values():
@@ -540,13 +534,9 @@ class Sealer:
         association, `shared` must be true: the rest of a block is skipped as soon as another process has
         reserved counters, because the receiver refuses counters below the highest one it has received.
         """
-        self._vault = vault
-        self._name = name
+        self._vault, self._name = vault, name
         self._spi = int(str(name).partition("-")[0])
-        self._mask = mask
-        self._block = block
-        self._shared = shared
-        self._encrypted = encrypted
+        self._mask, self._block, self._shared, self._encrypted = mask, block, shared, encrypted
         self._salt = secrets.randbits(_SALT_BITS) << _COUNTER_BITS
         self._next = 0
         self._end = 0

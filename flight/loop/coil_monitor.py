@@ -406,8 +406,7 @@ class CoilMonitor:
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:
-        self._settings = settings
-        self.tumble_rate = settings.tumble_rate
+        self._settings, self.tumble_rate = settings, settings.tumble_rate
         self._bounds = Bounds(
             settings.full_current, settings.current_uncertainty, settings.gain_error, settings.monitor_noise
         )

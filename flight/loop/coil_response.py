@@ -762,8 +762,7 @@ class MotionWitness:
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, ...]) -> None:
         """Set the current `full_current` (n,), A, of each coil that is fully on."""
-        self._response = response
-        self._full_current = full_current
+        self._response, self._full_current = response, full_current
         self._doubted_ns = -_DOUBTED_FOR_NS
         self.doubt = ""
 

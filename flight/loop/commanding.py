@@ -68,9 +68,7 @@ class OnboardParameters:
         """
         self._config = config
         self._adopt_modes, self._adopt_health = adopt_modes, adopt_health
-        self._keeper = keeper
-        self._recorder = services.recorder
-        self._events = services.events
+        self._keeper, self._recorder, self._events = keeper, services.recorder, services.events
         self._configured = {key: float(_value(config, key)) for key in PARAMETER_KEYS}
         self._values: Mapping[str, float] = self._configured
         self._table = KeptTable() if keeper is None else keeper.table
@@ -177,13 +175,9 @@ class CommandTask:
         channels: Sequence[Channel],
         services: Services,
     ) -> None:
-        self._modes = modes
-        self._drive = drive
-        self._parameters = parameters
+        self._modes, self._drive, self._parameters = modes, drive, parameters
         self._timeline = deque(sorted(timeline, key=lambda step: step.at))
-        self._channels = channels
-        self._facts = services.facts
-        self._recorder = services.recorder
+        self._channels, self._facts, self._recorder = channels, services.facts, services.recorder
         self._events = services.events
         self._answers = Packer()
         self._received: deque[bytes] = deque(maxlen=_REMEMBERED)

@@ -177,9 +177,7 @@ class RateGroup:
     def __init__(self, name: str, period_ns: int, task: Task) -> None:
         if period_ns <= 0:
             raise FlightError(f"rate group {name}: a period of {period_ns} ns is not positive")
-        self.name = name
-        self.period_ns = period_ns
-        self.task = task
+        self.name, self.period_ns, self.task = name, period_ns, task
         self.cycles = 0
         self.completed = 0
         self.slips = 0
@@ -256,8 +254,7 @@ class CyclicExecutive:
     ) -> None:
         self._clock = clock
         self._groups = tuple(groups)
-        self._observer = observer
-        self._stopwatch = stopwatch
+        self._observer, self._stopwatch = observer, stopwatch
         self._stop = False
 
     def stop(self) -> None:

@@ -115,11 +115,8 @@ class ControlCycle:
     """The task of the control rate group: sample, estimate, check, decide, steer, publish."""
 
     def __init__(self, tasks: LoopTasks, body: FlightBody, services: Services) -> None:
-        self._tasks = tasks
-        self._body = body
-        self._jobs = services.jobs
-        self._recorder = services.recorder
-        self._streams = services.streams
+        self._tasks, self._body, self._jobs = tasks, body, services.jobs
+        self._recorder, self._streams = services.recorder, services.streams
         self._knowledge = CoilKnowledge()
         self._ever_started = False
         self._had_estimate = False
@@ -338,10 +335,7 @@ class FlightLoop:
     def __init__(
         self, config: Config, body: FlightBody, tasks: LoopTasks, services: Services, supervisors: Supervisors
     ) -> None:
-        self._config = config
-        self._body = body
-        self._tasks = tasks
-        self._services = services
+        self._config, self._body, self._tasks, self._services = config, body, tasks, services
         self._supervisors = supervisors
         self._stop_reason = ""
         self._ended_ns = 0

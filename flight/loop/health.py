@@ -311,9 +311,7 @@ class PerformanceObserver:
     """
 
     def __init__(self, coils: TorqueCoils, services: Services) -> None:
-        self._coils = coils
-        self._clock = services.clock
-        self._recorder = services.recorder
+        self._coils, self._clock, self._recorder = coils, services.clock, services.recorder
         self._events = services.events
         self.lost = 0
 
@@ -389,14 +387,9 @@ class Housekeeping:
 
         The function `log_error` returns the error of the flight log, or an empty text.
         """
-        self._navigation = navigation
-        self._planner = planner
-        self._imaging = imaging
-        self._coils = coils
-        self._power = power
-        self._log_error = log_error
-        self._recorder = services.recorder
-        self._events = services.events
+        self._navigation, self._planner, self._imaging = navigation, planner, imaging
+        self._coils, self._power, self._log_error = coils, power, log_error
+        self._recorder, self._events = services.recorder, services.events
         self._facts = services.facts
         self._lost = 0
 
@@ -470,21 +463,14 @@ class HealthWatch:
 
         The function `feed` triggers the watchdog; it is called while all rate groups and workers progress.
         """
-        self._modes = modes
-        self._drive = drive
-        self._power = power
-        self._workers = workers
+        self._modes, self._drive, self._power, self._workers = modes, drive, power, workers
         self._monitor = ResourceMonitor(limits)
         self._clock_watch = ClockWatch(services.clock.host)
-        self._clock = services.clock
-        self._recorder = services.recorder
-        self._events = services.events
-        self._jobs = services.jobs
+        self._clock, self._recorder = services.clock, services.recorder
+        self._events, self._jobs = services.events, services.jobs
         # Worker events need no throttle, because each of them belongs to a restart, and restarts are limited.
         self._worker_events = EventLog(services.recorder.event, 0)
-        self._facts = services.facts
-        self._streams = services.streams
-        self._feed = feed
+        self._facts, self._streams, self._feed = services.facts, services.streams, feed
         self._fed = 0
         self._power_ns = -1
         self._sample: ResourceSample | None = None

@@ -139,8 +139,7 @@ class FrameMeasurer:
     """Makes jobs for the vision worker from frames, and measurements from the results."""
 
     def __init__(self, settings: ImagingSettings, navigation: Navigation) -> None:
-        self._settings = settings
-        self._navigation = navigation
+        self._settings, self._navigation = settings, navigation
         self._body_to_camera = attitude_matrix(settings.mounting)
 
     def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
@@ -267,9 +266,7 @@ class FrameReport:
     """Records results of frames. The attribute `accepted` counts accepted rates from streaks."""
 
     def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
-        self._measurer = measurer
-        self._view = view
-        self._recorder = services.recorder
+        self._measurer, self._view, self._recorder = measurer, view, services.recorder
         self._events = services.events
         self.accepted = 0
 
@@ -429,8 +426,7 @@ class ObjectTracks:
 
         self._body = body
         self._tracker = ObjectTracker(settings)
-        self._recorder = services.recorder
-        self._events = services.events
+        self._recorder, self._events = services.recorder, services.events
         self._field = StarField()
         self._located: tuple[int, FloatArray, CameraAttitude | None] | None = None
 
@@ -608,14 +604,10 @@ class Imaging:
         services: Services,
         objects: ObjectTracks | None = None,
     ) -> None:
-        self._camera = camera
-        self._settings = settings
-        self._navigation = navigation
+        self._camera, self._settings, self._navigation = camera, settings, navigation
         self._measurer = FrameMeasurer(settings, navigation)
         self._report = FrameReport(self._measurer, view, services)
-        self._jobs = services.jobs
-        self._events = services.events
-        self._facts = services.facts
+        self._jobs, self._events, self._facts = services.jobs, services.events, services.facts
         self._streams = services.streams
         self._frame: Frame | None = None
         self._last_sequence = -1

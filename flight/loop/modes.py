@@ -308,9 +308,7 @@ class PointingWatch:
     """Monitors rate and pointing error, and updates the conditions TUMBLING and HOLD_IMPOSSIBLE."""
 
     def __init__(self, settings: Modes, targets: BodyTargets, facts_: Facts) -> None:
-        self._settings = settings
-        self._targets = targets
-        self._facts = facts_
+        self._settings, self._targets, self._facts = settings, targets, facts_
         self._off = HoldTimer(settings.hold_patience)
 
     def adopt(self, settings: Modes) -> None:
@@ -399,11 +397,8 @@ class ModeControl:
         self._targets = body.control.targets
         self._paths = body.control.paths
         self._view = body.view
-        self._steering = steering
-        self._facts = services.facts
-        self._recorder = services.recorder
-        self._events = services.events
-        self._low_rate = settings.low_rate
+        self._steering, self._facts, self._recorder = steering, services.facts, services.recorder
+        self._events, self._low_rate = services.events, settings.low_rate
         self._modes = body.control.modes
         self._initial = Mode.named(settings.modes.initial)
         if self._initial not in body.control.modes:

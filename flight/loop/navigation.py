@@ -134,19 +134,15 @@ class Navigation:
         magnetometer: InertialUnit | None = None,
     ) -> None:
         """Read the inertial unit or, while it gives no readings, the `magnetometer`."""
-        self._unit = unit
-        self._magnetometer = magnetometer
+        self._unit, self._magnetometer = unit, magnetometer
         self._thinned = False  # whether only the newest reading of a cycle is used
         self._replaced = False  # whether the magnetometer replaces the inertial unit
         self._unit_ns = 0  # time (ns) of the unit's newest reading
         self._estimation = estimation
         self._filter = estimation.filter
         self._feed = estimation.feed
-        self._settings = settings
-        self._recorder = services.recorder
-        self._events = services.events
-        self._facts = services.facts
-        self._streams = services.streams
+        self._settings, self._recorder, self._events = settings, services.recorder, services.events
+        self._facts, self._streams = services.facts, services.streams
         self._since_ns = 0
         self._received_ns = 0  # time (ns) of the newest reading
         self._agreed_ns = 0
@@ -382,14 +378,9 @@ class Positioning:
 
         A receiver is reported as lost after `max_age_ns` without a fix.
         """
-        self._receiver = receiver
-        self._accept = accept
-        self._max_age_ns = max_age_ns
-        self._events = services.events
-        self._facts = services.facts
-        self._streams = services.streams
-        self._clock = services.clock
-        self._recorder = services.recorder
+        self._receiver, self._accept, self._max_age_ns = receiver, accept, max_age_ns
+        self._events, self._facts, self._streams = services.events, services.facts, services.streams
+        self._clock, self._recorder = services.clock, services.recorder
         self._fixed_ns = 0
         self._off_ns: int | None = None
         self._recorded_ns: int | None = None
@@ -480,9 +471,7 @@ class SunSensing:
         services: Services,
     ) -> None:
         """`accept` is `BodyEstimation.accept_sun`; readings older than `max_age_ns` are not used."""
-        self._strings = strings
-        self._accept = accept
-        self._max_age_ns = max_age_ns
+        self._strings, self._accept, self._max_age_ns = strings, accept, max_age_ns
         self._facts = services.facts
         self._read_ns = 0
 
@@ -540,9 +529,7 @@ class HorizonCameraTask:
         settings: HorizonCameraSettings,
         services: Services,
     ) -> None:
-        self._cameras = cameras
-        self._sight = sight
-        self._settings = settings
+        self._cameras, self._sight, self._settings = cameras, sight, settings
         self._services = services
         self._triggered_ns = 0
         self._waits = False

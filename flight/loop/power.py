@@ -66,8 +66,7 @@ class MonitorWatch:
     """Checks the readings of one monitor by its errors, its range and the voltage of the other monitor."""
 
     def __init__(self, name: str, monitor: PowerMonitor, cells: int) -> None:
-        self.name = name
-        self._monitor = monitor
+        self.name, self._monitor = name, monitor
         self._range = (cells * CELL_RANGE[0], cells * CELL_RANGE[1])
         self._last = (math.nan, math.nan)
         self._since_ns = 0
@@ -120,9 +119,7 @@ class PowerTask:
         self, section: Power, monitors: Sequence[PowerMonitor], loads: Sheddable, services: Services
     ) -> None:
         """Use the monitors of battery and, if fitted, bus."""
-        self._section = section
-        self._loads = loads
-        self._facts = services.facts
+        self._section, self._loads, self._facts = section, loads, services.facts
         self._recorder = services.recorder
         names, cells = ("battery monitor", "bus monitor"), section.battery.cells
         self._watches = [MonitorWatch(name, one, cells) for name, one in zip(names, monitors, strict=False)]

@@ -428,8 +428,7 @@ class StateStore:
     """Stores a StoredState in a folder. Only one process may use a folder at a time."""
 
     def __init__(self, folder: Path, report: Report, files: LinuxFiles | None = None) -> None:
-        self._folder = folder
-        self._report = report
+        self._folder, self._report = folder, report
         self._files = files or LinuxFiles()
         self._generation = 0
         self._order: tuple[str, ...] = COPIES
@@ -563,9 +562,7 @@ class StateKeeper:
         The argument `boots` is the highest boot number that `note_boot` has written. If the state has a
         smaller boot count, the state is outdated or lost, and the last boot counts as unclean.
         """
-        self._store = store
-        self._notices = notices
-        self._clock = clock
+        self._store, self._notices, self._clock = store, notices, clock
         self._begun_ns = clock.now_ns()
         loaded = store.load()
         if boots > loaded.boot_count:

@@ -64,12 +64,8 @@ class CoilDrive:
         settings: CoilDriveSettings,
         services: Services,
     ) -> None:
-        self._coils = coils
-        self._power = power
-        self._watch = watch
-        self._settings = settings
-        self._facts = services.facts
-        self._events = services.events
+        self._coils, self._power, self._watch, self._settings = coils, power, watch, settings
+        self._facts, self._events = services.facts, services.events
         self._reported: set[int] = set()  # axes whose diagnosis was reported
         self._braked = NO_AXES
         self._has_rate = True  # without a rate, a self-test of the coils has no result
@@ -239,9 +235,7 @@ class Steering:
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
-        self._body = body
-        self._drive = drive
-        self._facts = services.facts
+        self._body, self._drive, self._facts = body, drive, services.facts
         self._has_rate = True  # whether a body rate is known: from the newest reading or a substitute
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:

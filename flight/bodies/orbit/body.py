@@ -110,9 +110,7 @@ class OrbitView:
         environment: EstimatedEnvironment,
         services: Services,
     ) -> None:
-        self._filter = filter_
-        self._environment = environment
-        self._events = services.events
+        self._filter, self._environment, self._events = filter_, environment, services.events
         self._facts = services.facts
         self._knowledge = Knowledge.LOST
         self._is_clock_doubted = False

@@ -82,9 +82,7 @@ class CoarseSunFeed:
         self.strings = strings
         self.newest: StringReading | None = None
         self._turns = FieldAndStrings(strings)
-        self._period_ns = period_ns
-        self._filter = filter_
-        self._environment = environment
+        self._period_ns, self._filter, self._environment = period_ns, filter_, environment
         self._judged_ns = -PERIOD_NS
         self._against = 0
         self._last: list[float] = []
@@ -197,9 +195,7 @@ class HorizonCameraFeed:
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
-        self._filter = filter_
-        self._environment = environment
-        self._sun = sun
+        self._filter, self._environment, self._sun = filter_, environment, sun
         self._response = response
         self._structure = dict(structure)
         self._against = 0

@@ -42,8 +42,7 @@ class _MagneticLaw:
 
     def __init__(self, law: FieldDetumbler | SunAcquisition, coils: CoilMap) -> None:
         """`coils` maps dipole moments to currents."""
-        self._law = law
-        self._coils = coils
+        self._law, self._coils = law, coils
         self._field_check = StuckFieldCheck()
 
     def begin(self, now_ns: int) -> None:

@@ -198,8 +198,7 @@ class StepReplay:
 
     def __init__(self, settings: OrbitFilterSettings, dipoles: DipoleHistory) -> None:
         """`dipoles` holds the commanded dipoles during the history."""
-        self._settings = settings
-        self._dipoles = dipoles
+        self._settings, self._dipoles = settings, dipoles
         self.free = FreeFilter(settings.inertia, settings.free, settings.slow)
         self.steps: deque[FilterStep] = deque()
         self.refused_gyros = self.refused_fields = self.contradicted = 0
@@ -480,8 +479,7 @@ class OrbitFilter:
         The function `around` returns the orbit environment at a time of the clock, or None while the orbit is
         unknown.
         """
-        self._settings = settings
-        self._around = around
+        self._settings, self._around = settings, around
         # Dipoles are kept longer than the history, because its first step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
         self._replay = StepReplay(settings, self._dipoles)

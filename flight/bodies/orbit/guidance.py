@@ -241,8 +241,7 @@ class PointingTargets:
         self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool
     ) -> None:
         """Accept the configured targets in order of their mission times (s), which begin at 0."""
-        self._looks_for_objects = looks_for_objects
-        self._paths = paths
+        self._looks_for_objects, self._paths = looks_for_objects, paths
         self._times = [round(at * 1e9) for at, _ in timed]
         self._steps = [Target(k, PointingTargetLaw(target, paths)) for k, (_, target) in enumerate(timed)]
 

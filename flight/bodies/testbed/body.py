@@ -103,8 +103,7 @@ class UnitFeed:
     ) -> None:
         """`field` is a function of a time that returns the magnetic field (3,), T, in reference axes."""
         unit = config.inertial_unit
-        self._filter = filter_
-        self._field = field
+        self._filter, self._field = filter_, field
         # Field (T) at the centre of a square coil per dipole moment (A m^2), by the law of Biot and Savart.
         side = math.sqrt(config.plant.coil_area)
         self._field_per_dipole = 2.0 * math.sqrt(2.0) * _VACUUM_PERMEABILITY / (math.pi * side**3)
@@ -168,9 +167,7 @@ class ThreadView:
 
     def __init__(self, reader: ThreadReader, planning: Planning, services: Services) -> None:
         self._read = reader.read
-        self._planning = planning
-        self._recorder = services.recorder
-        self._events = services.events
+        self._planning, self._recorder, self._events = planning, services.recorder, services.events
 
     def record_cycle(self, output: ControlOutput) -> None:
         """Record the control packet of a cycle."""

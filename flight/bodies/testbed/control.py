@@ -230,12 +230,9 @@ class Planning:
         services: Services,
     ) -> None:
         self._plant = replace(plant, current_limit=plant.current_limit * settings.current_share)
-        self._settings = settings
-        self._guidance = guidance
+        self._settings, self._guidance = settings, guidance
         self._read = reader.read
-        self._jobs = services.jobs
-        self._recorder = services.recorder
-        self._events = services.events
+        self._jobs, self._recorder, self._events = services.jobs, services.recorder, services.events
         self._wanted = False
         self._job: PlanJob | None = None
         self._goal_ns: int | None = None
@@ -447,8 +444,7 @@ class ThreadTargets:
         self._steps = [Target(i, ThreadLaw(step.q2, step.rate)) for i, step in enumerate(steps)]
         self._times = [round(step.at * 1e9) for step in steps]
         self._read = reader.read
-        self._guidance = guidance
-        self._planning = planning
+        self._guidance, self._planning = guidance, planning
 
     def configured(self, mission_time_ns: int) -> Target:
         """Return the configured target that is in force at a mission time."""
@@ -497,8 +493,7 @@ class BdotLaw:
 
     def __init__(self, detumbler: Detumbler, dipole_per_ampere: float) -> None:
         """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
-        self._detumbler = detumbler
-        self._dipole_per_ampere = dipole_per_ampere
+        self._detumbler, self._dipole_per_ampere = detumbler, dipole_per_ampere
 
     def begin(self, now_ns: int) -> None:
         """Begin without knowledge of the magnetic field."""
@@ -671,9 +666,7 @@ class CageTracker:
         """
         self._inner = inner
         self._read = reader.read
-        self._plant = plant
-        self._field = field
-        self._dipole = dipole
+        self._plant, self._field, self._dipole = plant, field, dipole
 
     def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
         """Return the command that makes the requested torque with the least current."""

@@ -228,8 +228,7 @@ class Sender:
 
         Each PDU contains at most `segment_bytes` bytes of the file.
         """
-        self._segment_bytes = segment_bytes
-        self.record = record
+        self._segment_bytes, self.record = segment_bytes, record
         self.transaction = Transaction(source, record.number, record.destination)
         self.condition: int | None = None
         self.said = ""
@@ -390,8 +389,7 @@ class Receiver:
 
         Each NAK PDU requests at most `most_requests` ranges.
         """
-        self._most_requests = most_requests
-        self.record = record
+        self._most_requests, self.record = most_requests, record
         self.closed = False
         self.said = ""
         self.heard_ns = now_ns

@@ -273,8 +273,7 @@ class Downlink:
         self._idle_rate, self._idle_credit = idle_rate, 0.0
         self._files = files
         self._files_first = True
-        self._frame_bytes = frame_bytes
-        self._rate = rate
+        self._frame_bytes, self._rate = frame_bytes, rate
         self._credit = 0.0
         self._credit_ns: int | None = None
         self._begun_ns = 0
@@ -375,8 +374,7 @@ class Playback:
     """Playback of one time interval of recorded packets at a time."""
 
     def __init__(self, downlink: Downlink, log: LogFollower) -> None:
-        self._downlink = downlink
-        self._log = log
+        self._downlink, self._log = downlink, log
         self._done: Report | None = None
 
     def begin(self, play: Play, done: Report) -> list[Report]:

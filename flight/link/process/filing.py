@@ -333,8 +333,7 @@ class Renewal:
 
         The time `command_loss` (s) without an authentic frame is passed on to this program.
         """
-        self._folder = folder
-        self._status = status
+        self._folder, self._status = folder, status
         self._limit = command_loss
         self._session = os.urandom(8).hex()
         self._fault = ""

@@ -411,8 +411,7 @@ class SerialLine:
 
         Without a `framing`, frames are not coded, and each frame follows a sync marker.
         """
-        self.name = name
-        self._port = port
+        self.name, self._port = name, port
         self._framing = framing or LinkCodes().on_board()
         self._stream = self._framing.stream()
 
@@ -515,10 +514,7 @@ class Station:
         clock: Clock,
     ) -> None:
         """Use open communication lines, which the caller closes."""
-        self._vault = vault
-        self._lines = lines
-        self._control = control
-        self._log = log
+        self._vault, self._lines, self._control, self._log = vault, lines, control, log
         self._clock = clock
         self._gate = Gate(vault, COMMAND_SPIS, parser_of(settings.spacecraft), TELECOMMAND_MASK)
         self._codes = settings.codes

@@ -96,11 +96,8 @@ class SegmentStore:
         opener: Callable[[Path], SegmentFile] = open_segment,
     ) -> None:
         """Create the first segment file. Raises OSError if the file cannot be created."""
-        self._folder = folder
-        self._stem = stem
-        self._segment_bytes = segment_bytes
-        self._budget_bytes = budget_bytes
-        self._opener = opener
+        self._folder, self._stem, self._segment_bytes = folder, stem, segment_bytes
+        self._budget_bytes, self._opener = budget_bytes, opener
         self._finished: deque[tuple[Path, int]] = deque()  # paths and sizes (bytes), oldest first
         self._number = 0
         self.packets = 0
@@ -360,9 +357,7 @@ class FlightLog:
             raise UsageError(
                 f"log budget of {budget_bytes} bytes: give at least two segments of {segment_bytes} bytes"
             )
-        self._stem = stem
-        self._clock = clock
-        self._queue_packets = queue_packets
+        self._stem, self._clock, self._queue_packets = stem, clock, queue_packets
         self._sync_period_ns = sync_period_ns
         self._queue: deque[bytes] = deque()
         self._refused = 0  # packets lost because the queue was full or the log was closed
@@ -556,8 +551,7 @@ class Recorder:
     """
 
     def __init__(self, flight: Log, performance: Log) -> None:
-        self._flight = flight
-        self._performance = performance
+        self._flight, self._performance = flight, performance
         self._flight_packer = Packer()
         self._performance_packer = Packer()
         self._newest: dict[str, bytes] = {}
