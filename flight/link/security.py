@@ -81,16 +81,6 @@ def protect(
     return header + index + nonce + data + cipher.encrypt(nonce, b"", authenticated + data)
 
 
-def spi_of(protected: bytes) -> int:
-    """Return the SPI of a frame, -1 if the frame is too short."""
-    return int.from_bytes(protected[:SPI_BYTES], "big") if len(protected) >= OVERHEAD_BYTES else -1
-
-
-def counter_of(protected: bytes) -> int:
-    """Return the counter of a frame. The counter is authentic only if `unprotect` accepts the frame."""
-    return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big") % (1 << _COUNTER_BITS)
-
-
 def unprotect(
     cipher: AESGCM, header: bytes, mask: bytes, protected: bytes, encrypted: bool = True
 ) -> bytes | None:
@@ -464,14 +454,14 @@ class Gate:
             header, protected = self._parse(frame)
         except FrameError as error:
             raise RefusedError(Refusal.HEADER) from error
-        spi = spi_of(protected)
+        spi = int.from_bytes(protected[:SPI_BYTES], "big") if len(protected) >= OVERHEAD_BYTES else -1
         if spi not in self._open:
             raise RefusedError(Refusal.SPI)
         entry = self._open[spi] or self._read_again(spi)
         data = unprotect(self._cipher(entry), header, self._mask, protected, self._encrypted)
         if data is None:
             entry, data = self._by_next_key(spi, header, protected)
-        counter = counter_of(protected)
+        counter = int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big") % (1 << _COUNTER_BITS)
         if counter < entry.unused:
             raise RefusedError(Refusal.REPEATED, spi, counter)
         if counter >= min(entry.unused + self._window, HIGHEST_COUNTER):

@@ -197,11 +197,8 @@ class StuckLeg:
 
     def _brake_all(self, supplied: Supplied) -> None:
         self.suspicion = self.suspicion or _reason(supplied)
-        self._step, self._left, self._braked = (
-            _Step.ALL_BRAKED,
-            list(supplied.at_rest),
-            tuple(supplied.at_rest),
-        )
+        self._step = _Step.ALL_BRAKED
+        self._left, self._braked = list(supplied.at_rest), tuple(supplied.at_rest)
         self.brake, self.rest = frozenset(supplied.at_rest), True
         self._await()
 
@@ -725,16 +722,12 @@ class CoilMonitor:
     def _predictions(self, reading: PowerReading) -> list[Predicted]:
         """Predict the newest ADC sample and, if the circuit did not change in the window, its mean."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
-        begin_ns = reading.time_ns - self._settings.window_ns
+        begin_ns, commands = reading.time_ns - self._settings.window_ns, self._commands
         if begin_ns >= self._unmixed_ns:
             windows.append((reading.current, begin_ns, MEAN))
         return [
             predict(
-                current,
-                self._commands.window(since_ns, reading.time_ns),
-                self._bounds,
-                sampling,
-                reading.clipped,
+                current, commands.window(since_ns, reading.time_ns), self._bounds, sampling, reading.clipped
             )
             for current, since_ns, sampling in windows
         ]

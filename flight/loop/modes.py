@@ -142,10 +142,7 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_POINT: TriggerAnswer.STAY,
     },
     Mode.SUN: {**_USUAL, Trigger.LOST: Mode.ACQUIRE, Trigger.COMMAND_SUN: TriggerAnswer.STAY},
-    Mode.POINT: {
-        **_USUAL,
-        Trigger.LOST: Mode.ACQUIRE,
-    },  # a new target is approached from the present attitude
+    Mode.POINT: {**_USUAL, Trigger.LOST: Mode.ACQUIRE},  # a new target is approached from this attitude
 }
 
 

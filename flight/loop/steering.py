@@ -119,9 +119,8 @@ class CoilDrive:
             watch.interrupted(now_ns)
         for reading in readings:
             self._has_rate = reading.has_rate
-            if not reading.has_rate:
-                continue
-            watch.observe_motion(reading.time_ns, reading.rate, reading.field)
+            if reading.has_rate:
+                watch.observe_motion(reading.time_ns, reading.rate, reading.field)
         answer = self._power.latest() if self._power is not None and not self._power.error() else None
         if answer is not None:
             watch.measured(answer)
@@ -129,7 +128,10 @@ class CoilDrive:
             self._events.report(events.COIL_TESTED, now_ns, text)
         for text in watch.news():
             self._events.report(events.COIL_CORRECTED, now_ns, text)
-        self._report_verdicts(now_ns)
+        for verdict in watch.verdicts:
+            if verdict.axis not in self._reported:
+                self._reported.add(verdict.axis)
+                self._facts.update(facts.COILS_BROKEN[verdict.axis], True, now_ns, verdict.text)
         trial = watch.begin_trial(now_ns)
         if trial is not None:
             self._begin_trial(*trial, now_ns)
@@ -155,12 +157,6 @@ class CoilDrive:
         self._reported.clear()
         self.isolate()
         self._events.report(events.COIL_TRUSTED, now_ns, "all coils are in use again")
-
-    def _report_verdicts(self, now_ns: int) -> None:
-        for verdict in self._watch.verdicts:
-            if verdict.axis not in self._reported:
-                self._reported.add(verdict.axis)
-                self._facts.update(facts.COILS_BROKEN[verdict.axis], True, now_ns, verdict.text)
 
     def _begin_trial(self, axis: int, text: str, now_ns: int) -> None:
         """Use an excluded coil again, because the coil monitor begins a trial of this coil."""

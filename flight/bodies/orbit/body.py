@@ -148,7 +148,9 @@ class OrbitView:
             self._events.report(events.LEARNED_REFUSED, now_ns, text)
         self._contradictions = len(found.contradictions)
         if output.cycle.slot % DESCRIPTION_EVERY == 0 and estimate is not None:
-            self._record_description(now_ns)
+            values = self._filter.description(now_ns)
+            fields = {name: values[name].ravel().tolist() for name in values}
+            self._recorder.record(DESCRIPTION, now_ns, **fields)
         if output.cycle.slot % NAVIGATION_EVERY:
             return
         sigma = self._environment.field_sigma(now_ns) if self._environment.known else None
@@ -178,12 +180,6 @@ class OrbitView:
             field_bias=_NAN3 if estimate is None else estimate.field_bias.tolist(),
             residual_dipole=_NAN3 if estimate is None else found.residual_dipole.tolist(),
         )
-
-    def _record_description(self, now_ns: int) -> None:
-        """Record the estimated inertia, coils and sensors."""
-        values = self._filter.description(now_ns)
-        fields = {name: values[name].ravel().tolist() for name in values}
-        self._recorder.record(DESCRIPTION, now_ns, **fields)
 
     def announce(self, target: Target, now_ns: int) -> None:
         """Report a new target as an event."""

@@ -341,7 +341,9 @@ class Renewal:
         self._recorded = ("", "")
         self._due_ns = 0
         self._modified_ns = 0
-        self._reported = self._stored_number()
+        self._reported = 0
+        with suppress(OSError, *_DAMAGED):
+            self._reported = int(decoded(read_regular(folder / "reported", _LARGEST) or b""))
 
     def request(self, directive: Privileged, done: Report, now_ns: int) -> str:
         """Store a request for the privileged part. Return the reason for a failure, or an empty text.
@@ -418,11 +420,6 @@ class Renewal:
             self._reported = newest
             self._write("reported", encoded(newest))
         return found
-
-    def _stored_number(self) -> int:
-        with suppress(OSError, *_DAMAGED):
-            return int(decoded(read_regular(self._folder / "reported", _LARGEST) or b""))
-        return 0
 
     def _write(self, name: str, data: bytes) -> bool:
         with suppress(OSError):

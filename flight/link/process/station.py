@@ -527,7 +527,7 @@ class Station:
             settings.frame_bytes,
             settings.rate,
             self._seal,
-            self._next_unit,
+            lambda: self._filing.packet(clock.now_ns(), self._time_ns()),
             settings.idle_rate,
         )
         self._filing = Filing(files_folder(vault.folder), log.place, clock.now_ns())
@@ -805,9 +805,6 @@ class Station:
         except TelemetryError as error:
             self._unpacked += 1
             self._unpacked_text = str(error)
-
-    def _next_unit(self) -> bytes | None:
-        return self._filing.packet(self._clock.now_ns(), self._time_ns())
 
     def _time_ns(self) -> int:
         """Return the mission time (ns), limited to the range of the time field in a packet."""
