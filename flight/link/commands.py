@@ -504,20 +504,21 @@ _Instruction = tuple[int, int, int, int]
 """BPF instruction: operation code, jump offset if true, jump offset if false, and operand."""
 
 
-def _filter_datagrams(
-    bound: socket.socket, identifiers: Sequence[int], peers: Sequence[IPv4Network] | None = None
+def filter_datagrams(
+    bound: socket.socket, peers: Sequence[IPv4Network] | None, identifiers: Sequence[int] = ()
 ) -> None:
-    """Attach a kernel filter that drops datagrams which do not begin with one of `identifiers`.
+    """Attach a kernel filter that drops datagrams from addresses outside `peers`, unless `peers` is None.
 
-    With `peers`, the filter also drops datagrams from addresses outside these networks.
-
-    If the kernel refuses the filter, the socket receives all datagrams, and its reader must check them.
+    If `identifiers` are given, the filter also drops datagrams which do not begin with one of them. If the
+    kernel refuses the filter, the socket receives all datagrams, and its reader must check them.
     """
     start = _UDP_HEADER_BYTES if bound.family == socket.AF_INET else 0
     left = len(identifiers)
-    program: list[_Instruction] = [(_LOAD_HALF, 0, 0, start)]
-    program += [(_EQUAL, left - number, 0, identifier) for number, identifier in enumerate(identifiers)]
-    program.append(_DROP)
+    program: list[_Instruction] = []
+    if identifiers:
+        program = [(_LOAD_HALF, 0, 0, start)]
+        program += [(_EQUAL, left - number, 0, identifier) for number, identifier in enumerate(identifiers)]
+        program.append(_DROP)
     for peer in peers or ():
         network = (_EQUAL, 0, 1, int(peer.network_address))
         program += [(_LOAD_WORD, 0, 0, _SOURCE), (_AND, 0, 0, int(peer.netmask)), network, _WHOLE]
@@ -564,13 +565,9 @@ class DatagramChannel:
         path: Path | None = None,
         peers: Sequence[IPv4Network] | None = None,
     ) -> None:
-        """Use a bound socket.
+        """Use a bound socket, which the channel closes, as it removes the file `path` of a UNIX socket.
 
-        Args:
-            name: name of the channel.
-            bound: bound datagram socket, which the channel closes.
-            path: file of a UNIX socket, removed when the channel closes, or None for a UDP socket.
-            peers: networks of the accepted senders, or None to accept all senders.
+        Only datagrams from the networks `peers` are accepted, or all datagrams if `peers` is None.
         """
         self.name = name
         self._socket = bound
@@ -667,7 +664,7 @@ def _bound_unix(path: Path) -> socket.socket:
     except OSError:
         bound.close()
         raise
-    _filter_datagrams(bound, IDENTIFIERS)
+    filter_datagrams(bound, None, IDENTIFIERS)
     return bound
 
 
@@ -683,7 +680,7 @@ def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> Datagr
     except (OSError, OverflowError) as error:
         bound.close()
         raise UsageError(f"commands.udp: cannot listen on {address}: {error}") from error
-    _filter_datagrams(bound, IDENTIFIERS, peers)
+    filter_datagrams(bound, peers, IDENTIFIERS)
     return DatagramChannel("udp", bound, peers=peers)
 
 

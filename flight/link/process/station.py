@@ -9,10 +9,8 @@ killed at any moment therefore executes no command twice.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import select
 import socket
-import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +21,7 @@ from typing import Any, Protocol
 
 from flight.link import commands
 from flight.link.coding import LONGEST_CLTU, FrameDecoder, Framing, LinkCodes
-from flight.link.commands import CommandError, CommandPacker
+from flight.link.commands import CommandError, CommandPacker, filter_datagrams
 from flight.link.files.store import files_folder
 from flight.link.files.units import UP, is_unit
 from flight.link.frames import TELECOMMAND_HEADER, TELECOMMAND_MASK, TELEMETRY_MASK, open_telecommand
@@ -88,13 +86,12 @@ _STRANGERS = 256
 If 200 unauthenticated clients connect per second, a new connection has 1.3 s for its first frame.
 """
 _UNSENT = 1 << 18
-_SO_ATTACH_FILTER = 26  # Linux, asm-generic/socket.h; not in Python's module socket
 _PIECE = 1 << 14
 _RECONNECT_NS = 5 * SECOND_NS
 
 
 class Line(Protocol):
-    """Interface of a communication line to the ground."""
+    """Interface of a communication line to the ground, which by default trusts all senders."""
 
     name: str
 
@@ -124,15 +121,10 @@ class UdpLine:
         peers: Sequence[IPv4Network] | None = None,
         codes: LinkCodes | None = None,
     ) -> None:
-        """Bind a UDP socket.
+        """Bind a UDP socket to the address HOST:PORT. Raises UsageError.
 
-        Args:
-            address: own address, HOST:PORT.
-            to: fixed address HOST:PORT that receives telemetry, or None for no fixed address.
-            peers: networks of the accepted senders, or None to accept all senders.
-            codes: encoders and decoders of the frames in the datagrams, or None for uncoded frames.
-
-        Raises UsageError if the address cannot be bound.
+        The fixed address `to` receives telemetry. Only senders in the networks `peers` are accepted, or all
+        senders if `peers` is None. Without `codes`, frames are not coded.
         """
         self.name = f"UDP {address}"
         self._peers = peers
@@ -148,8 +140,7 @@ class UdpLine:
             self._socket.close()
             raise UsageError(f"link.udp: cannot listen on {address}: {error}") from error
         if peers is not None:
-            with contextlib.suppress(OSError):  # without a socket filter, `receive` checks the senders
-                _accept_only(self._socket, peers)
+            filter_datagrams(self._socket, peers)
 
     @property
     def port(self) -> int:
@@ -192,31 +183,6 @@ class UdpLine:
         self._socket.close()
 
 
-def _accept_only(udp: socket.socket, peers: Sequence[IPv4Network]) -> None:
-    """Let the kernel discard datagrams from addresses outside `peers`, before they fill the socket's buffer.
-
-    The filter is a classic BPF program (Linux, `Documentation/networking/filter.rst`). Raises OSError.
-    """
-    load, keep, restore, mask, compare, end = 0x20, 0x07, 0x87, 0x54, 0x15, 0x06
-    source_address = 2**32 - 0x100000 + 12  # SKF_NET_OFF, and the offset in the IPv4 header
-    accepted = [
-        step
-        for peer in peers
-        for step in (
-            (restore, 0, 0, 0),
-            (mask, 0, 0, int(peer.netmask)),
-            (compare, 0, 1, int(peer.network_address)),
-            (end, 0, 0, 0xFFFF),
-        )
-    ]
-    steps = [(load, 0, 0, source_address), (keep, 0, 0, 0), *accepted, (end, 0, 0, 0)]
-    program = b"".join(struct.pack("=HBBI", *step) for step in steps)
-    buffer = ctypes.create_string_buffer(program, len(program))
-    udp.setsockopt(
-        socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("HP", len(steps), ctypes.addressof(buffer))
-    )
-
-
 @dataclass(slots=True)
 class _Connection:
     """TCP connection: its decoder, its unsent bytes, and whether it has sent an authentic frame."""
@@ -237,14 +203,10 @@ class TcpLine:
     def __init__(
         self, address: str, peers: Sequence[IPv4Network] | None = None, framing: Framing | None = None
     ) -> None:
-        """Listen for connections.
+        """Listen for connections at the address HOST:PORT. Raises UsageError.
 
-        Args:
-            address: own address, HOST:PORT.
-            peers: networks from which connections are accepted, or None to accept all connections.
-            framing: form of the frames in the stream; None for uncoded frames, each after a sync marker.
-
-        Raises UsageError if the address cannot be bound.
+        Connections are accepted from the networks `peers`, or from everywhere if `peers` is None. Without a
+        `framing`, frames are not coded, and each frame follows a sync marker.
         """
         self.name = f"TCP {address}"
         self._peers = peers
@@ -339,7 +301,7 @@ class TcpLine:
         connection.close()
 
 
-class TncLine:
+class TncLine(Line):
     """Client of a terminal node controller (TNC), such as Direwolf, by KISS over TCP.
 
     A lost connection is opened again after five seconds.
@@ -368,9 +330,6 @@ class TncLine:
         if not data:
             self.close()
         return [(frame, None) for frame in self._stream.add(data)]
-
-    def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing, because all telemetry is sent to the TNC."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send telemetry frames, each as the data of one KISS frame.
@@ -403,7 +362,7 @@ class TncLine:
             self._socket = None
 
 
-class SerialLine:
+class SerialLine(Line):
     """Serial line to a radio for frames that follow sync markers, or are coded as configured."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing | None = None) -> None:
@@ -422,9 +381,6 @@ class SerialLine:
         except DeviceError:
             return []
         return [(frame, None) for _, data in pieces for frame in self._stream.add(data)]
-
-    def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing, because all telemetry is sent to the serial line."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames. Frames are discarded while the port is lost."""
@@ -783,9 +739,16 @@ class Station:
             self._send(VERIFICATION, {**values, "stage": int(one.stage), **one.request._asdict()})
 
     def _status(self) -> None:
+        gate, vault = self._gate, self._vault
+        known = {spi: vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
+        gates = [gate.association(spi) for spi in COMMAND_SPIS]
         values = {
             "received": self._received,
-            **_security(self._gate, self._vault),
+            "admitted": gate.admitted,
+            **{f"refused_{cause.name.lower()}": gate.refused[cause] for cause in Refusal},
+            "highest": [-2 if entry is None else entry.unused - 1 for entry in gates],
+            "generation": [0 if entry is None else entry.generation for entry in known.values()],
+            "copies": [vault.copies(spi) for spi in known],
             "refused_command": self._refused_commands,
             "sent": self._downlink.sent,
             "thinned": self._downlink.thinned,
@@ -809,19 +772,6 @@ class Station:
     def _time_ns(self) -> int:
         """Return the mission time (ns), limited to the range of the time field in a packet."""
         return min(self._mission_ns + self._clock.now_ns() - self._mission_at_ns, _HIGHEST_REPORTED)
-
-
-def _security(gate: Gate, vault: Vault) -> dict[str, Any]:
-    """Return the values of the link packet about received frames and security associations."""
-    known = {spi: vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
-    gates = [gate.association(spi) for spi in COMMAND_SPIS]
-    return {
-        "admitted": gate.admitted,
-        **{f"refused_{cause.name.lower()}": gate.refused[cause] for cause in Refusal},
-        "highest": [-2 if entry is None else entry.unused - 1 for entry in gates],
-        "generation": [0 if entry is None else entry.generation for entry in known.values()],
-        "copies": [vault.copies(spi) for spi in known],
-    }
 
 
 def parser_of(spacecraft: int) -> Callable[[bytes], tuple[bytes, bytes]]:
