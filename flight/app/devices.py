@@ -328,6 +328,9 @@ def unit_settings(unit: InertialUnitSection) -> Vn100Settings:
     )
 
 
+check_vn100 = unit_settings
+
+
 def open_vn100(rig: Rig, unit: InertialUnitSection) -> Vn100:
     """Return the driver of a VN-100."""
     return Vn100(rig.wires.serial(unit.device, unit.baud_rate), rig.clock, unit_settings(unit))
@@ -404,6 +407,9 @@ def coil_settings(coils: Coils) -> CoilSettings:
     """Return the settings of the coil driver."""
     wired = wirings(coils.channels, coils.resistance, coils.signs, coils.limits)
     return CoilSettings(wired, coils.supply_voltage, max(coils.limits), coils.stale_after)
+
+
+check_pca9685 = check_drv8830 = coil_settings
 
 
 def open_pca9685(rig: Rig, coils: Coils) -> TorqueCoils:

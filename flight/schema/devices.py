@@ -248,16 +248,14 @@ class Coils(Section, frozen=True, kw_only=True):
             self.windings, key=lambda one: one.strength() * (one.current_limit or self.current_limit)
         )
         half = 0.5 * weaker.strength()
-        return (
-            *self.windings,
-            Winding(
-                axis=(x, y, z),
-                dipole_per_ampere=half,
-                resistance=weaker.resistance,
-                current_limit=weaker.current_limit,
-                channels=(a, b),
-            ),
+        fictitious = Winding(
+            axis=(x, y, z),
+            dipole_per_ampere=half,
+            resistance=weaker.resistance,
+            current_limit=weaker.current_limit,
+            channels=(a, b),
         )
+        return (*self.windings, fictitious)
 
     @property
     def channels(self) -> tuple[tuple[int, int], ...]:
@@ -295,11 +293,8 @@ def coil_fields(config: Any) -> FloatArray | None:
     for coil in config.coils.windings:
         if coil.position is None or not any(coil.position):
             return None
-        strength, area = (
-            (coil.strength(), coil.area)
-            if plant is None
-            else (plant.coil_turns * plant.coil_area, plant.coil_area)
-        )
+        area = coil.area if plant is None else plant.coil_area
+        strength = coil.strength() if plant is None else plant.coil_turns * area
         fields.append(coil_field(strength * coil.direction(), -np.array(coil.position), area))
     return np.array(fields)
 
@@ -486,8 +481,6 @@ FAST = 0.02
 
 class Camera(Section, frozen=True, kw_only=True):
     """The star camera: properties that are needed to process its frames, and the real camera `device`.
-
-    `device` is the real camera.
 
     A frame in which stars form streaks is exposed for a time within the range `streak_exposure` (s) that
     depends on the body's rate. Frames without streaks, and all frames if `streak_exposure` is omitted, are
@@ -724,31 +717,20 @@ class Driver:
     off: Callable[[Any], Sequence[tuple[int, int, int]]] = nothing
 
 
-def _ours(kind: str, section: type[Any], name: str, **more: Any) -> Driver:
+def _ours(kind: str, section: type[Any], name: str, *more: str) -> Driver:
     """Return the registration of a built-in driver, with functions in `flight.app.devices`."""
-    functions = {word: later(f"flight.app.devices:{word}_{name}") for word in ("open", "probe", "files")}
+    words = ("open", "probe", "files", *more)
+    functions: dict[str, Any] = {word: later(f"flight.app.devices:{word}_{name}") for word in words}
     emulate = None if kind == "camera" else later(f"sim_hal.emulation:emulate_{name}")
-    return Driver(kind, section, emulate=emulate, **functions, **more)
+    return Driver(kind, section, emulate=emulate, **functions)
 
 
-VN100 = _ours("inertial_unit", InertialUnitSection, "vn100", check=later("flight.app.devices:unit_settings"))
+VN100 = _ours("inertial_unit", InertialUnitSection, "vn100", "check")
 SENSORS = _ours("inertial_unit", SensorsSection, "sensors")
 MAGNETOMETER = _ours("magnetometer", MagnetometerSection, "sensors")
-PCA9685 = _ours(
-    "coils",
-    Coils,
-    "pca9685",
-    check=later("flight.app.devices:coil_settings"),
-    off=later("flight.app.devices:off_pca9685"),
-)
-DRV8830 = _ours(
-    "coils",
-    Coils,
-    "drv8830",
-    check=later("flight.app.devices:coil_settings"),
-    off=later("flight.app.devices:off_drv8830"),
-)
-INA219 = _ours("power_monitor", PowerMonitorSection, "ina219", check=later("flight.app.devices:check_ina219"))
+PCA9685 = _ours("coils", Coils, "pca9685", "check", "off")
+DRV8830 = _ours("coils", Coils, "drv8830", "check", "off")
+INA219 = _ours("power_monitor", PowerMonitorSection, "ina219", "check")
 UBLOX = _ours("gps", Gps, "ublox")
 NMEA = _ours("gps", Gps, "nmea")
 ADS1115 = _ours("solar_strings", SolarStringsSection, "ads1115")

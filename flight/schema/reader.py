@@ -34,7 +34,6 @@ from flight.schema.document import (
     ConfigError,
     Document,
     Quaternion,
-    Vector,
     check_aim,
     convert,
     read_document,
@@ -70,7 +69,7 @@ _DATA_SYMBOLS = 223
 
 
 def check_consistency(config: Config, document: Document) -> None:
-    """Raise ConfigError for values that contradict each other. Raises ConfigError."""
+    """Raise ConfigError for values that contradict each other."""
 
     def refuse(dotted: str, problem: str) -> None:
         raise document.error(dotted, problem)
@@ -114,8 +113,14 @@ def check_consistency(config: Config, document: Document) -> None:
                     f"wide_cameras[{index}].{name}",
                     f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}",
                 )
-    _check_supplies(config, refuse)
-    _check_connections(config, refuse)
+    if config.solar_strings is not None:
+        _check_strings(config.solar_strings, refuse)
+    if config.power is not None:
+        _check_power(config, config.power, refuse)
+    taken: dict[str, str] = {}
+    for key, given, place in _connections(config):
+        if (other := taken.setdefault(place, key)) != key:
+            refuse(key, f"is {given}, which `{other}` also uses: give each device its own address or file")
 
 
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
@@ -150,10 +155,8 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
         limit, reached = coil.current_limit or coils.current_limit, coils.supply_voltage / coil.resistance
         if limit > _BEYOND * reached:
             key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
-            problem = (
-                f"is {limit:g}: the supply can drive only {reached:.3g} A through {coil.resistance:g} ohm"
-            )
-            refuse(key, problem)
+            most = f"the supply can drive only {reached:.3g} A through {coil.resistance:g} ohm"
+            refuse(key, f"is {limit:g}: {most}")
     try:
         slots = coils.slots
     except UsageError as error:
@@ -246,13 +249,6 @@ def _check_strings(strings: SolarStringsSection, refuse: Refuse) -> None:
             refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
 
 
-def _check_supplies(config: Config, refuse: Refuse) -> None:
-    if config.solar_strings is not None:
-        _check_strings(config.solar_strings, refuse)
-    if config.power is not None:
-        _check_power(config, config.power, refuse)
-
-
 def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
     curve, limits = power.battery.open_circuit, power.low_battery
     if any(after <= before for before, after in pairwise(curve)):
@@ -302,14 +298,6 @@ def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
                 yield f"{key}.device.{name}", place, place
 
 
-def _check_connections(config: Config, refuse: Refuse) -> None:
-    taken: dict[str, str] = {}
-    for key, value, place in _connections(config):
-        first = taken.setdefault(place, key)
-        if first != key:
-            refuse(key, f"is {value}, which `{first}` also uses: give each device its own address or file")
-
-
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
     norm = math.sqrt(sum(c * c for c in quaternion))
     if abs(norm - 1.0) > 1e-6:
@@ -319,14 +307,10 @@ def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
 def _check_unit(kind: str, unit: UnitSection, refuse: Refuse) -> None:
     _check_length(f"{kind}.mounting", unit.mounting, refuse)
     for name in ("gyro_matrix", "field_matrix"):
-        _check_matrix(f"{kind}.calibration.{name}", getattr(unit.calibration, name), refuse)
-
-
-def _check_matrix(dotted: str, matrix: tuple[Vector, Vector, Vector], refuse: Refuse) -> None:
-    largest = float(np.abs(np.array(matrix) - np.eye(3)).max())
-    if largest > _LARGEST_CORRECTION:
-        problem = f"differs from the identity matrix by {largest:.3g}: it may differ by at most"
-        refuse(dotted, f"{problem} {_LARGEST_CORRECTION:g} in each element")
+        largest = float(np.abs(np.array(getattr(unit.calibration, name)) - np.eye(3)).max())
+        if largest > _LARGEST_CORRECTION:
+            problem = f"differs from the identity matrix by {largest:.3g}: it may differ by at most"
+            refuse(f"{kind}.calibration.{name}", f"{problem} {_LARGEST_CORRECTION:g} in each element")
 
 
 def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> None:
