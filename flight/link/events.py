@@ -42,7 +42,7 @@ def _info(code: int, name: str, meaning: str) -> EventKind:
     return EventKind(code, name, Severity.INFORMATION, meaning)
 
 
-def _warning(code: int, name: str, meaning: str, reaction: Reaction = Reaction.NOTE) -> EventKind:
+def _warn(code: int, name: str, meaning: str, reaction: Reaction = Reaction.NOTE) -> EventKind:
     return EventKind(code, name, Severity.WARNING, meaning, reaction)
 
 
@@ -52,15 +52,13 @@ def _fault(code: int, name: str, meaning: str, reaction: Reaction = Reaction.NOT
 
 STARTED = _info(1, "started", "the control loop started")
 STOPPED = _info(2, "stopped", "the control loop ended; the text gives the reason")
-CYCLE_SLIP = _warning(3, "cycle-slip", "control cycles were skipped")
+CYCLE_SLIP = _warn(3, "cycle-slip", "control cycles were skipped")
 TASK_FAILED = _fault(
     4, "task-failed", "a task raised an exception; if it is the control task, the coils go to zero"
 )
 MODE = _info(5, "mode", "the mode changed; the text gives the cause")
-CRASHED_OFTEN = _warning(
-    6, "crashed-often", "too many recent unclean shutdowns: the flight starts in safe mode"
-)
-BOOT_WAITS = _warning(7, "boot-waits", "the flight is still booting because the devices give no valid data")
+CRASHED_OFTEN = _warn(6, "crashed-often", "too many recent unclean shutdowns: the flight starts in safe mode")
+BOOT_WAITS = _warn(7, "boot-waits", "the flight is still booting because the devices give no valid data")
 TASK_FAILING = _fault(8, "task-failing", "the control task fails in every cycle", Reaction.SAFE)
 NO_PROGRESS = _fault(
     9, "no-progress", "a rate group or worker makes no progress, so the watchdog is not reset"
@@ -70,15 +68,13 @@ SERVICE_FAILING = _fault(
 )
 SERVICE_RECOVERED = _info(97, "service-recovered", "all background jobs run again")
 IMU_SILENT = _fault(10, "imu-silent", "the inertial unit sends nothing")
-IMU_CORRUPT = _warning(11, "imu-corrupt", "the inertial unit sends bytes that form no packet")
-IMU_IMPLAUSIBLE = _warning(
+IMU_CORRUPT = _warn(11, "imu-corrupt", "the inertial unit sends bytes that form no packet")
+IMU_IMPLAUSIBLE = _warn(
     12, "imu-implausible", "the inertial unit sends values that are out of range or not finite"
 )
 IMU_LINE_LOST = _fault(13, "imu-line-lost", "the serial port of the inertial unit has disappeared")
 IMU_RECOVERED = _info(14, "imu-recovered", "the inertial unit sends valid packets again")
-IMU_REFUSED = _warning(
-    15, "imu-refused", "inertial measurements that disagree with the estimate are rejected"
-)
+IMU_REFUSED = _warn(15, "imu-refused", "inertial measurements that disagree with the estimate are rejected")
 IMU_UNUSABLE = _fault(16, "imu-unusable", "the inertial unit sends bytes that contain no reading")
 GYRO_LOST = _fault(155, "gyro-lost", "the inertial unit sends readings without a valid rate")
 GYRO_RECOVERED = _info(156, "gyro-recovered", "the inertial unit measures the rate again")
@@ -87,16 +83,14 @@ CONTROL_LOST = _fault(
 )
 CONTROL_REGAINED = _info(21, "control-regained", "the estimate is valid again")
 BLIND = _fault(22, "blind", "the estimate has been invalid or inaccurate for too long", Reaction.SAFE)
-TUMBLING = _warning(
-    23, "tumbling", "the body rotates too fast for any mode but detumbling", Reaction.DETUMBLE
-)
+TUMBLING = _warn(23, "tumbling", "the body rotates too fast for any mode but detumbling", Reaction.DETUMBLE)
 HOLD_IMPOSSIBLE = _fault(
     24,
     "hold-impossible",
     "the attitude cannot be held: its error is large and does not decrease",
     Reaction.SAFE,
 )
-STREAM_POOR = _warning(25, "stream-poor", "a stream of readings is late, slow or out of range")
+STREAM_POOR = _warn(25, "stream-poor", "a stream of readings is late, slow or out of range")
 STREAM_GOOD = _info(26, "stream-good", "a stream of readings is normal again")
 COIL_FAULT = _fault(30, "coil-fault", "the PWM chip does not accept commands", Reaction.COILS_OFF)
 COIL_RECOVERED = _info(31, "coil-recovered", "the PWM chip accepts commands again")
@@ -104,78 +98,76 @@ COIL_BROKEN = _fault(
     34, "coil-broken", "a coil does not carry the commanded current and is isolated", Reaction.ISOLATE
 )
 COIL_TRUSTED = _info(35, "coil-trusted", "an isolated coil is used again, by command or for a trial")
-COIL_CORRECTED = _warning(
+COIL_CORRECTED = _warn(
     143, "coil-corrected", "a coil is used with another sign or gain, because the motion shows it"
 )
 COIL_TESTED = _info(144, "coil-tested", "coils that pointing hardly uses were tested by short current pulses")
-COIL_SUSPECT = _warning(
+COIL_SUSPECT = _warn(
     36, "coil-suspect", "the supply current does not match the commanded currents; the faulty coil is unknown"
 )
-POWER_DOUBTED = _warning(37, "power-doubted", "the current monitor contradicts the measured motion")
-POWER_FAULT = _warning(32, "power-fault", "the current monitor does not answer")
+POWER_DOUBTED = _warn(37, "power-doubted", "the current monitor contradicts the measured motion")
+POWER_FAULT = _warn(32, "power-fault", "the current monitor does not answer")
 POWER_RECOVERED = _info(33, "power-recovered", "the current monitor answers again")
-COMMANDS_DOUBTED = _warning(
+COMMANDS_DOUBTED = _warn(
     38, "commands-doubted", "the body does not move as commanded, so the filter uses the gyro alone"
 )
 COMMANDS_TRUSTED = _info(39, "commands-trusted", "the body moves as commanded again")
 TARGET = _info(40, "target", "a new attitude is commanded")
 PLAN_STRETCHED = _info(41, "plan-stretched", "no path fits into the horizon, so the horizon was extended")
-PLAN_REFUSED = _warning(42, "plan-refused", "a plan was rejected; the text gives the reason")
-PLANNER_BUSY = _warning(43, "planner-busy", "the planner has not finished its previous job")
-PLANNER_FAILED = _warning(44, "planner-failed", "the planner found no plan; the text gives the reason")
-HOLDING = _warning(45, "holding", "the last valid path has ended and its final attitude is held")
-SLEW_LATE = _warning(46, "slew-late", "a slew does not arrive in time", Reaction.HOLD)
-WORKER_DIED = _warning(47, "worker-died", "a worker process ended or was killed")
+PLAN_REFUSED = _warn(42, "plan-refused", "a plan was rejected; the text gives the reason")
+PLANNER_BUSY = _warn(43, "planner-busy", "the planner has not finished its previous job")
+PLANNER_FAILED = _warn(44, "planner-failed", "the planner found no plan; the text gives the reason")
+HOLDING = _warn(45, "holding", "the last valid path has ended and its final attitude is held")
+SLEW_LATE = _warn(46, "slew-late", "a slew does not arrive in time", Reaction.HOLD)
+WORKER_DIED = _warn(47, "worker-died", "a worker process ended or was killed")
 WORKER_READY = _info(48, "worker-ready", "a worker runs again")
 WORKER_RESTS = _fault(
     49, "worker-rests", "a worker died too often in a row and is restarted after some minutes"
 )
-CAMERA_LOST = _warning(50, "camera-lost", "the camera has delivered no frame for too long")
+CAMERA_LOST = _warn(50, "camera-lost", "the camera has delivered no frame for too long")
 CAMERA_RECOVERED = _info(51, "camera-recovered", "the camera delivers frames again")
-CAMERA_FROZEN = _warning(52, "camera-frozen", "the camera delivers the same frame repeatedly")
-CAMERA_BLACK = _warning(53, "camera-black", "a frame is completely dark")
-CAMERA_SATURATED = _warning(154, "camera-saturated", "a frame is completely saturated")
-VISION_FAILED = _warning(54, "vision-failed", "vision found no result; the text gives the reason")
-STREAK_REFUSED = _warning(55, "streak-refused", "a rate from star streaks disagrees with the estimate")
-STARS_REFUSED = _warning(56, "stars-refused", "an attitude from stars disagrees with the estimate")
-CAMERA_TORN = _warning(57, "camera-torn", "a frame contains parts of an earlier frame")
-CAMERA_STRANGE = _warning(
+CAMERA_FROZEN = _warn(52, "camera-frozen", "the camera delivers the same frame repeatedly")
+CAMERA_BLACK = _warn(53, "camera-black", "a frame is completely dark")
+CAMERA_SATURATED = _warn(154, "camera-saturated", "a frame is completely saturated")
+VISION_FAILED = _warn(54, "vision-failed", "vision found no result; the text gives the reason")
+STREAK_REFUSED = _warn(55, "streak-refused", "a rate from star streaks disagrees with the estimate")
+STARS_REFUSED = _warn(56, "stars-refused", "an attitude from stars disagrees with the estimate")
+CAMERA_TORN = _warn(57, "camera-torn", "a frame contains parts of an earlier frame")
+CAMERA_STRANGE = _warn(
     58, "camera-strange", "many stars were detected but none match the catalogue: check the camera's pixels"
 )
-VISION_SLOW = _warning(59, "vision-slow", "the processing of a frame takes too long")
+VISION_SLOW = _warn(59, "vision-slow", "the processing of a frame takes too long")
 FRAME_UNUSED = _info(69, "frame-unused", "a frame of the rotating body gave neither rate nor attitude")
-CAMERA_LATE = _warning(66, "camera-late", "a frame arrived late or is overdue")
+CAMERA_LATE = _warn(66, "camera-late", "a frame arrived late or is overdue")
 LOG_FAULT = _fault(60, "log-fault", "the flight log cannot be written")
 LOG_RECOVERED = _info(65, "log-recovered", "the flight log is written again")
 RECORD_LOST = _fault(110, "record-lost", "a record was lost because values were out of the packet's range")
-STATE_RECOVERED = _warning(
+STATE_RECOVERED = _warn(
     61, "state-recovered", "one copy of the stored state is damaged; the other copy is used"
 )
-STATE_LOST = _warning(
-    62, "state-lost", "both copies of the stored state are damaged; default values are used"
-)
-STATE_UNWRITTEN = _warning(63, "state-unwritten", "the state cannot be written to disk")
-STATE_OLD = _warning(
+STATE_LOST = _warn(62, "state-lost", "both copies of the stored state are damaged; default values are used")
+STATE_UNWRITTEN = _warn(63, "state-unwritten", "the state cannot be written to disk")
+STATE_OLD = _warn(
     98, "state-old", "the stored state precedes the last boot, so the last shutdown counts as unclean"
 )
-PARAMETERS_LEFT = _warning(
+PARAMETERS_LEFT = _warn(
     115, "parameters-left", "the loaded parameter table is rejected and the previous table is used"
 )
-START_WAITED = _warning(99, "start-waited", "the start failed and was repeated; the text gives the reason")
-CONFIG_DAMAGED = _warning(
+START_WAITED = _warn(99, "start-waited", "the start failed and was repeated; the text gives the reason")
+CONFIG_DAMAGED = _warn(
     67,
     "config-damaged",
     "the configuration is not the accepted one; the configuration of an earlier flight is used",
 )
-LENS_CHANGED = _warning(157, "lens-changed", "a frame contradicts the learned lens, which is learned again")
-LEARNED_REFUSED = _warning(68, "learned-refused", "implausible or contradicted learned values were rejected")
-UNCLEAN_SHUTDOWN = _warning(64, "unclean-shutdown", "the previous boot did not end cleanly")
-CLOCK_STEP = _warning(70, "clock-step", "the wall clock was changed; control does not use it")
-CPU_HIGH = _warning(71, "cpu-high", "the control process uses too much processor time")
-MEMORY_GROWS = _warning(72, "memory-grows", "the memory use of the flight processes grows")
+LENS_CHANGED = _warn(157, "lens-changed", "a frame contradicts the learned lens, which is learned again")
+LEARNED_REFUSED = _warn(68, "learned-refused", "implausible or contradicted learned values were rejected")
+UNCLEAN_SHUTDOWN = _warn(64, "unclean-shutdown", "the previous boot did not end cleanly")
+CLOCK_STEP = _warn(70, "clock-step", "the wall clock was changed; control does not use it")
+CPU_HIGH = _warn(71, "cpu-high", "the control process uses too much processor time")
+MEMORY_GROWS = _warn(72, "memory-grows", "the memory use of the flight processes grows")
 MEMORY_HIGH = _fault(73, "memory-high", "the flight processes use too much memory", Reaction.RESTART)
-DISK_LOW = _warning(74, "disk-low", "little disk space is left for the flight log")
-HOT = _warning(75, "hot", "the board is warm")
+DISK_LOW = _warn(74, "disk-low", "little disk space is left for the flight log")
+HOT = _warn(75, "hot", "the board is warm")
 TOO_HOT = _fault(76, "too-hot", "the board is too hot to drive coils", Reaction.SAFE)
 RESOURCE_NORMAL = _info(77, "resource-normal", "a resource is within its limits again")
 RELEASE_LEFT = _fault(
@@ -183,48 +175,46 @@ RELEASE_LEFT = _fault(
     "release-left",
     "the current release or the launcher is damaged or did not start; the text names the release in use",
 )
-RETURNED = _warning(
+RETURNED = _warn(
     150, "returned", "the board returned to an earlier release or configuration; the text gives the reason"
 )
 COMMANDED = _info(80, "commanded", "a command was executed")
-COMMAND_REFUSED = _warning(81, "command-refused", "a command was refused; the text gives the reason")
-COMMAND_SOCKET = _warning(
+COMMAND_REFUSED = _warn(81, "command-refused", "a command was refused; the text gives the reason")
+COMMAND_SOCKET = _warn(
     82, "command-socket", "the file of the command socket was removed, so the socket is bound again"
 )
 GUARDIAN_LOST = _fault(90, "guardian-lost", "the guardian died or hangs; another one is started")
 GUARDIAN_READY = _info(91, "guardian-ready", "a guardian watches the heartbeats again")
-GUARDIAN_ACTED = _warning(
-    92, "guardian-acted", "the heartbeats stopped and the guardian held the coils at zero"
-)
+GUARDIAN_ACTED = _warn(92, "guardian-acted", "the heartbeats stopped and the guardian held the coils at zero")
 GUARDIAN_BLIND = _fault(93, "guardian-blind", "the guardian cannot reach the PWM chip and keeps trying")
 REAL_TIME = _info(94, "real-time", "the text lists the obtained real-time scheduling and locked memory")
-REAL_TIME_REFUSED = _warning(95, "real-time-refused", "real-time scheduling or locked memory was refused")
+REAL_TIME_REFUSED = _warn(95, "real-time-refused", "real-time scheduling or locked memory was refused")
 
 ATTITUDE_KNOWLEDGE = _info(100, "attitude-knowledge", "the quality of the attitude estimate changed")
-GPS_LOST = _warning(101, "gps-lost", "the GPS receiver has delivered no usable fix for too long")
+GPS_LOST = _warn(101, "gps-lost", "the GPS receiver has delivered no usable fix for too long")
 GPS_RECOVERED = _info(102, "gps-recovered", "the GPS receiver delivers usable fixes again")
-GPS_REFUSED = _warning(103, "gps-refused", "a GPS fix was refused; the text gives the reason")
-GPS_SET_UP = _warning(153, "gps-set-up", "the GPS receiver refused a command of its configuration")
-FIELD_EXTRAPOLATED = _warning(152, "field-extrapolated", "the date is outside the years of the field model")
-GPS_LINK = _warning(151, "gps-link", "frames of the GPS receiver were corrupt, implausible or corrected")
-STRINGS_LOST = _warning(104, "strings-lost", "the solar strings deliver no readings")
+GPS_REFUSED = _warn(103, "gps-refused", "a GPS fix was refused; the text gives the reason")
+GPS_SET_UP = _warn(153, "gps-set-up", "the GPS receiver refused a command of its configuration")
+FIELD_EXTRAPOLATED = _warn(152, "field-extrapolated", "the date is outside the years of the field model")
+GPS_LINK = _warn(151, "gps-link", "frames of the GPS receiver were corrupt, implausible or corrected")
+STRINGS_LOST = _warn(104, "strings-lost", "the solar strings deliver no readings")
 STRINGS_RECOVERED = _info(105, "strings-recovered", "the solar strings deliver readings again")
-SUN_UNCLEAR = _warning(106, "sun-unclear", "the solar strings detect no Sun although the satellite is sunlit")
+SUN_UNCLEAR = _warn(106, "sun-unclear", "the solar strings detect no Sun although the satellite is sunlit")
 SUN_CLEAR = _info(107, "sun-clear", "the solar strings detect the Sun again")
-CLOCK_OFF = _warning(
+CLOCK_OFF = _warn(
     130,
     "clock-off",
     "the wall clock differs from GPS time, which is used instead, or precedes the epoch of the elements",
 )
-FIELD_REFUSED = _warning(
+FIELD_REFUSED = _warn(
     131, "field-refused", "the magnetometer is ignored because its value is stuck or contradicts the estimate"
 )
 FIELD_TRUSTED = _info(132, "field-trusted", "the magnetometer agrees with the estimate again")
 SLEW_BEGUN = _info(108, "slew-begun", "a slew to the target with minimum heat begins")
 SLEW_ENDED = _info(109, "slew-ended", "a slew has ended and the target is tracked from now on")
-WIDE_LOST = _warning(133, "wide-lost", "a wide camera delivers no frames")
+WIDE_LOST = _warn(133, "wide-lost", "a wide camera delivers no frames")
 WIDE_RECOVERED = _info(134, "wide-recovered", "all wide cameras deliver frames again")
-WIDE_FALSE = _warning(135, "wide-false", "the frames of a wide camera contradict the fine attitude")
+WIDE_FALSE = _warn(135, "wide-false", "the frames of a wide camera contradict the fine attitude")
 WIDE_TRUSTED = _info(136, "wide-trusted", "the frames of the wide cameras agree with the attitude again")
 
 OBJECT_FOUND = _info(120, "object-found", "the track of a moving object is confirmed")
@@ -233,16 +223,16 @@ OBJECT_LOST = _info(
 )
 
 OBJECT_FOLLOWED = _info(122, "object-followed", "the boresight of the star camera follows an object")
-OBJECT_ESCAPES = _warning(
+OBJECT_ESCAPES = _warn(
     123, "object-escapes", "the torque of the coils is too small to keep an object in the field of view"
 )
 
 SUN_FOUND = _info(140, "sun-found", "the Sun was detected in safe mode and the body turns towards it")
-SUN_MISSED = _warning(141, "sun-missed", "no Sun was detected in safe mode, so the body is only damped")
-ASTRAY = _warning(142, "astray", "the body is far from its path and is slowed down before a new plan")
+SUN_MISSED = _warn(141, "sun-missed", "no Sun was detected in safe mode, so the body is only damped")
+ASTRAY = _warn(142, "astray", "the body is far from its path and is slowed down before a new plan")
 
-BATTERY_LOW = _warning(160, "battery-low", "the battery is low, so the currents of the coils are limited")
-BATTERY_VERY_LOW = _warning(
+BATTERY_LOW = _warn(160, "battery-low", "the battery is low, so the currents of the coils are limited")
+BATTERY_VERY_LOW = _warn(
     161, "battery-very-low", "the battery is very low, so the star camera takes fewer frames"
 )
 BATTERY_CRITICAL = _fault(162, "battery-critical", "the battery is almost empty", Reaction.SAFE)
@@ -254,14 +244,14 @@ BATTERY_CHARGED = EventKind(
     "the battery has recovered; a flight in SAFE because of the battery leaves SAFE",
     Reaction.RETURN,
 )
-POWER_SENSOR_LOST = _warning(
+POWER_SENSOR_LOST = _warn(
     165, "power-sensor-lost", "a monitor of battery or bus is silent, stuck or contradicted, and is not used"
 )
 POWER_SENSOR_RECOVERED = _info(
     166, "power-sensor-recovered", "the monitors of battery and bus are used again"
 )
 
-WORK_SHED = _warning(170, "work-shed", "the processor is overloaded, so less important work is reduced")
+WORK_SHED = _warn(170, "work-shed", "the processor is overloaded, so less important work is reduced")
 WORK_RESTORED = _info(
     171, "work-restored", "reduced work is resumed, because the processor has spare capacity"
 )

@@ -26,6 +26,7 @@ from flight.schema.devices import (
     SolarStringsSection,
     UnitSection,
     V4l2Device,
+    WideCamera,
     fitted_devices,
     structure_mask,
     with_drivers,
@@ -101,26 +102,12 @@ def check_consistency(config: Config, document: Document) -> None:
     if config.magnetometer is not None:
         _check_unit("magnetometer", config.magnetometer, refuse)
     for index, camera in enumerate(config.wide_cameras):
-        _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
-        try:
-            structure_mask(camera, of_file=False)
-        except UsageError as error:
-            refuse(f"wide_cameras[{index}].structure", f"is refused: {error}")
-        first = config.wide_cameras[0]
-        for name in ("response", "decades", "bits", "pedestal"):
-            if (value := getattr(camera, name)) != (wanted := getattr(first, name)):
-                refuse(
-                    f"wide_cameras[{index}].{name}",
-                    f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}",
-                )
+        _check_wide_camera(f"wide_cameras[{index}]", camera, config.wide_cameras[0], refuse)
     if config.solar_strings is not None:
         _check_strings(config.solar_strings, refuse)
     if config.power is not None:
         _check_power(config, config.power, refuse)
-    taken: dict[str, str] = {}
-    for key, given, place in _connections(config):
-        if (other := taken.setdefault(place, key)) != key:
-            refuse(key, f"is {given}, which `{other}` also uses: give each device its own address or file")
+    _check_connections(config, refuse)
 
 
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
@@ -298,6 +285,13 @@ def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
                 yield f"{key}.device.{name}", place, place
 
 
+def _check_connections(config: Config, refuse: Refuse) -> None:
+    taken: dict[str, str] = {}
+    for key, value, place in _connections(config):
+        if (first := taken.setdefault(place, key)) != key:
+            refuse(key, f"is {value}, which `{first}` also uses: give each device its own address or file")
+
+
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
     norm = math.sqrt(sum(c * c for c in quaternion))
     if abs(norm - 1.0) > 1e-6:
@@ -354,6 +348,18 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
     except ValueError as error:
         named = next((name for name in ("peers", "udp", "tcp", "kiss") if getattr(link, name)), "peers")
         refuse(f"link.{named}", str(error))
+
+
+def _check_wide_camera(dotted: str, camera: WideCamera, first: WideCamera, refuse: Refuse) -> None:
+    _check_length(f"{dotted}.mounting", camera.mounting, refuse)
+    try:
+        structure_mask(camera, of_file=False)
+    except UsageError as error:
+        refuse(f"{dotted}.structure", f"is refused: {error}")
+    for name in ("response", "decades", "bits", "pedestal"):
+        if (value := getattr(camera, name)) != (wanted := getattr(first, name)):
+            problem = f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}"
+            refuse(f"{dotted}.{name}", problem)
 
 
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
