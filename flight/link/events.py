@@ -1,4 +1,4 @@
-"""Table of all events, with the severity of each event and the reaction to each event."""
+"""Table of all events with their severities and reactions, and the modes of the satellite."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prediction of the supply current of healthy and broken coils.
+"""Prediction of the supply current of healthy and broken coils, and the search for a leg that is stuck high.
 
 The supply current is predicted from the commands for each hypothesis: that all coils are healthy, or that one
 axis has one fault. Each H-bridge has two inputs, A and B. The input A is pulsed for positive currents, the
@@ -8,13 +8,15 @@ the other input is pulsed.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, auto
 from functools import cache
 
 import numpy as np
 
+from hal.interfaces.devices import NO_AXES
 from knightcube.astro.arrays import FloatArray
 
 
@@ -75,14 +77,14 @@ class Bounds:
     Attributes:
         full_current: current (A) of each coil at a duty cycle of one.
         uncertainty: error bound (A) of the current of each driven coil.
-        gain: relative error bound that is common to all readings.
+        gain: relative error bound due to resistance, supply voltage and sampling of the chopped current.
         noise: error bound (A) of the current monitor.
     """
 
     full_current: tuple[float, ...]
-    uncertainty: float
-    gain: float
-    noise: float
+    uncertainty: float = 3.5e-3
+    gain: float = 0.2
+    noise: float = 1.5e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,3 +201,198 @@ def fits(
 def _scales(gain: float) -> FloatArray:
     """Return nine equally spaced factors (9, 1, 1) from the lower to the upper bound of the gain error."""
     return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]
+
+
+_SURE = 2
+"""Number of consecutive ADC samples that must agree in a step of the search for a stuck leg."""
+_PATIENCE = 12
+"""Number of ADC samples without agreement after which a step of the search is abandoned."""
+_PAUSE = 50
+"""Minimum number of ADC samples from a check at zero current that finds no fault to the next check."""
+_UNCLEAR = 20
+"""Number of consecutive ADC samples with ambiguous commands after which the coils are checked at zero."""
+
+
+class _Step(Enum):
+    WATCHING = auto()
+    RESTING = auto()
+    ALL_BRAKED = auto()
+    ONE_RELEASED = auto()
+    NO_CURE = auto()
+
+
+class StuckLeg:
+    """Searches for an output leg that is stuck high by commanding zero currents and braking the bridges.
+
+    Attributes:
+        brake: indices of the bridges that must be braked now.
+        rest: whether all currents must be commanded to zero now.
+        suspicion: reason for the search; empty if there is no search.
+    """
+
+    def __init__(self, excess: float) -> None:
+        """Set the smallest `excess` of the supply current (A) that indicates a fault."""
+        self._excess = excess
+        self._pause = self._unclear = 0
+        self._high = self._short = self._normal = self._looks = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Release all bridges and end the search."""
+        self._step = _Step.WATCHING
+        self._left: list[int] = []
+        self._braked: tuple[int, ...] = ()
+        self._await()
+        self.brake = NO_AXES
+        self.rest = False
+        self.suspicion = ""
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether a search is running, in which the coils are commanded to zero and may be braked."""
+        return self.rest
+
+    def exceeds(self, supplied: Supplied) -> bool:
+        """Return whether an ADC sample exceeds the current that healthy coils would draw."""
+        return supplied.current > supplied.most + self._excess
+
+    def ask_for_rest(self, why: str) -> None:
+        """Request zero currents in all coils, unless a search is running or the last request is recent."""
+        if self._step is _Step.WATCHING and not self._pause:
+            self._rest(why)
+
+    def look(self, supplied: Supplied) -> int | None:
+        """Process an ADC sample, and return the axis with a stuck leg once it is identified."""
+        self._pause = max(self._pause - 1, 0)
+        if self.rest and supplied.driven:
+            return None  # the commanded zero currents are not yet in force
+        high = self.exceeds(supplied)
+        short = supplied.current < supplied.least - self._excess
+        self._high = self._high + 1 if high else 0
+        self._short = self._short + 1 if short else 0
+        self._normal = 0 if high or short else self._normal + 1
+        self._looks += 1
+        if self.is_searching and self._looks > _PATIENCE:
+            self._give_up()  # a stuck leg would not draw an intermittent current
+            return None
+        self._unclear = self._unclear + 1 if supplied.spread > self._excess else 0
+        if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
+            self._rest("")
+            return None
+        if self._high >= _SURE:
+            return self._judge_too_much(supplied)
+        if self._short >= _SURE and self._step is _Step.WATCHING:
+            self._put_to_rest(supplied)
+        elif self._normal >= _SURE:
+            self._judge_normal()
+        return None
+
+    def _judge_too_much(self, supplied: Supplied) -> int | None:
+        match self._step:
+            case _Step.WATCHING if supplied.driven:
+                self._put_to_rest(supplied)
+            case _Step.WATCHING | _Step.RESTING if supplied.at_rest:
+                self._brake_all(supplied)
+            case _Step.ONE_RELEASED:
+                found = self._left[0]
+                self.reset()
+                return found
+            case _:
+                self._give_up()
+        return None
+
+    def _judge_normal(self) -> None:
+        match self._step:
+            case _Step.RESTING if not self.suspicion:
+                self.reset()
+            case _Step.RESTING:
+                self._pause = _PAUSE
+                self._give_up()
+            case _Step.ALL_BRAKED:
+                self._release_next()
+            case _Step.ONE_RELEASED:
+                del self._left[0]
+                self._release_next()
+            case _Step.NO_CURE:
+                self.reset()
+            case _Step.WATCHING:
+                pass
+
+    def _brake_all(self, supplied: Supplied) -> None:
+        self.suspicion = self.suspicion or _reason(supplied)
+        self._step = _Step.ALL_BRAKED
+        self._left, self._braked = list(supplied.at_rest), tuple(supplied.at_rest)
+        self.brake, self.rest = frozenset(supplied.at_rest), True
+        self._await()
+
+    def _put_to_rest(self, supplied: Supplied) -> None:
+        if self._pause:
+            self._give_up()
+            return
+        self._rest(_reason(supplied))
+
+    def _rest(self, why: str) -> None:
+        self.suspicion = self.suspicion or why
+        self._step = _Step.RESTING
+        self.brake, self.rest = NO_AXES, True
+        self._await()
+
+    def _release_next(self) -> None:
+        """Release the next bridge; end the search after the last one."""
+        if not self._left:
+            self.reset()
+            return
+        self._step = _Step.ONE_RELEASED
+        self.brake = frozenset(self._braked) - {self._left[0]}
+        self._await()
+
+    def _give_up(self) -> None:
+        """End the search until the supply current is normal again."""
+        self.reset()
+        self._step = _Step.NO_CURE
+
+    def _await(self) -> None:
+        self._high = self._short = self._normal = self._looks = 0
+
+
+def _reason(supplied: Supplied) -> str:
+    due = f"{1e3 * max(supplied.least, 0.0):.0f} to {1e3 * supplied.most:.0f} mA"
+    return f"supply current {1e3 * supplied.current:.0f} mA, expected {due}"
+
+
+_PROOFS = 2
+"""Number of consecutive ADC samples that must agree before braking is confirmed or refuted."""
+
+
+class BrakeProof:
+    """Confirms from ADC samples that the braked bridges have a leg stuck high."""
+
+    def __init__(self) -> None:
+        self._axes: set[int] = set()
+        self._exceeds: deque[bool] = deque(maxlen=_PROOFS)
+
+    def __bool__(self) -> bool:
+        """Return whether any braked bridge is unconfirmed."""
+        return bool(self._axes)
+
+    def add(self, axis: int) -> None:
+        """Add an axis that is braked because of a diagnosis that is not yet confirmed."""
+        self._axes.add(axis)
+
+    def discard(self, axis: int) -> None:
+        """Remove an axis."""
+        self._axes.discard(axis)
+
+    def ingest(self, exceeds: bool) -> frozenset[int]:
+        """Process an ADC sample, which may show a current in spite of braking.
+
+        Return the axes whose coils carry a current although they are braked.
+        """
+        self._exceeds.append(exceeds)
+        if len(self._exceeds) < _PROOFS:
+            return frozenset()
+        wrong = frozenset(self._axes) if all(self._exceeds) else frozenset()
+        if len(set(self._exceeds)) == 1:
+            self._axes.clear()
+            self._exceeds.clear()
+        return wrong

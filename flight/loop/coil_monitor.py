@@ -48,9 +48,7 @@ and 18 % for a single ADC sample of the chopped current (`hal.drivers.current_mo
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 
 import numpy as np
 
@@ -58,10 +56,11 @@ from flight.loop.coil_currents import (
     MEAN,
     NEWEST,
     Bounds,
+    BrakeProof,
     CoilFault,
     Predicted,
     Sampling,
-    Supplied,
+    StuckLeg,
     fits,
     predict,
 )
@@ -76,203 +75,121 @@ from flight.loop.coil_response import (
     MotionWitness,
     ResponseSettings,
 )
-from flight.loop.coil_self_test import SelfTest, SelfTestSettings
 from hal.interfaces.devices import COIL_NAMES, NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
-_SURE = 2
-"""Number of consecutive ADC samples that must agree in a step of the search for a stuck leg."""
-_PATIENCE = 12
-"""Number of ADC samples without agreement after which a step of the search is abandoned."""
-_PAUSE = 50
-"""Minimum number of ADC samples from a check at zero current that finds no fault to the next check."""
-_UNCLEAR = 20
-"""Number of consecutive ADC samples with ambiguous commands after which the coils are checked at zero."""
 
-
-class _Step(Enum):
-    WATCHING = auto()
-    RESTING = auto()
-    ALL_BRAKED = auto()
-    ONE_RELEASED = auto()
-    NO_CURE = auto()
-
-
-class StuckLeg:
-    """Searches for an output leg that is stuck high by commanding zero currents and braking the bridges.
+@dataclass(frozen=True, slots=True)
+class SelfTestSettings:
+    """Settings of the coils' self-test.
 
     Attributes:
-        brake: indices of the bridges that must be braked now.
-        rest: whether all currents must be commanded to zero now.
-        suspicion: reason for the search; empty if there is no search.
+        interval_ns: longest time (ns) without evidence about a coil, after which the coil is tested.
+        limits: largest currents (n,), A, of a test.
+        gyro_hz: number of gyro samples per second.
     """
 
-    def __init__(self, excess: float) -> None:
-        """Set the smallest `excess` of the supply current (A) that indicates a fault."""
-        self._excess = excess
-        self._pause = self._unclear = 0
-        self._high = self._short = self._normal = self._looks = 0
-        self.reset()
-
-    def reset(self) -> None:
-        """Release all bridges and end the search."""
-        self._step = _Step.WATCHING
-        self._left: list[int] = []
-        self._braked: tuple[int, ...] = ()
-        self._await()
-        self.brake = NO_AXES
-        self.rest = False
-        self.suspicion = ""
-
-    @property
-    def is_searching(self) -> bool:
-        """Whether a search is running, in which the coils are commanded to zero and may be braked."""
-        return self.rest
-
-    def exceeds(self, supplied: Supplied) -> bool:
-        """Return whether an ADC sample exceeds the current that healthy coils would draw."""
-        return supplied.current > supplied.most + self._excess
-
-    def ask_for_rest(self, why: str) -> None:
-        """Request zero currents in all coils, unless a search is running or the last request is recent."""
-        if self._step is _Step.WATCHING and not self._pause:
-            self._rest(why)
-
-    def look(self, supplied: Supplied) -> int | None:
-        """Process an ADC sample, and return the axis with a stuck leg once it is identified."""
-        self._pause = max(self._pause - 1, 0)
-        if self.rest and supplied.driven:
-            return None  # the commanded zero currents are not yet in force
-        high = self.exceeds(supplied)
-        short = supplied.current < supplied.least - self._excess
-        self._high = self._high + 1 if high else 0
-        self._short = self._short + 1 if short else 0
-        self._normal = 0 if high or short else self._normal + 1
-        self._looks += 1
-        if self.is_searching and self._looks > _PATIENCE:
-            self._give_up()  # a stuck leg would not draw an intermittent current
-            return None
-        self._unclear = self._unclear + 1 if supplied.spread > self._excess else 0
-        if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
-            self._rest("")
-            return None
-        if self._high >= _SURE:
-            return self._judge_too_much(supplied)
-        if self._short >= _SURE and self._step is _Step.WATCHING:
-            self._put_to_rest(supplied)
-        elif self._normal >= _SURE:
-            self._judge_normal()
-        return None
-
-    def _judge_too_much(self, supplied: Supplied) -> int | None:
-        match self._step:
-            case _Step.WATCHING if supplied.driven:
-                self._put_to_rest(supplied)
-            case _Step.WATCHING | _Step.RESTING if supplied.at_rest:
-                self._brake_all(supplied)
-            case _Step.ONE_RELEASED:
-                found = self._left[0]
-                self.reset()
-                return found
-            case _:
-                self._give_up()
-        return None
-
-    def _judge_normal(self) -> None:
-        match self._step:
-            case _Step.RESTING if not self.suspicion:
-                self.reset()
-            case _Step.RESTING:
-                self._pause = _PAUSE
-                self._give_up()
-            case _Step.ALL_BRAKED:
-                self._release_next()
-            case _Step.ONE_RELEASED:
-                del self._left[0]
-                self._release_next()
-            case _Step.NO_CURE:
-                self.reset()
-            case _Step.WATCHING:
-                pass
-
-    def _brake_all(self, supplied: Supplied) -> None:
-        self.suspicion = self.suspicion or _reason(supplied)
-        self._step = _Step.ALL_BRAKED
-        self._left, self._braked = list(supplied.at_rest), tuple(supplied.at_rest)
-        self.brake, self.rest = frozenset(supplied.at_rest), True
-        self._await()
-
-    def _put_to_rest(self, supplied: Supplied) -> None:
-        if self._pause:
-            self._give_up()
-            return
-        self._rest(_reason(supplied))
-
-    def _rest(self, why: str) -> None:
-        self.suspicion = self.suspicion or why
-        self._step = _Step.RESTING
-        self.brake, self.rest = NO_AXES, True
-        self._await()
-
-    def _release_next(self) -> None:
-        """Release the next bridge; end the search after the last one."""
-        if not self._left:
-            self.reset()
-            return
-        self._step = _Step.ONE_RELEASED
-        self.brake = frozenset(self._braked) - {self._left[0]}
-        self._await()
-
-    def _give_up(self) -> None:
-        """End the search until the supply current is normal again."""
-        self.reset()
-        self._step = _Step.NO_CURE
-
-    def _await(self) -> None:
-        self._high = self._short = self._normal = self._looks = 0
+    interval_ns: int
+    limits: FloatArray
+    gyro_hz: float
 
 
-def _reason(supplied: Supplied) -> str:
-    due = f"{1e3 * max(supplied.least, 0.0):.0f} to {1e3 * supplied.most:.0f} mA"
-    return f"supply current {1e3 * supplied.current:.0f} mA, expected {due}"
+_SHOWN = 8.0
+"""Gain of a healthy coil divided by the standard deviation with which a self-test measures the gain."""
+_EFFICIENCY = 0.7
+"""Ratio of two standard deviations of a gain: without and with the simultaneous estimation of a constant
+torque."""
+_SHORTEST_QUARTER, _LONGEST_QUARTER = 1.0, 4.0
+"""Minimum and maximum duration (s) of each of the four quarters of a test."""
+_GAP_NS = 400_000_000
+"""Time (ns) with zero current before a test, during which the magnetic field is measured."""
+_CALM_NS = 10_000_000_000
+"""Time (ns) for which the commands must be small before a test."""
+_QUIET = 0.25
+"""Largest commanded current at which a test is made, as a fraction of the largest current of the test."""
+_REPORT_NS = 5_000_000_000
+"""Time (ns) between the last test and the report, during which the motion is evaluated."""
+_NEAR_FIELD_NS = 60_000_000_000
+"""Time (ns) after which a coil that was nearly parallel to the magnetic field is tested again."""
 
 
-_PROOFS = 2
-"""Number of consecutive ADC samples that must agree before braking is confirmed or refuted."""
+class SelfTest:
+    """Self-test of rarely used coils by short test currents, whose effect on the body's motion is measured.
 
+    While a satellite points, its coil currents of a few mA reveal neither an open nor a reversed coil. A coil
+    that the motion has not confirmed for `interval_ns` is therefore driven alone by a known current with the
+    signs +, -, -, + in four equal quarters. After these four quarters, neither the rate nor the attitude has
+    changed. Duration and current of a test follow from the gyro's noise, so that a test measures the gain of
+    a healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a test is the
+    angular acceleration times the square of the duration of one of the four quarters. `CoilResponse`
+    evaluates the response, with the errors of the inertia as nuisance parameters. The current monitor
+    compares the supply current with the command, as at any other time.
+    """
 
-class BrakeProof:
-    """Confirms from ADC samples that the braked bridges have a leg stuck high."""
+    def __init__(self, response: CoilResponse, rate_noise: float, settings: SelfTestSettings) -> None:
+        """Set the standard deviation `rate_noise` (rad/s) of a gyro sample."""
+        self._response, self._settings = response, settings
+        self._least = _SHOWN * rate_noise / (_EFFICIENCY * math.sqrt(4.0 * settings.gyro_hz / 3.0))
+        self._shown_ns: list[int | None] = [None] * len(settings.limits)
+        self._running: tuple[int, int, int, float] | None = None
+        self._loud_ns = 0
+        self._tested: dict[int, int] = {}  # end (ns) of each test without a report, by axis
 
-    def __init__(self) -> None:
-        self._axes: set[int] = set()
-        self._exceeds: deque[bool] = deque(maxlen=_PROOFS)
+    def request(self) -> None:
+        """Test all coils as soon as possible, because the body does not move as commanded."""
+        self._shown_ns = [-self._settings.interval_ns] * len(self._shown_ns)
 
-    def __bool__(self) -> bool:
-        """Return whether any braked bridge is unconfirmed."""
-        return bool(self._axes)
+    def stop(self) -> None:
+        """End the tests, because a coil is suspected or the correction of a coil has changed."""
+        self._running = None
+        self._tested.clear()
 
-    def add(self, axis: int) -> None:
-        """Add an axis that is braked because of a diagnosis that is not yet confirmed."""
-        self._axes.add(axis)
+    def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
+        """Return the test currents (n,), A, that replace the `wanted` currents (n,), or None without a test.
 
-    def discard(self, axis: int) -> None:
-        """Remove an axis."""
-        self._axes.discard(axis)
-
-    def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Process an ADC sample, which may show a current in spite of braking.
-
-        Return the axes whose coils carry a current although they are braked.
+        The currents `wanted` are effective currents. Only coils that are `usable` (n,) are tested.
         """
-        self._exceeds.append(exceeds)
-        if len(self._exceeds) < _PROOFS:
-            return frozenset()
-        wrong = frozenset(self._axes) if all(self._exceeds) else frozenset()
-        if len(set(self._exceeds)) == 1:
-            self._axes.clear()
-            self._exceeds.clear()
-        return wrong
+        if (np.abs(wanted) > _QUIET * self._settings.limits).any():
+            self._loud_ns, self._running = now_ns, None
+        for axis, shown_ns in enumerate(self._shown_ns):
+            if shown_ns is None or self._response.is_healthy(axis):
+                self._shown_ns[axis] = now_ns
+        if self._running is None and now_ns - self._loud_ns >= _CALM_NS:
+            self._begin(usable, now_ns)
+        if self._running is None:
+            return None
+        axis, since_ns, quarter_ns, current = self._running
+        quarter = (now_ns - since_ns) // quarter_ns
+        currents = np.zeros(len(self._shown_ns))
+        if quarter >= 4:
+            self._running, self._tested[axis], self._shown_ns[axis] = None, now_ns, now_ns
+        elif now_ns >= since_ns:
+            currents[axis] = current if quarter in {0, 3} else -current
+        return currents
+
+    def report(self, now_ns: int) -> str:
+        """Return the results of the last tests as text, once the motion has been evaluated, or ""."""
+        if not self._tested or self._running or now_ns - max(self._tested.values()) < _REPORT_NS:
+            return ""
+        tested, self._tested = sorted(self._tested), {}
+        return "; ".join(f"coil {COIL_NAMES[axis]}: {self._response.text(axis)}" for axis in tested)
+
+    def _begin(self, usable: BoolArray, now_ns: int) -> None:
+        """Begin the test of the next coil that is due."""
+        interval_ns, strength = self._settings.interval_ns, self._response.strength
+        if strength is None:
+            return
+        for axis in np.flatnonzero(usable).tolist():
+            shown_ns = self._shown_ns[axis]
+            if shown_ns is None or now_ns - shown_ns < interval_ns:
+                continue
+            current, limit = self._least / float(strength[axis]), float(self._settings.limits[axis])
+            quarter = max(_SHORTEST_QUARTER, (current / limit) ** (2.0 / 3.0))
+            if quarter > _LONGEST_QUARTER:
+                self._shown_ns[axis] = now_ns - interval_ns + _NEAR_FIELD_NS
+                continue
+            self._running = axis, now_ns + _GAP_NS, round(quarter * 1e9), min(current, limit)
+            return
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,23 +204,11 @@ class CoilVerdict:
 
 @dataclass(frozen=True, slots=True)
 class CoilMonitorSettings:
-    """Properties of the coil circuit and of the current monitor, and thresholds for a diagnosis.
+    """Properties of the coil circuit, and the settings of the diagnosis by the body's motion.
 
     Attributes:
         full_current: current (A) of each coil when fully on, which is the supply voltage divided by its
             resistance.
-        current_uncertainty: bound (A) on the deviation of a driven coil's current from its command.
-        gain_error: relative error bound due to resistance, supply voltage and sampling of the chopped
-            current.
-        monitor_noise: error bound (A) of the current monitor at any current.
-        window_ns: time (ns) over which the current monitor averages. After a longer gap between readings, the
-            evidence is discarded.
-        persistence: number of consecutive readings after which a fault is suspected if these readings
-            contradict a healthy circuit.
-        settle: number of readings after a fault until the averaging window excludes the time before it.
-        evidence: number of readings that are needed for a diagnosis.
-        probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
-        probe_half_ns: half the period (ns) of the probe's square wave.
         response: settings for evaluating the coils from the body's motion, or None if the motion is not used.
         slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
@@ -314,15 +219,6 @@ class CoilMonitorSettings:
     """
 
     full_current: tuple[float, ...]
-    current_uncertainty: float = 3.5e-3
-    gain_error: float = 0.2
-    monitor_noise: float = 1.5e-3
-    window_ns: int = 1_100_000_000
-    persistence: int = 3
-    settle: int = 2
-    evidence: int = 3
-    probe_current: float = 0.04
-    probe_half_ns: int = 800_000_000
     response: ResponseSettings | None = None
     slow: ResponseSettings | None = None
     tumble_rate: float = math.inf
@@ -383,6 +279,18 @@ _STUCK_EXCESS = 0.3
 _LEAST_SHORT = 0.02
 """Smallest excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
+_WINDOW_NS = 1_100_000_000
+"""Averaging time (ns) of the current monitor. After a longer gap between readings, the evidence is
+discarded."""
+_SETTLE = 2
+"""Number of readings after a fault until the averaging window excludes the time before it."""
+_SETTLE_NS = _SETTLE * _READING_NS
+_PERSISTENCE = 3
+"""Number of consecutive contradictions to a healthy circuit after which a fault is suspected."""
+_EVIDENCE = 3
+"""Number of readings that are needed for a diagnosis."""
+_PROBE_CURRENT, _PROBE_HALF_NS = 0.04, 800_000_000
+"""Amplitude (A) and half period (ns) of the square wave that reveals which of several axes is faulty."""
 _IN_DOUBT = 5
 """Number of readings after which an axis may be diagnosed as faulty although the kind of fault is
 uncertain."""
@@ -404,10 +312,8 @@ class CoilMonitor:
 
     def __init__(self, settings: CoilMonitorSettings) -> None:
         self._settings, self.tumble_rate = settings, settings.tumble_rate
-        self._bounds = Bounds(
-            settings.full_current, settings.current_uncertainty, settings.gain_error, settings.monitor_noise
-        )
-        self._commands = CoilCommands(2 * settings.window_ns)
+        self._bounds = Bounds(settings.full_current)
+        self._commands = CoilCommands(2 * _WINDOW_NS)
         self._reading_ns = -(1 << 62)
         self._fresh = 0
         self._strange = 0
@@ -417,7 +323,7 @@ class CoilMonitor:
         self._unmixed_ns = 0  # time (ns) from which readings show one circuit state
         self._evidence = Evidence(self._bounds)
         coils = len(settings.full_current)
-        self._probe = Probe(settings.probe_current, settings.probe_half_ns, coils)
+        self._probe = Probe(_PROBE_CURRENT, _PROBE_HALF_NS, coils)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._responses = [response for response in (self._response, self._slow) if response is not None]
@@ -531,7 +437,7 @@ class CoilMonitor:
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
         # Without readings of the current monitor, the search for a stuck leg cannot succeed, and is ended.
-        if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
+        if self._leg.is_searching and time_ns - self._looked_ns > _WINDOW_NS:
             self._leg.reset()
         effective = tuple(self.correction.effective(currents).tolist())
         for response in self._responses:
@@ -574,7 +480,7 @@ class CoilMonitor:
 
     def _probe_weak_coil(self, axis: int, now_ns: int) -> None:
         """Start probe currents, from which the current monitor decides whether a coil is open."""
-        silent = now_ns - self._reading_ns > self._settings.window_ns
+        silent = now_ns - self._reading_ns > _WINDOW_NS
         if silent or self._suspected_ns is not None or now_ns - self._weak_ns < _AGAIN_NS:
             return
         self._weak_ns = now_ns
@@ -647,15 +553,15 @@ class CoilMonitor:
             if self._suspected_ns is None and self._leg.suspicion:
                 self._suspect(self._leg.suspicion)
             return
-        self._fresh = self._fresh + 1 if gap_ns < self._settings.window_ns else 1
-        if self._fresh <= self._settings.settle:
+        self._fresh = self._fresh + 1 if gap_ns < _WINDOW_NS else 1
+        if self._fresh <= _SETTLE:
             self._reset()
             self._unmixed_ns = reading.time_ns
             return
         predictions = self._predictions(reading)
         if self._suspected_ns is None:
             self._check_healthy(predictions, reading)
-        elif reading.time_ns - self._suspected_ns > self._settle_ns:
+        elif reading.time_ns - self._suspected_ns > _SETTLE_NS:
             self._evidence.add(predictions)
             self._judge(reading.time_ns)
 
@@ -691,10 +597,6 @@ class CoilMonitor:
         return self._witness.doubt
 
     @property
-    def _settle_ns(self) -> int:
-        return self._settings.settle * _READING_NS
-
-    @property
     def _known(self) -> dict[int, CoilFault]:
         """The fault of each broken axis, as it affects the supply current; a braked axis draws no current."""
         return dict.fromkeys(self._settings.absent, CoilFault.OPEN) | {
@@ -722,7 +624,7 @@ class CoilMonitor:
     def _predictions(self, reading: PowerReading) -> list[Predicted]:
         """Predict the newest ADC sample and, if the circuit did not change in the window, its mean."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
-        begin_ns, commands = reading.time_ns - self._settings.window_ns, self._commands
+        begin_ns, commands = reading.time_ns - _WINDOW_NS, self._commands
         if begin_ns >= self._unmixed_ns:
             windows.append((reading.current, begin_ns, MEAN))
         return [
@@ -741,7 +643,7 @@ class CoilMonitor:
                 self._sound_ns = reading.newest_since_ns
             return
         self._strange += 1
-        if self._strange >= self._settings.persistence:
+        if self._strange >= _PERSISTENCE:
             why = f"supply current {1e3 * reading.newest:.0f} mA, expected {1e3 * asked:.0f} mA"
             self._suspect(why)
             if reading.newest > asked > 0.0:
@@ -749,14 +651,14 @@ class CoilMonitor:
 
     def _suspect(self, why: str) -> None:
         self._suspected_ns = self._unmixed_ns = self._reading_ns
-        self._judge_ns = self._reading_ns + self._settle_ns + _IN_DOUBT * _READING_NS
+        self._judge_ns = self._reading_ns + _SETTLE_NS + _IN_DOUBT * _READING_NS
         self._evidence.clear()
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
         """Diagnose a fault if all evidence concerns one axis, or suspect no fault if readings are normal."""
         evidence = self._evidence
-        if len(evidence) < self._settings.evidence:
+        if len(evidence) < _EVIDENCE:
             return
         left = evidence.possible_faults(self._known)
         if evidence.is_normal_again(self._known, left):
@@ -812,7 +714,7 @@ class CoilMonitor:
     def _is_contradicted(self, axis: int, fault: CoilFault) -> bool:
         if self._suspected_ns is None:
             return False
-        begun_ns = min(self._sound_ns, self._suspected_ns - self._settings.window_ns)
+        begun_ns = min(self._sound_ns, self._suspected_ns - _WINDOW_NS)
         return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
 
     def _look_further(self, axes: set[int], now_ns: int) -> None:

@@ -147,10 +147,6 @@ class ResponseSettings:
         errors: largest errors of the coils' gains, and of inertia and gyro of a body that is free about three
             axes.
         sure: standard deviation of a gain below which the gain is used to assess a coil.
-        persistence: number of consecutive fits that must agree.
-        lowest_sound, highest_feeble, highest_reversed: gain limits for a healthy coil (minimum), a coil
-            without torque (maximum) and a reversed coil (maximum).
-        memory_ns: time (ns) for which residual accelerations are stored.
         settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed,
             or None if their field is small compared with the Earth's.
         disturbance: function that returns the largest expected acceleration (rad/s^2) by disturbance torques
@@ -169,15 +165,16 @@ class ResponseSettings:
     damping: float = 5.0e-3
     errors: BodyErrors = field(default_factory=BodyErrors)
     sure: float = 0.25
-    persistence: int = 3
-    lowest_sound: float = 0.6
-    highest_feeble: float = 0.4
-    highest_reversed: float = -0.5
-    memory_ns: int = 20_000_000_000
     settle_ns: int | None = None
     disturbance: Callable[[int], float] | None = None
 
 
+_PERSISTENCE = 3
+"""Number of consecutive fits that must agree."""
+_LOWEST_SOUND, _HIGHEST_FEEBLE, _HIGHEST_REVERSED = 0.6, 0.4, -0.5
+"""Smallest gain of a healthy coil, largest gain of a coil without torque, and of a reversed coil."""
+_MEMORY_NS = 20_000_000_000
+"""Time (ns) for which residual accelerations are stored."""
 _STALE_NS = 200_000_000
 _REACH_NS = 3_000_000_000
 """Time (ns) for which commands are stored.
@@ -348,7 +345,7 @@ class CoilResponse:
     def axes(self, finding: Finding) -> list[int]:
         """Return the axes for which a finding held in the last `persistence` fits."""
         counts = self._in_a_row[finding]
-        return [axis for axis, count in enumerate(counts) if count >= self._settings.persistence]
+        return [axis for axis, count in enumerate(counts) if count >= _PERSISTENCE]
 
     def is_healthy(self, axis: int) -> bool:
         """Return whether an axis had the gain of a healthy coil in the last `persistence` fits."""
@@ -424,7 +421,7 @@ class CoilResponse:
         remainder = row[:, coils] - row[:, :coils].sum(axis=1)
         per_ampere = per_ampere[-1].T * self._mask
         self._remainders.append((self._last_ns, row[:, :coils], per_ampere, remainder, row[:, coils + 3 :]))
-        while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
+        while self._remainders[0][0] < self._last_ns - _MEMORY_NS:
             self._remainders.popleft()
         if len(self._rows) < self._settings.least_bins:
             return False
@@ -449,7 +446,7 @@ class CoilResponse:
         steady = np.abs(newest.gain - whole.gain) < _STEADY * newest.sigma
         for axis in range(self._count_of_coils):
             shown = [fit for fit in fits if fit.possible and fit.is_reversed[axis]]
-            shown = [fit for fit in shown if fit.gain[axis] < self._settings.highest_reversed]
+            shown = [fit for fit in shown if fit.gain[axis] < _HIGHEST_REVERSED]
             if shown:
                 self.gain[axis], self.sigma[axis] = shown[0].gain[axis], shown[0].sigma[axis]
             alone, is_steady = bool(whole.alone[axis]), bool(steady[axis])
@@ -523,7 +520,7 @@ class CoilResponse:
         settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
         judged = possible and abs(gain) <= float(self.largest[axis])
         sure = judged and sigma < settings.sure
-        weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
+        weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < _HIGHEST_FEEBLE
         exact = judged and alone and is_steady and sigma < _EXACT
         # The dipole of a coil that was corrected before may be several times the dipole assumed at present.
         corrected = float(self.largest[axis]) > LARGEST_GAIN
@@ -531,7 +528,7 @@ class CoilResponse:
         findings = {
             Finding.REVERSED: wrong,
             Finding.FEEBLE: wrong or (sure and weak),
-            Finding.SOUND: sure and gain > settings.lowest_sound,
+            Finding.SOUND: sure and gain > _LOWEST_SOUND,
             Finding.WEAK: exact and gain + 3.0 * sigma < _USED_WEAK_GAIN and gain - 3.0 * sigma > LEAST_GAIN,
             Finding.STRONG: exact and gain - 3.0 * sigma > _STRONG_GAIN,
         }

@@ -12,7 +12,18 @@ task is reported, and the loop continues.
 The control thread submits a job and later collects its result; it never waits for a job. In a lock-step
 simulation, `LockStepRunner` runs a job at once when it is submitted, and delivers its result after the
 modelled latency in simulated time, so that the result of a flight does not depend on the speed of the
-machine. In a real-time flight, `flight.loop.executive.ProcessRunner` runs jobs in separate processes.
+machine. In a real-time flight, `ProcessRunner` runs jobs in separate processes, which a thread starts,
+supervises, restarts and reaps. The control thread and the supervising thread exchange values through queues
+that never wait, so that starts and unexpected exits of workers do not delay the control thread. Each worker
+process has a socket for messages, and a memory file for arrays that both processes map, so that frames of
+several megabytes are not sent through a pipe. Each unexpected exit is reported as `WorkerNews`.
+
+A worker that exits or exceeds its time limit is restarted, unless its budget of restarts is used up. The
+first restart is immediate, the second is delayed by half a second, and each later delay is twice as long as
+the previous one. The budget of restarts is reset when a worker has run for a minute. After `BUDGET`
+consecutive exits, the worker is not restarted for ten minutes. Then the worker's budget of restarts is reset,
+so that it recovers on a long flight once the cause has disappeared. A worker is therefore started at most
+`BUDGET` times in 12 minutes.
 """
 
 from __future__ import annotations

@@ -1,9 +1,14 @@
-"""Navigation: passes readings of inertial unit, GPS and solar cells to the filter, and monitors them.
+"""Navigation: passes readings of inertial unit, GPS, solar cells and horizon cameras to the filter.
 
 The serial line of the inertial unit is monitored for silence (no bytes), corruption (bytes without valid
 packets) and implausible values. Rates from streaks and attitudes from stars update the estimate at the times
 of their measurement. The filter propagates with the coil currents, which are unknown (`CoilKnowledge`) while
 the PWM driver fails, after the loop has stalled, and while the supply current contradicts the commands.
+
+All horizon cameras are triggered together, more often while the body needs their frames. A camera is reported
+if it delivers no frame, repeats an image, or delivers images that contradict a fine attitude. The task runs
+once a second, or ten times a second for cameras with a period below 2 s, independently of the control cycle.
+A frame is a measurement at the time of its exposure.
 """
 
 from __future__ import annotations

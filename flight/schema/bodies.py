@@ -1,4 +1,4 @@
-"""The configuration of a satellite in orbit: sections in addition to those that all bodies share."""
+"""The configurations of the testbed and of a satellite: sections beyond those that all bodies share."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Converts configuration text to values and typed sections; errors state file, line, value and remedy.
+"""Converts configuration text to typed sections; errors state file, line, value and remedy.
 
 Plain scalars follow the core schema of YAML 1.2: `1e-5` and `0o17` are numbers, `yes` and `12:30` are texts.
 Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected. A file with the key
-`extends` takes over the values of another file and replaces some of them.
+`extends` takes over the values of another file and replaces some of them. At the end of the module stand the
+types of values with their bounds, and the values of a pointing goal.
 """
 
 from __future__ import annotations

@@ -49,9 +49,8 @@ from flight.loop.body import (
     ReadingFeed,
     Target,
 )
-from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, SelfTestSettings
 from flight.loop.coil_response import ResponseSettings
-from flight.loop.coil_self_test import SelfTestSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned
 from flight.schema.bodies import OrbitConfig, as_orbit

@@ -6,6 +6,16 @@ processes it with the mean commanded dipole and the mean of the gyro samples. Ma
 only while the coils are off and their field has decayed. Within an incomplete step, the estimate is
 propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time: the
 filter returns to the beginning of the step that contains this time, and repeats all steps since then.
+
+The learned states are stored for the next boot in three parts, without the cross-covariance of different
+parts. The part `attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment
+of the star camera. The part `attitude-torques` holds the residual dipole in shadow and in sunlight and the
+torques. The part `body` holds the inertia and the matrix of the coils. The matrix of the coils applies to
+dipoles that were computed with the signs and gains from the coil monitor. These signs and gains are therefore
+stored too, in the entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s) for which the
+learned states were estimated. At the next boot, the covariance of each state grows by its random walk over
+the elapsed time, and by a fraction of its initial covariance, because switching a sensor off and on changes
+its bias.
 """
 
 from __future__ import annotations

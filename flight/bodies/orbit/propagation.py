@@ -1,4 +1,7 @@
-"""Propagation of the satellite's estimate within a filter step, from the end of the last step."""
+"""Steps of the satellite's attitude filter, and propagation of its estimate from the end of the last step.
+
+A step holds the coil commands and the readings between two times.
+"""
 
 from __future__ import annotations
 

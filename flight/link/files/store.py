@@ -1,7 +1,11 @@
-"""State of file transfers on disk: open transfers, transaction numbers, ended transfers and received files.
+"""Files on disk: reading, records, durable writing and locks of files, and the state of file transfers.
 
-Each record is written to a temporary file, synced and renamed, so that a crash leaves the old or the new
-record. A record is a line of JSON, followed by a line with its CRC-32 in hexadecimal digits.
+Files are read with a size limit, because a FIFO at the path of an expected file would block the reader, and a
+huge sparse file would exhaust the memory.
+
+The state of file transfers consists of open transfers, transaction numbers, ended transfers and received
+files. Each record is written to a temporary file, synced and renamed, so that a crash leaves the old or the
+new record. A record is a line of JSON, followed by a line with its CRC-32 in hexadecimal digits.
 """
 
 from __future__ import annotations

@@ -1,9 +1,13 @@
-"""Management of files on board: rules for sent and received files, and selection of received files.
+"""Files on board and their use: rules for files, selection of received files, and requests of renewals.
 
 The satellite can send files in the folders `log/` (recorded runs) and `received/` to the ground. Each file
 sent to the satellite belongs to one of the kinds `KINDS`. A received file has no effect until a command with
 the file's SHA-256 selects the file. The selected file becomes `chosen/KIND/NAME`, replacing the selected file
 of the same kind (docs/fly/files.md).
+
+Updates of release or configuration in orbit (docs/fly/renewal.md) are executed by the privileged program
+`deploy/renewal.py`. It reads the requests and the record `contact` in the folder of `Renewal`, and writes the
+status file that `Renewal` reads.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ from typing import cast
 import numpy as np
 import pytest
 
+from flight.loop.coil_monitor import SelfTest, SelfTestSettings
 from flight.loop.coil_response import CoilResponse
-from flight.loop.coil_self_test import SelfTest, SelfTestSettings
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 TICK_NS = 25_000_000
