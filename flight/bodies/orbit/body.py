@@ -85,7 +85,6 @@ from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 from knightcube.gnc.guidance.attitude_law import BodyAxes
 from knightcube.gnc.tracker import Track
-from knightcube.reference.sensor_fusion import GyroBiasFilter, KnownAttitude, SeparateDetermination
 from knightcube.vision.solar_cells import SolarStringModel
 
 SPIN_EVERY = 10
@@ -257,8 +256,6 @@ class SatelliteEstimation(BodyEstimation):
                 config.wide_cameras, self.orbit_filter, self.environment, self._sun
             )
             if config.estimation.compare is not None:
-                from flight.bodies.orbit.body import ComparedFeed  # noqa: PLC0415 - seldom needed
-
                 compared = ComparedFeed(self.feed, self.orbit_filter, config, services)
                 self.feed, self.horizon_cameras.compare = compared, compared.compare
 
@@ -426,12 +423,13 @@ ORBIT = BodyKind(pointing_job.run, make)
 
 
 def _pauses(config: OrbitConfig) -> WindowSchedule:
-    """Return the control windows of pointing.
+    """Return the control windows of pointing, in which the coils act for a longer time than in detumbling."""
+    return _windows(config, config.pointing.act)
 
-    The pauses are as long as in detumbling, but the coils carry current for a longer time.
-    """
-    settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
-    return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
+
+def _windows(config: OrbitConfig, act: float) -> WindowSchedule:
+    durations = (config.detumble.settle, config.detumble.measure, act)
+    return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in durations))
 
 
 def _tracker(config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment) -> PointingTracker:
@@ -583,9 +581,6 @@ def _detumbler(
     config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment
 ) -> FieldDetumbler:
     section, craft = config.detumble, config.craft
-    settle_ns, measure_ns, act_ns = (
-        round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
-    )
     settings = FieldRateSettings(
         inertia=craft.inertia_matrix(),
         field_sigma=section.field_noise,
@@ -602,7 +597,7 @@ def _detumbler(
         slow=section.low_rate,
     )
     expected = expected_field(filter_, environment, braking.instants)
-    return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings, expected)
+    return FieldDetumbler(_windows(config, section.act), braking, settings, expected)
 
 
 def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> CoilMonitor:
@@ -636,27 +631,26 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
     slow = replace(response, bin_samples=40, least_bins=8, model_error=3.0e-5)
     tumble = config.modes.tumble_rate
     interval_ns, limits = round(config.pointing.coil_test * SECOND_NS), np.array(config.coils.limits)
-    settings = CoilMonitorSettings(
-        full,
-        response=response,
-        slow=slow,
-        tumble_rate=tumble,
-        self_test=SelfTestSettings(interval_ns, limits, config.inertial_unit.rate_hz)
-        if interval_ns
-        else None,
-        absent=config.coils.absent,
-    )
-    return CoilMonitor(settings)
+    self_test = SelfTestSettings(interval_ns, limits, config.inertial_unit.rate_hz) if interval_ns else None
+    absent = config.coils.absent
+    return CoilMonitor(CoilMonitorSettings(full, response, slow, tumble, self_test=self_test, absent=absent))
 
 
 class ComparedFeed:
-    """Passes readings to the flight filter and to the compared method; implements `ReadingFeed`."""
+    """Passes readings to the flight filter and to the method of Meller et al.; implements `ReadingFeed`."""
 
     def __init__(
         self, feed: ReadingFeed, filter_: OrbitFilter, config: OrbitConfig, services: Services
     ) -> None:
+        from knightcube.reference.sensor_fusion import (  # noqa: PLC0415 - seldom needed
+            GyroBiasFilter,
+            KnownAttitude,
+            SeparateDetermination,
+        )
+
         unit, section = config.inertial_unit, config.estimation
         noise = unit.rate_noise / np.sqrt(unit.rate_hz)
+        self._known = KnownAttitude
         self._feed, self._filter, self._services = feed, filter_, services
         self._method = SeparateDetermination(GyroBiasFilter(noise, section.bias_start, section.bias_walk))
 
@@ -680,16 +674,11 @@ class ComparedFeed:
         """Determine the attitude at `time_ns` from the directions of the sensors, and record it."""
         found = self._method.update(time_ns, sun, nadir, field)
         past = self._filter.past(time_ns) if self._filter.runs else None
-        flown = KnownAttitude()
+        flown = self._known()
         if past is not None:
-            flown = KnownAttitude(past.quaternion, past.covariance[ATTITUDE, ATTITUDE])
-        named = {
-            "cameras": found.cameras,
-            "magnetometer": found.magnetometer,
-            "fused": found.fused,
-            "filtered": found.filtered,
-            "flown": flown,
-        }
+            flown = self._known(past.quaternion, past.covariance[ATTITUDE, ATTITUDE])
+        methods = ("cameras", "magnetometer", "fused", "filtered")
+        named = {name: getattr(found, name) for name in methods} | {"flown": flown}
         values = {name: one.quaternion.tolist() for name, one in named.items()}
         sigmas = {f"{name}_sigma": one.sigma for name, one in named.items()}
         recorder = self._services.recorder

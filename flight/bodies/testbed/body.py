@@ -373,10 +373,8 @@ def attitude_filter(
 def detumbling_law(config: TestbedConfig, plant: SingleAxisPlant) -> BdotLaw:
     """Return the detumbling law with its control windows."""
     section = config.detumble
-    settle_ns, measure_ns, act_ns = (
-        round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
-    )
-    schedule = WindowSchedule(settle_ns, measure_ns, act_ns)
+    durations = (section.settle, section.measure, section.act)
+    schedule = WindowSchedule(*(round(seconds * SECOND_NS) for seconds in durations))
     turning = section.field_turn > 0.0
     share = share_in_rotating_field(section.field_turn, schedule) if turning else section.share
     dipole = dipole_per_ampere(config)
