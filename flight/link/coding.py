@@ -81,9 +81,7 @@ _DUAL_BASE_ROOT = 117  # exponent of beta = alpha^117; the basis of the symbols 
 class ReedSolomon:
     """Reed-Solomon code (255,223) of CCSDS 131.0-B-5, section 4, in the dual basis.
 
-    Attributes:
-        corrected: number of corrected symbols.
-        uncorrectable: number of codewords with too many errors.
+    The code has corrected `corrected` symbols, and `uncorrectable` codewords had too many errors.
     """
 
     def __init__(self, depth: int) -> None:
@@ -344,11 +342,7 @@ class CltuStream:
 
 
 class CommandCode:
-    """Code of telecommands: CLTUs with or without pseudo-randomiser, or frames without code.
-
-    Attributes:
-        corrected: number of corrected bits.
-    """
+    """Code of telecommands: CLTUs with or without pseudo-randomiser, or none; `corrected` counts bits."""
 
     def __init__(self, cltu_kind: str | None) -> None:
         """Encode frames in CLTUs of the kind "plain" or "randomised", or not at all for None."""
@@ -436,12 +430,7 @@ class Framing:
 
 
 class LinkCodes:
-    """Codes of both directions of a link.
-
-    Attributes:
-        telemetry: coding of telemetry frames.
-        commands: coding of telecommand frames.
-    """
+    """Codes of both directions of a link, for telemetry frames and for telecommand frames."""
 
     def __init__(
         self,

@@ -250,12 +250,7 @@ class Point(_Command):
 
 @dataclass(frozen=True, slots=True)
 class LoadParameters(_Command):
-    """Command to replace the parameter table.
-
-    Attributes:
-        replaced: CRC-32 of the parameter table to be replaced.
-        values: new parameter values, in the order of the table.
-    """
+    """Command to replace the table with the CRC-32 `replaced` by new values in the order of the table."""
 
     replaced: int
     values: tuple[float, ...]

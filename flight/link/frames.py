@@ -198,13 +198,8 @@ class PacketAssembler:
         """Return the packets that end in a frame, except idle packets.
 
         After lost frames, a packet that began before or in the lost frames is discarded, and decoding
-        continues at the first header pointer.
-
-        Args:
-            header: header of the frame, 6 bytes.
-            data: decrypted data of the frame.
-            missing: number of frames of all virtual channels that were lost since the link was opened,
-                according to the authenticated counters.
+        continues at the first header pointer. According to the authenticated counters, `missing` frames of
+        all virtual channels were lost since the link was opened.
         """
         _, _, count, status = TELEMETRY_HEADER.unpack(header)
         if self._count != (count - 1) % _COUNTS or missing - self._missing >= _COUNTS:
@@ -268,11 +263,9 @@ class FrameStream:
     ) -> None:
         """Find frames in a byte stream.
 
-        Args:
-            length_of: function that returns the length (bytes) of a frame from its header.
-            header_bytes: length (bytes) of the header that `length_of` needs.
-            decode: function that returns the frame in the bytes after a sync marker.
-            wrong_bits: maximum number of wrong bits in a sync marker directly after a valid frame.
+        The function `length_of` returns the length (bytes) of a frame from its header of `header_bytes`
+        bytes, and `decode` returns the frame in the bytes after a sync marker. A sync marker directly after a
+        valid frame may have `wrong_bits` wrong bits.
         """
         self._length_of, self._header_bytes, self._decode = length_of, header_bytes, decode
         self._wrong_bits = wrong_bits
@@ -317,8 +310,3 @@ class FrameStream:
 def telecommand_stream() -> FrameStream:
     """Return a decoder of telecommand frames, whose headers state the frame length."""
     return FrameStream(stated_length, TELECOMMAND_HEADER.size)
-
-
-def telemetry_stream(frame_bytes: int) -> FrameStream:
-    """Return a decoder of telemetry frames of `frame_bytes` bytes."""
-    return FrameStream(lambda _: frame_bytes, 0)

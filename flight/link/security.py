@@ -281,12 +281,9 @@ _MOST_IDS_BYTES = 1 << 16
 
 
 class _Witness:
-    """Reference folder with the newest association of each SPI and the digests of replaced keys.
+    """Reference folder with the newest (`known`) association of each SPI and the digests of replaced keys.
 
     Disk errors are ignored, because a link without a reference folder is better than no link.
-
-    Attributes:
-        known: newest association of each SPI.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -381,12 +378,7 @@ Parse = Callable[[bytes], tuple[bytes, bytes]]
 
 
 class Gate:
-    """Receiver that authenticates frames of one direction and rejects replays.
-
-    Attributes:
-        refused: number of refused frames for each cause.
-        admitted: number of accepted frames.
-    """
+    """Authenticates frames of one direction and rejects replays; counts `admitted` and `refused` frames."""
 
     def __init__(
         self,

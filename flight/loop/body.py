@@ -483,11 +483,7 @@ class BodyControl(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FlightBody:
-    """A body ready to fly.
-
-    Attributes:
-        streak_estimator: estimator that `camera.estimator` selects, or None for the default estimator.
-    """
+    """A body ready to fly. The `streak_estimator` is None for the default estimator of rates from streaks."""
 
     estimation: BodyEstimation
     control: BodyControl

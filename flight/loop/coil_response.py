@@ -753,8 +753,7 @@ motion is inconclusive."""
 class MotionWitness:
     """Checks diagnoses that are based on the supply current against the torque observed in the body's motion.
 
-    Attributes:
-        doubt: the reason why the current monitor is considered faulty; empty while it is trusted.
+    The text `doubt` states why the current monitor is considered faulty; it is empty while it is trusted.
     """
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, ...]) -> None:

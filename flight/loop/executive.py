@@ -121,11 +121,7 @@ class JobRunner(Protocol):
 
 
 class LockStepRunner:
-    """Runs jobs in simulated time; implements JobRunner.
-
-    Attributes:
-        borrowed_ns: time (ns) spent on jobs in the calling thread.
-    """
+    """Runs jobs in simulated time, for `borrowed_ns` ns of the calling thread; implements JobRunner."""
 
     def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
         self._clock = clock

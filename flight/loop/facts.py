@@ -429,11 +429,7 @@ CLOCK_OFF_NS = 1_000_000_000
 
 
 class FlightClock:
-    """Clock of the host, which returns the GPS receiver's UTC if the host's UTC differs from it.
-
-    Attributes:
-        host: clock of the host, whose UTC may be wrong.
-    """
+    """Clock of the `host`, which returns the GPS receiver's UTC if the host's UTC differs from it."""
 
     def __init__(self, host: Clock) -> None:
         self.host = host

@@ -95,9 +95,8 @@ class ResourceReader(Protocol):
 class ResourceState:
     """Processor load and memory growth computed from samples, or NaN with too few samples.
 
-    Attributes:
-        cpu_share: processor time between the last two samples, as a fraction of one core.
-        memory_slope: growth of memory use (bytes/s) by a least squares fit over the window.
+    The load `cpu_share` is the processor time between the last two samples, as a fraction of one core. The
+    growth `memory_slope` of memory use (bytes/s) is a least squares fit over the window.
     """
 
     sample: ResourceSample | None = None
@@ -676,11 +675,7 @@ class BusyPeriods:
 
 
 class Shedding:
-    """Task that reduces the workers' jobs while they exceed the processor's capacity; runs once a second.
-
-    Attributes:
-        plans_shed: number of periodic plans that were omitted since start.
-    """
+    """Task that reduces the workers' jobs while they exceed the processor's capacity; runs once a second."""
 
     def __init__(
         self,
@@ -692,12 +687,8 @@ class Shedding:
     ) -> None:
         """Start at the shedding level without reductions.
 
-        Args:
-            signs: symptoms of overload.
-            plans: counter of plans that are late.
-            apply: function that applies a shedding level to navigation and imaging.
-            frames: function that returns the numbers of frames not taken, and of frames that are late.
-            services: services of the loop.
+        The function `apply` applies a shedding level to navigation and imaging. The function `frames` returns
+        the numbers of frames not taken, and of frames that are late.
         """
         self._signs, self._plans, self._apply, self._frames = tuple(signs), plans, apply, frames
         self._recorder, self._events = services.recorder, services.events

@@ -449,15 +449,10 @@ class ObjectTracks:
         attitude: CameraAttitude | None,
         now_ns: int,
     ) -> None:
-        """Accept the points of light in a frame without identified stars.
+        """Accept the points of light `seen` in a frame without identified stars.
 
-        Args:
-            sequence: number of the frame.
-            middle_ns: time of mid-exposure.
-            seen: points of light in the frame.
-            motion: motion of the camera over the exposure.
-            attitude: estimated attitude of the camera at mid-exposure, or None if unknown.
-            now_ns: present time.
+        The streaks give the motion of the camera over the exposure. The `attitude` of the camera is estimated
+        for mid-exposure, or None if unknown.
         """
         predicted = self._predicted(middle_ns, motion, attitude)
         pixel = float(seen.sigma.min(initial=1.0)) / FLOOR_PX

@@ -356,10 +356,8 @@ def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
 class ModeSettings:
     """Bounds of the modes.
 
-    Attributes:
-        low_rate, low_for: limits of detumbling, which ends when the rate has been below `low_rate` (rad/s)
-            for `low_for` (s).
-        stop: function that ends the flight after the current cycle; its argument is the reason.
+    Detumbling ends when the rate has been below `low_rate` (rad/s) for `low_for` (s). The function `stop`
+    ends the flight after the current cycle for a reason.
     """
 
     modes: Modes

@@ -51,9 +51,8 @@ class CoilDriveSettings:
 class CoilDrive:
     """Commands the coils, and monitors their response.
 
-    Attributes:
-        command: effective currents (n,), A, of the command in this cycle.
-        available: flags (n,) of the axes that are not excluded.
+    The command of this cycle has the effective currents `command` (n,), A. The flags `available` (n,) mark
+    the axes that are not excluded.
     """
 
     def __init__(

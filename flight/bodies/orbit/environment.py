@@ -93,12 +93,7 @@ class Witness:
 
 
 class FixSequence:
-    """GPS fixes that agree with one orbit and with one offset of the receiver's time.
-
-    Attributes:
-        first: first fix.
-        joined: number of fixes that agree with the first fix.
-    """
+    """GPS fixes of one orbit and one offset of the receiver's time; `joined` fixes agree with the `first` one."""
 
     def __init__(self, fix: GpsFix, offset_ns: int) -> None:
         """`offset_ns` is the receiver's UTC minus the time of the host's clock."""
@@ -182,9 +177,8 @@ def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
 class EstimatedEnvironment:
     """Knowledge of the orbit.
 
-    Attributes:
-        refused: number of GPS fixes that were refused; a fix that is kept to begin an orbit does not count.
-        refusal: why the last fix was refused; empty if it was used or kept.
+    The number `refused` of GPS fixes does not include fixes that are kept to begin an orbit. The text
+    `refusal` states why the last fix was refused; it is empty if the fix was used or kept.
     """
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:

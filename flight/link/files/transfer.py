@@ -168,10 +168,7 @@ class Timer:
     """Retry timer, which expires if nothing is received for one period.
 
     After a few retries the period doubles with each retry, up to one minute, because the other end may be out
-    of radio contact for hours.
-
-    Attributes:
-        times: number of retries since the other end last sent a PDU.
+    of radio contact for hours. The attribute `times` counts the retries since the other end last sent a PDU.
     """
 
     def __init__(self, period_ns: int, now_ns: int) -> None:
@@ -591,13 +588,9 @@ _SUSPENDED = "suspended"
 
 
 class Origin(NamedTuple):
-    """Identification of the command that caused a transfer; all zeros for a transfer without command.
+    """Frame (SPI and counter) and packet (first 16 bits and sequence count) of the command for a transfer.
 
-    Attributes:
-        spi: SPI of the frame that contained the command.
-        counter: counter of the frame that contained the command.
-        packet: first 16 bits of the command packet.
-        sequence: sequence count of the command packet.
+    All numbers are zero for a transfer without command.
     """
 
     spi: int = 0
@@ -629,11 +622,9 @@ class Progress:
 
 
 class Entity:
-    """CFDP entity: all file transfers of one end of the link. Not thread-safe.
+    """CFDP entity `number`: all file transfers of one end of the link. Not thread-safe.
 
-    Attributes:
-        number: CFDP number of this entity.
-        ended: queue of ended transfers, which the caller empties.
+    The caller empties the queue `ended` of ended transfers.
     """
 
     def __init__(

@@ -262,14 +262,10 @@ class TimetableError(FlightError):
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Schedule entry: a command in words and its due time.
+    """Schedule entry: a command in words and its due time `at_ns`, UTC in ns since 1970.
 
-    Attributes:
-        number: number of the schedule entry, counted from 1, by which the entry can be deleted.
-        at_ns: due time of the command, UTC in ns since 1970.
-        spi: security parameter index (SPI) of the frame that contained the scheduling command.
-        counter: counter of the frame that contained the scheduling command.
-        command: command in words.
+    Entries have numbers from 1, by which they can be deleted. The values `spi` and `counter` are those of the
+    frame that contained the scheduling command.
     """
 
     number: _Count
@@ -401,13 +397,7 @@ class Scheduling:
             self._mode = int(layout.array(packet)[0]["mode"])
 
     def obey(self, directive: Scheduled | Deletion | Listing, done: Report, utc_ns: int) -> list[Report]:
-        """Execute a scheduling directive and return all reports about it.
-
-        Args:
-            directive: directive that adds, deletes or lists scheduled commands.
-            done: report to be sent when the directive is completed.
-            utc_ns: current UTC, ns since 1970.
-        """
+        """Execute a directive and return all reports about it; `done` is the report of its completion."""
         try:
             match directive:
                 case Scheduled():

@@ -58,11 +58,7 @@ class _PacketStream:
 
 
 class LogFollower:
-    """Reader of new packets in the flight log of the newest run of an archive, or of a single run.
-
-    Attributes:
-        place: folder of the archive or of the single run.
-    """
+    """Reader of new packets in the log of the run in folder `place`, or of the newest run of an archive."""
 
     def __init__(self, place: Path) -> None:
         """Begin near the end of the newest run in the folder `place`. The run may also be created later."""
@@ -208,11 +204,7 @@ _FLUSH_NS = 200_000_000
 
 
 class LiveQueue:
-    """Queue of live telemetry packets that wait to be sent.
-
-    Attributes:
-        thinned: number of packets dropped because a newer packet of the same type replaced them.
-    """
+    """Queue of live telemetry packets. Newer packets of the same type have replaced `thinned` packets."""
 
     def __init__(self, room: float) -> None:
         """Create a queue that keeps only the newest packet of each type once it contains `room` bytes."""
@@ -378,12 +370,7 @@ class Playback:
         self._done: Report | None = None
 
     def begin(self, play: Play, done: Report) -> list[Report]:
-        """Begin a playback and return the reports due now.
-
-        Args:
-            play: directive with the run and time interval.
-            done: report to be sent when the playback is complete.
-        """
+        """Begin a playback and return the reports due now; `done` is the report of its completion."""
         folder = self._log.folder(play.run)
         if folder is None:
             return [replace(done, stage=Stage.FAILED, text=f"there is no run {play.run}")]

@@ -80,15 +80,7 @@ class Filing:
     """Executes the file commands and manages the file transfers on board. Not thread-safe."""
 
     def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
-        """Continue the stored transfers.
-
-        Args:
-            folder: folder of the transfers and the received files.
-            log: folder of the recorded runs.
-            now_ns: current time of the monotonic clock, ns.
-
-        Raises UsageError if the folder cannot be used.
-        """
+        """Continue the transfers in `folder`; `log` holds the recorded runs. Raises UsageError."""
         self._folder = folder
         self._store = Store(folder)
         self._roots = {"log": log, "received": self._store.received}
@@ -146,14 +138,7 @@ class Filing:
             yield one, report
 
     def obey(self, directive: FileDirective, done: Report, utc_ns: int, now_ns: int) -> list[Report]:
-        """Execute a file directive and return the reports due now.
-
-        Args:
-            directive: directive about files.
-            done: report to be sent when the directive is completed.
-            utc_ns: current UTC, ns since 1970.
-            now_ns: current time of the monotonic clock, ns.
-        """
+        """Execute a file directive and return the reports due now; `done` is the report of its completion."""
         try:
             match directive:
                 case ListFiles(entity=entity, under=under):
@@ -394,9 +379,7 @@ class Renewal:
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
         """Record the contact with the ground, and return new reports of the privileged part.
 
-        Args:
-            admitted: number of authentic frames since the start of the link.
-            now_ns: current time of the monotonic clock, ns.
+        The number of authentic frames since the start of the link is `admitted`.
         """
         contact = (str(admitted), self._fault)
         if contact != self._recorded and now_ns >= self._due_ns and self._status.parent.exists():

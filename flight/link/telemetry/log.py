@@ -242,15 +242,9 @@ def find_runs(archive: Path) -> list[Path]:
 def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
     """Create the folder of the next run, and delete old runs to make room for the new run.
 
-    Only run folders are deleted. A full or failing disk raises no error here, because the log reports the
-    failure.
-
-    Args:
-        archive: folder of the runs.
-        budget_bytes: maximum size of all runs.
-        coming_bytes: maximum size of the new run.
-
-    Raises UsageError if the budget is smaller than the new run or if the path is wrong.
+    All runs have at most `budget_bytes` bytes, and the new run at most `coming_bytes`. Only run folders are
+    deleted. A full or failing disk raises no error here, because the log reports the failure. Raises
+    UsageError if the budget is smaller than the new run or if the path is wrong.
     """
     if coming_bytes > budget_bytes:
         raise UsageError(

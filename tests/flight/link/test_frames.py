@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from flight.link.frames import (
     SYNC,
     FrameError,
+    FrameStream,
     MasterCount,
     PacketAssembler,
     TelecommandHeader,
@@ -19,7 +20,6 @@ from flight.link.frames import (
     idle_packet,
     open_telecommand,
     open_telemetry,
-    telemetry_stream,
 )
 
 SPACECRAFT = 0x1A5
@@ -161,7 +161,7 @@ def test_frames_are_found_in_a_stream_however_it_is_cut(
     made = framer()
     frames = [frame for n in range(4) for frame in made.add(packet(n, 80))]
     stream = noise.join([b"", *(SYNC + frame for frame in frames)])
-    finder, found, position = telemetry_stream(FRAME), [], 0
+    finder, found, position = FrameStream(lambda _: FRAME, 0), [], 0
     while position < len(stream):
         step = draw.choice(cuts)
         found += finder.add(stream[position : position + step])
@@ -171,5 +171,5 @@ def test_frames_are_found_in_a_stream_however_it_is_cut(
 
 def test_a_false_marker_hides_no_frame() -> None:
     (frame,) = framer().add(packet(0, ROOM - 6))
-    found = telemetry_stream(FRAME).add(SYNC + b"\x1a\xcf" + SYNC + frame + SYNC)
+    found = FrameStream(lambda _: FRAME, 0).add(SYNC + b"\x1a\xcf" + SYNC + frame + SYNC)
     assert found[-1] == frame
