@@ -158,10 +158,7 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices; devices that the configuration does not have are None or empty.
-
-    The first monitor in `supply` of the power system is the battery monitor.
-    """
+    """The open devices, None or empty if not configured; the first monitor in `supply` is the battery's."""
 
     unit: InertialUnit
     magnetometer: InertialUnit | None
@@ -238,10 +235,7 @@ def check_settings(config: Config) -> None:
 
 
 def real_rig(config: Config, stack: ExitStack, patient: bool = False, exclusive: bool = False) -> Rig:
-    """Return this machine's hardware with all devices closed; `stack` closes what a driver opens.
-
-    The bus of the coils is locked for this process if `exclusive` is true.
-    """
+    """Return this machine's hardware, which `stack` closes; `exclusive` locks the bus of the coils."""
     clock = SystemClock()
     wires = LinuxWires(clock, stack, config.coils.bus, patient, exclusive)
     return Rig(clock, wires, lambda _: None, True, 0)

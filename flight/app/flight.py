@@ -186,10 +186,7 @@ def mission_zero(clock: Clock) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A request whose configuration was read from the file in `chosen`, and validated.
-
-    The text `merged` includes the files that the configuration extends.
-    """
+    """A valid configuration of a request, read from `chosen`; `merged` includes the extended files."""
 
     request: RunRequest
     chosen: Chosen
@@ -270,10 +267,7 @@ def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Op
 
 
 def _judge(request: RunRequest) -> _Judged:
-    """Read the configuration once, and validate it.
-
-    Raises UnreadConfigError, and UsageError for an invalid configuration.
-    """
+    """Read the configuration once, and validate it. Raises UnreadConfigError and UsageError."""
     path = request.config_path
     chosen = accepted_config(path, os.environ) if request.accepted else Chosen(path, read_text(path))
     request = replace(request, config_path=chosen.path)
@@ -441,10 +435,7 @@ def _saturation(camera: Camera) -> float:
 
 
 def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
-    """Return the estimator of rates from streaks that the camera section selects.
-
-    Raises ConfigError if the body does not have the selected estimator.
-    """
+    """Return the estimator of rates from streaks that a camera selects. Raises ConfigError if absent."""
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))
     if body.streak_estimator is None:

@@ -555,10 +555,7 @@ class FlownConfig:
 
 
 def _named(folder: Path) -> list[tuple[int, Path, str]]:
-    """Return number, path and checksum of the files that are named like a stored configuration.
-
-    Raises OSError.
-    """
+    """Return number, path and checksum of the files named like a stored configuration. Raises OSError."""
     place = folder / FOLDER
     try:
         paths = list(place.iterdir())

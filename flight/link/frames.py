@@ -55,10 +55,7 @@ def stated_length(header: bytes) -> int:
 
 
 def open_telecommand(frame: bytes, spacecraft: int) -> bytes:
-    """Return a telecommand frame without its CRC.
-
-    Raises FrameError if the frame is for another spacecraft, is not of type BD or has a wrong length.
-    """
+    """Return a telecommand frame without its CRC. Raises FrameError unless it is a BD frame for us."""
     if len(frame) < TELECOMMAND_HEADER.size + CRC_BYTES or stated_length(frame) != len(frame):
         raise FrameError("its length is wrong")
     first = int.from_bytes(frame[:2], "big")
@@ -145,10 +142,7 @@ class TelemetryFramer:
 
 
 class IdleFramer:
-    """Framer of telemetry frames with only idle data, which keep the carrier of a radio modulated.
-
-    The frames are not protected, because they carry no information.
-    """
+    """Framer of idle frames, which keep the carrier of a radio modulated and need no protection."""
 
     def __init__(self, spacecraft: int, frame_bytes: int, master: MasterCount, fill: bytes) -> None:
         """Make frames of `frame_bytes` bytes with the first bytes of `fill`."""

@@ -194,10 +194,7 @@ class Vault:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against writes by other processes.
-
-        Raises FlightError if the lock file cannot be opened.
-        """
+        """Lock the folder against writes by other processes. Raises FlightError if this fails."""
         with ExitStack() as stack:
             try:
                 file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -209,10 +206,7 @@ class Vault:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Lock the folder against a second link process.
-
-        Raises UsageError if another link process uses it.
-        """
+        """Lock the folder against a second link process. Raises UsageError if another one uses it."""
         with locked(self._folder / _OWNER, f"{self._folder}: another link process uses these counters"):
             yield
 
@@ -412,10 +406,7 @@ class Gate:
         return self._open[spi]
 
     def admit(self, frame: bytes) -> Admitted:
-        """Return the content of an accepted frame; raise RefusedError for a refused frame.
-
-        The same frame is refused if it is received again.
-        """
+        """Return the content of a frame, which is accepted once. Raises RefusedError."""
         try:
             admitted = self._admit(frame)
         except RefusedError as error:
@@ -481,10 +472,7 @@ class Gate:
         return known
 
     def _by_next_key(self, spi: int, header: bytes, protected: bytes) -> tuple[Association, bytes]:
-        """Return the association and the data of a frame if the sender already uses the next key.
-
-        Raises RefusedError if the frame does not authenticate with the next key either.
-        """
+        """Return association and data of a frame that already uses the next key. Raises RefusedError."""
         following = self._vault.read(f"{spi}-{NEXT}") if self._store_every > 1 else None
         if following is not None:
             data = unprotect(following.cipher, header, self._mask, protected, self._encrypted)
@@ -496,10 +484,7 @@ class Gate:
 
 
 class Sealer:
-    """Sender that protects frames with the key of one security parameter index (SPI).
-
-    A counter is reserved on disk before it is used in a frame.
-    """
+    """Protects frames with the key of one SPI. A counter is reserved on disk before it is used."""
 
     def __init__(
         self,
@@ -533,10 +518,7 @@ class Sealer:
         return True
 
     def seal(self, header: bytes, data: bytes) -> tuple[bytes, int]:
-        """Return a protected frame, without CRC, and its counter.
-
-        Raises FlightError if no further counter can be reserved.
-        """
+        """Return a protected frame, without CRC, and its counter. Raises FlightError without a counter."""
         if self._next == self._end or (self._shared and self._is_overtaken()):
             self._reserve()
         assert self._cipher is not None

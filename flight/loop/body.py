@@ -293,10 +293,7 @@ class BodyTargets(Protocol):
         """Return the configured target that is in force at a mission time."""
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target that command `number` sets.
-
-        Raises UsageError if this kind of body cannot reach the target.
-        """
+        """Return the target of command `number`. Raises UsageError if this kind of body cannot reach it."""
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
         """Return a target that holds the present attitude, or the nearest one that can be held."""

@@ -384,10 +384,7 @@ class BrakeProof:
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Process an ADC sample, which may show a current in spite of braking.
-
-        Return the axes whose coils carry a current although they are braked.
-        """
+        """Process an ADC sample, and return the axes whose coils carry a current although they are braked."""
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:
             return frozenset()

@@ -395,10 +395,7 @@ class CoilMonitor:
         return self._leg.rest
 
     def forget(self, axis: int) -> None:
-        """Discard the diagnosis of an axis, as commanded by the ground.
-
-        If the fault persists, it is detected again.
-        """
+        """Discard the diagnosis of an axis by command of the ground; a persisting fault is detected again."""
         self._trials[axis] = 0
         self._release(axis)
 
@@ -430,10 +427,7 @@ class CoilMonitor:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NO_AXES, written_ns: int | None = None
     ) -> None:
-        """Record the currents (n,), A, and brakes in force at `time_ns`, written at `written_ns` if given.
-
-        The currents are the actual coil currents, not the effective currents.
-        """
+        """Record the actual currents (n,), A, and brakes in force at `time_ns`, written at `written_ns`."""
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
         # Without readings of the current monitor, the search for a stuck leg cannot succeed, and is ended.

@@ -322,10 +322,7 @@ class CoilResponse:
     def _field_without_coils(
         self, time_ns: int, span: float, rate: FloatArray, field: FloatArray
     ) -> FloatArray | None:
-        """Return the field measured in the present or last pause, rotated with the body.
-
-        The result is None before the first pause.
-        """
+        """Return the field of the last pause of the coils, rotated with the body, or None before a pause."""
         since_ns, currents = self._commands[-1]
         settle_ns = self._settings.settle_ns or 0
         if not any(currents) and time_ns - since_ns >= settle_ns:
@@ -686,10 +683,7 @@ class CoilCorrection:
         return frozenset(self._unreviewed)
 
     def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
-        """Change the sign of a coil, and return whether it was changed.
-
-        The sign is not changed if it has changed too often in the last ten minutes.
-        """
+        """Change the sign of a coil unless it changed too often in ten minutes; return whether it changed."""
         recent = [time_ns for time_ns in self._changes[axis] if now_ns - time_ns < LONGEST_REST_NS]
         self._changes[axis] = recent
         if len(recent) >= _MOST_CHANGES:

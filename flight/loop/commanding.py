@@ -62,10 +62,7 @@ class OnboardParameters:
         keeper: StateKeeper | None,
         services: Services,
     ) -> None:
-        """Start with the configured values, or with the table that the `keeper` has stored.
-
-        The functions `adopt_modes` and `adopt_health` give new limits to the tasks that use them.
-        """
+        """Start with the configured or stored table; the functions `adopt_...` pass new limits to tasks."""
         self._config = config
         self._adopt_modes, self._adopt_health = adopt_modes, adopt_health
         self._keeper, self._recorder, self._events = keeper, services.recorder, services.events
@@ -75,10 +72,7 @@ class OnboardParameters:
         self._loaded_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Apply the stored table if it is valid for this software version and configuration.
-
-        Record the active table.
-        """
+        """Apply the stored table if software and configuration permit it, and record the table in force."""
         self._loaded_ns = now_ns
         if kept := self._table.values:
             # Keys that the stored table lacks, because another version wrote it, get their configured values.
@@ -94,10 +88,7 @@ class OnboardParameters:
             self._keep(msgspec.structs.replace(self._table, proven=True))
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Load a parameter table, which is rejected if the table in force does not have the CRC `replaced`.
-
-        Return why the new table is rejected, or an empty text.
-        """
+        """Load a table in place of the one with the CRC `replaced`; return why it is rejected, or ""."""
         if replaced != self._crc:
             return f"the table in use has CRC {self._crc:08x}, not {replaced:08x}: dump and check it again"
         before = self._table.values if self._table.proven else self._table.before
@@ -152,10 +143,7 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a configuration section in which the values of a table replace those of the configuration.
-
-    Raises ValidationError for invalid values.
-    """
+    """Return a section with the values of a table instead of its own. Raises ValidationError."""
     changes = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
     return msgspec.convert({**msgspec.to_builtins(section), **changes}, type(section))
 
@@ -209,10 +197,7 @@ class CommandTask:
                 channel.answer(answer, sender)
 
     def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
-        """Execute a datagram.
-
-        Return the fields of the answer, and whether the datagram is a well-formed command packet.
-        """
+        """Execute a datagram; return the fields of the answer, and whether the datagram is well-formed."""
         command: Command | None = None
         problem = ""
         well_formed = True
@@ -281,10 +266,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command that a step of the configured time line contains.
-
-    Raises CommandError unless the step contains exactly one command.
-    """
+    """Return the single command of a step of the configured time line. Raises CommandError."""
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

@@ -413,10 +413,7 @@ class WorkerProcess:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
 
     def receive(self) -> JobAnswer | None:
-        """Return an answer that has arrived, or None.
-
-        Raises EOFError if the process has ended, and FlightError for a damaged message.
-        """
+        """Return an answer, or None. Raises EOFError if the process has ended, and FlightError for damage."""
         try:
             while chunk := self._socket.recv(1 << 16):
                 self._received += chunk
@@ -476,10 +473,7 @@ class _Kept:
         self._deaths = 0
 
     def due_ns(self) -> int:
-        """Return the time (ns) of the worker's next timeout or restart.
-
-        Returns -1 if no timeout or restart is pending.
-        """
+        """Return the time (ns) of the worker's next timeout or restart, or -1 if none is pending."""
         if self.process is None:
             return self._due_ns
         dues = [self.submitted_ns + self.worker.timeout_ns] if self.submitted_ns >= 0 else []

@@ -376,10 +376,7 @@ class FlightLoop:
         self._show = progress
 
     def run(self, epoch_ns: int, label: RunLabel) -> str:
-        """Fly from `epoch_ns` on, and return why the flight ended.
-
-        The coils are off afterwards, even if an error is raised.
-        """
+        """Fly from `epoch_ns` on, and return why the flight ended. The coils are off even after an error."""
         services = self._services
         self._begin(epoch_ns, label)
         try:

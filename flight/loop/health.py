@@ -171,10 +171,7 @@ class ClockWatch:
         self.steps = 0
 
     def look(self) -> float | None:
-        """Return the step (s) of the wall clock since the last call, or None if it made no step.
-
-        A slow drift of the clock is not reported.
-        """
+        """Return the step (s) of the wall clock since the last call, or None. A drift is not a step."""
         offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         before_ns, self._offset_ns = self._offset_ns, offset_ns
         if before_ns is None or abs(offset_ns - before_ns) <= _CLOCK_STEP_NS:
@@ -326,10 +323,7 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report skipped time slots of the control group.
-
-        Other groups are not reported, because they skip slots only if the control group does.
-        """
+        """Report skipped slots of the control group; only then do other groups skip slots."""
         if group.name != CONTROL:
             return
         self.lost += slots
@@ -382,10 +376,7 @@ class Housekeeping:
         log_error: Callable[[], str],
         services: Services,
     ) -> None:
-        """Collect the counters of the given tasks.
-
-        The function `log_error` returns the error of the flight log, or an empty text.
-        """
+        """Collect the counters of the tasks; `log_error` returns the error of the flight log, or ""."""
         self._navigation, self._planner, self._imaging = navigation, planner, imaging
         self._coils, self._power, self._log_error = coils, power, log_error
         self._recorder, self._events = services.recorder, services.events
@@ -458,10 +449,7 @@ class HealthWatch:
         feed: Callable[[], None],
         services: Services,
     ) -> None:
-        """Watch the given tasks.
-
-        The function `feed` triggers the watchdog; it is called while all rate groups and workers progress.
-        """
+        """Watch the tasks; `feed` triggers the watchdog while all rate groups and workers progress."""
         self._modes, self._drive, self._power, self._workers = modes, drive, power, workers
         self._monitor = ResourceMonitor(limits)
         self._clock_watch = ClockWatch(services.clock.host)
@@ -706,10 +694,7 @@ class Shedding:
         return made
 
     def run(self, lost_cycles: int, now_ns: int) -> None:
-        """Evaluate the load, change the shedding level by at most one, and record changes.
-
-        The number of control cycles lost since start is `lost_cycles`.
-        """
+        """Evaluate the load and the number of `lost_cycles`, and change the shedding level by at most one."""
         self._plans.look(now_ns)
         seen = [sign for sign in self._signs if sign.look(now_ns)]
         if seen:

@@ -296,10 +296,7 @@ class FrameReport:
         now_ns: int,
         accepted: bool | None,
     ) -> None:
-        """Record an attitude measured with stars.
-
-        The flag `accepted` is None for an attitude that was not passed to the filter.
-        """
+        """Record an attitude measured with stars; `accepted` is None if it was not passed to the filter."""
         if is_strange(solution):
             text = f"frame {frame.sequence}: {len(solution.points)} detected stars match no part of the sky"
             self._events.report(events.CAMERA_STRANGE, now_ns, text)
@@ -396,10 +393,7 @@ class RepeatedRows:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
     def look(self, pixels: Image) -> int:
-        """Return how many of the sampled rows of a frame are copies from an earlier frame.
-
-        The result is 0 for a frame without copied rows, and for a frame in which all rows are copies.
-        """
+        """Return how many sampled rows are copies from earlier frames, or 0 if all of them are copies."""
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
         noisy = [row for row in rows if np.mean(pixels[row][1:] != pixels[row][:-1]) >= _LEAST_CHANGES]
         here = {row: zlib.crc32(pixels[row].tobytes()) for row in noisy}

@@ -300,10 +300,7 @@ class Navigation:
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def begin_from(self, attitude: AttitudeMeasurement) -> bool:
-        """If the filter has no estimate, start it from an attitude measured with stars.
-
-        Return whether the filter started.
-        """
+        """Start a filter without an estimate from an attitude of the stars; return whether it started."""
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
@@ -379,10 +376,7 @@ class Positioning:
         max_age_ns: int,
         services: Services,
     ) -> None:
-        """`accept` is `BodyEstimation.accept_fix`.
-
-        A receiver is reported as lost after `max_age_ns` without a fix.
-        """
+        """Pass fixes to `accept`; report the receiver as lost after `max_age_ns` without a fix."""
         self._receiver, self._accept, self._max_age_ns = receiver, accept, max_age_ns
         self._events, self._facts, self._streams = services.events, services.facts, services.streams
         self._clock, self._recorder = services.clock, services.recorder

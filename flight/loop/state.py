@@ -215,10 +215,7 @@ def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
 
 
 def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> StoredState:
-    """Return the state `elapsed` s after a boot that began with the state `begun`.
-
-    New learned parameters replace old parameters of the same name.
-    """
+    """Return the state `elapsed` s after a boot that began with `begun`, with newly learned parameters."""
     return msgspec.structs.replace(
         begun,
         operated=begun.operated + max(elapsed, 0.0),
@@ -239,10 +236,7 @@ CRASH_WINDOW = 600.0
 
 
 def boot_record(begun: StoredState, window: float) -> BootRecord:
-    """Return the record for a boot that begins with the state `begun`.
-
-    An unclean shutdown counts as recent within `window` s of operating time.
-    """
+    """Return the record of a boot; an unclean shutdown is recent within `window` s of operating time."""
     recent = sum(begun.operated - shutdown.operated <= window for shutdown in begun.unclean)
     after = bool(begun.unclean) and begun.unclean[-1].boot == begun.boot_count - 1
     return BootRecord(begun.boot_count, recent, after, begun.mode)
@@ -459,10 +453,7 @@ class StateStore:
         return newest.copy.state
 
     def store(self, state: StoredState) -> bool:
-        """Write both copies, and return whether at least one of them is durable.
-
-        Raises ValueError for an invalid state.
-        """
+        """Write both copies, and return whether one is durable. Raises ValueError for an invalid state."""
         data = encode(self._generation + 1, state)
         failures = []
         for name in self._order:
@@ -498,10 +489,7 @@ def encode(generation: int, state: StoredState) -> bytes:
 
 
 def decode(data: bytes) -> _StateCopy:
-    """Return the content of one copy of the state.
-
-    Raises ValueError for bytes that `encode` does not produce.
-    """
+    """Return the content of one copy of the state. Raises ValueError for a copy that `encode` cannot make."""
     if len(data) > LARGEST_FILE:
         raise ValueError(f"{len(data)} bytes are too many")
     line = line_of(data)
@@ -614,10 +602,7 @@ class StateKeeper:
         return self._notices.drain()
 
     def close(self, clean: bool) -> None:
-        """Write the final state, which records whether the end is clean.
-
-        This method may be called twice, and waits at most 5 s.
-        """
+        """Write the final state with the kind of end, waiting at most 5 s. May be called twice."""
         self._ticker.stop()
         if self._closed or not self._writing.acquire(timeout=_HUNG_DISK_S):
             self._closed = True

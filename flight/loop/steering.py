@@ -143,10 +143,7 @@ class CoilDrive:
         self._watch.tumble_rate = modes.tumble_rate
 
     def isolate(self) -> None:
-        """Exclude the axes whose coils the coil monitor considers broken.
-
-        Excluding axes is the reaction to the event `coil-broken`.
-        """
+        """Exclude the axes with broken coils: the reaction to the event `coil-broken`."""
         self.available = self._watch.available
 
     def trust(self, now_ns: int) -> None:
@@ -273,10 +270,7 @@ class Steering:
         return self._run_law(self._body.control.detumbling, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Turn the body to the Sun, which requires no attitude.
-
-        A body without Sun acquisition is commanded zero current.
-        """
+        """Turn the body to the Sun without an attitude, or keep the coils at zero without Sun acquisition."""
         acquisition = self._body.control.sun_acquisition
         if acquisition is None:
             return self.rest(now_ns)

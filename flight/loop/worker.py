@@ -65,10 +65,7 @@ def encode_values(value: Any) -> tuple[bytes, list[Array]]:
 
 
 def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:
-    """Decode a result of `encode_values`, with arrays that are views of `buffers`.
-
-    Damaged data may raise any exception.
-    """
+    """Decode a result, with arrays that are views of `buffers`. Damaged data may raise any exception."""
     return _Reader(buffers).made(msgspec.msgpack.decode(data))
 
 
@@ -191,10 +188,7 @@ _HEADER = struct.Struct("<QQI")
 
 
 def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
-    """Pickle a value into a message with a header, and copy its large buffers into the shared memory `slab`.
-
-    Raises FlightError if the shared memory is too small.
-    """
+    """Pickle a value, with large buffers in the memory `slab`. Raises FlightError for a too small `slab`."""
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
     return _framed(body, [buffer.raw() for buffer in buffers], slab)
@@ -207,19 +201,13 @@ def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
 
 
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
-    """Encode a value as a message for a receiver that does not trust the sender.
-
-    Raises FlightError for an unsupported type.
-    """
+    """Encode a value for a receiver that does not trust the sender. Raises FlightError for another type."""
     body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
 
 
 def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
-    """Return the value of a worker's message that `pack_values` made.
-
-    Raises FlightError for a damaged message.
-    """
+    """Return the value of a message of `pack_values`. Raises FlightError for a damaged message."""
     try:
         return decode_values(*_parts(message, slab))
     except FlightError:
@@ -229,10 +217,7 @@ def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
 
 
 def message_length(data: bytes | bytearray) -> int | None:
-    """Return the length of the message at the start of `data`, or None if its header is incomplete.
-
-    Raises FlightError if the length of the message is outside the permitted range.
-    """
+    """Return the length of the message at the start of `data`, or None if incomplete. Raises FlightError."""
     if len(data) < _HEADER.size:
         return None
     head_length, body_length, _ = _HEADER.unpack_from(data)

@@ -480,10 +480,7 @@ def _two_digits(value: float) -> float:
 
 
 def as_orbit(config: Config) -> OrbitConfig:
-    """Return a configuration, which must be that of a satellite in orbit.
-
-    Raises ConfigError for any other body.
-    """
+    """Return a configuration of a satellite in orbit unchanged. Raises ConfigError for any other body."""
     if not isinstance(config, OrbitConfig):
         raise ConfigError("body", f"is {config.body}: this needs the configuration of a satellite in orbit")
     return config

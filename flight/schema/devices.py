@@ -606,10 +606,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:
-    """Return the model of a configured camera: its calibrated lens, or a pinhole with its field of view.
-
-    Raises LensError for a lens that cannot exist.
-    """
+    """Return the calibrated lens of a camera, or a pinhole with its field of view. Raises LensError."""
     if camera.lens is None:
         return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
     lens = camera.lens
@@ -793,10 +790,7 @@ def _named(kind: str, named: str, key: str) -> Driver:
 
 
 def with_drivers(shape: type[Any], document: Document) -> type[Any]:
-    """Return the type of a configuration whose sections have the types that their drivers registered.
-
-    Raises ConfigError for a driver that cannot be imported.
-    """
+    """Return a type of configuration with the sections that the drivers registered. Raises ConfigError."""
 
     def section_of(kind: str, named: Any, key: str) -> type[Any]:
         try:

@@ -43,10 +43,7 @@ _LONGEST_PATH = 1024
 
 
 class ConfigError(InputError):
-    """A configuration that cannot be flown.
-
-    The attribute `where` is the file and, if known, the line of the wrong value.
-    """
+    """A configuration that cannot be flown; `where` is the file and, if known, the line of the value."""
 
 
 class UnreadConfigError(ConfigError):
@@ -197,10 +194,7 @@ def config_path(text: str) -> Path:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a configuration file.
-
-    Raises ConfigError if it cannot be read or is longer than 1 MiB.
-    """
+    """Return the text of a configuration file of at most 1 MiB. Raises ConfigError."""
     try:
         with path.open(encoding="utf-8") as file:
             text = file.read(_LONGEST + 1)  # a device may have no end
@@ -244,10 +238,7 @@ def read_document(text: str, name: str) -> Document:
 
 
 def merged_text(text: str, name: str) -> str:
-    """Return a configuration as one file: `text` itself, or its merged values if it extends another file.
-
-    Raises ConfigError.
-    """
+    """Return a configuration and the files that it extends as one text. Raises ConfigError."""
     document = read_document(text, name)
     if len(document.chain) == 1:
         return text
@@ -597,10 +588,7 @@ class Aim(Section, frozen=True, kw_only=True):
     roll_deg: Longitude | None = None
 
     def target_at(self, goal: str) -> PointingTarget:
-        """Return the pointing target for a goal.
-
-        Raises UsageError for a missing value, and for a value of another goal.
-        """
+        """Return the pointing target for a goal. Raises UsageError for missing and superfluous values."""
         angles = (self.latitude_deg, self.longitude_deg, self.right_ascension_deg, self.declination_deg)
         numbers = tuple(math.radians(value) for value in angles if value is not None)
         roll = None if self.roll_deg is None else math.radians(self.roll_deg)

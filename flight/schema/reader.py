@@ -459,10 +459,7 @@ def _replace_unit(document: Document) -> None:
 
 
 def load_testbed(path: Path) -> TestbedConfig:
-    """Read and validate a configuration of the testbed.
-
-    Raises ConfigError, also for the configuration of another body.
-    """
+    """Read and validate a configuration of the testbed. Raises ConfigError, also for another body."""
     try:
         return as_testbed(load(path))
     except ConfigError as error:
@@ -470,10 +467,7 @@ def load_testbed(path: Path) -> TestbedConfig:
 
 
 def load_camera(path: Path) -> Camera:
-    """Read the camera of a configuration, or of a file with only a `camera` section.
-
-    Raises ConfigError, also if there is no camera.
-    """
+    """Read the camera of a configuration, or of a `camera` section alone. Raises ConfigError."""
     text = read_text(path)
     document = read_document(text, str(path))
     if set(document.values) == {"camera"} and document.values["camera"] != "none":

@@ -30,10 +30,7 @@ class _Outlet(io.FileIO):
     _lost = False
 
     def write(self, data: Any, /) -> int:
-        """Write bytes, and return how many were written or discarded.
-
-        Raises OSError once for an error such as a full disk.
-        """
+        """Return how many bytes were written or discarded. Raises OSError once, such as for a full disk."""
         try:
             if not self._lost:
                 return super().write(data)
@@ -45,10 +42,7 @@ class _Outlet(io.FileIO):
 
 
 def outlast_readers() -> None:
-    """Let the process continue if the reader of standard output or error is closed.
-
-    Streams that a caller has replaced stay unchanged.
-    """
+    """Let the process outlast the readers of its output; streams that a caller replaced stay unchanged."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:

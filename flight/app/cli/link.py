@@ -162,10 +162,7 @@ def _judge(config_path: Path, log: Path) -> _JudgedLink:
 
 
 def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
-    """Open keys and lines after the separation inhibit.
-
-    Raises UsageError, FlightError, DeviceError or OSError for problems that may be temporary.
-    """
+    """Open keys and lines after the separation inhibit. Raises errors of problems that may be temporary."""
     if judged.problem:
         _say(judged.problem)
     section, clock = judged.link, SystemClock()
@@ -253,10 +250,7 @@ class _LoopbackLine:
 
 
 def self_test() -> None:
-    """Run a link until it has executed one command and reported the execution. Raises FlightError after 20 s.
-
-    The installation of a release runs this test.
-    """
+    """Run a link until it has executed one command, as a test of a release. Raises FlightError after 20 s."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as name:
         folder = Path(name)
         keys = [folder / "satellite" / "keys", folder / "ground"]

@@ -224,10 +224,7 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
 
 
 def seed_number(text: str) -> int:
-    """Return the seed given as an argument.
-
-    Raises ArgumentTypeError if the seed is not a whole number from 0 to 2^64 - 1.
-    """
+    """Return the seed given as an argument. Raises ArgumentTypeError unless it is 0 to 2^64 - 1."""
     try:
         value = int(text)
     except ValueError as error:

@@ -93,7 +93,7 @@ class Witness:
 
 
 class FixSequence:
-    """GPS fixes of one orbit and one offset of the receiver's time; `joined` fixes agree with the `first` one."""
+    """GPS fixes of one orbit and one offset of the receiver's time; `joined` fixes agree with `first`."""
 
     def __init__(self, fix: GpsFix, offset_ns: int) -> None:
         """`offset_ns` is the receiver's UTC minus the time of the host's clock."""

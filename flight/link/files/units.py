@@ -155,10 +155,7 @@ def pack(transaction: Transaction, content: Content) -> bytes:
 
 
 def unpack(data: bytes) -> tuple[Transaction, Content]:
-    """Return the transaction and content of the PDU at the beginning of `data`.
-
-    Raises PduError if the bytes are not a valid PDU.
-    """
+    """Return the transaction and content of the PDU at the beginning of `data`. Raises PduError."""
     if len(data) < _FIXED_BYTES:
         raise PduError(f"the unit has {len(data)} bytes, but a CFDP header has at least {_FIXED_BYTES}")
     if data[0] & 0b111 << 5 != _PDU_VERSION:

@@ -318,10 +318,7 @@ class Timetable:
         return tuple(sorted(self._now.entries, key=lambda entry: (entry.at_ns, entry.number)))
 
     def add(self, at_ns: int, spi: int, counter: int, command: str) -> Entry:
-        """Add an entry and store the schedule.
-
-        Raises TimetableError if the schedule is full or not writable.
-        """
+        """Add an entry and store the schedule. Raises TimetableError if it is full or not writable."""
         if len(self._now.entries) >= MOST_ENTRIES:
             raise TimetableError(f"{MOST_ENTRIES} commands are scheduled already: delete one")
         entry = Entry(self._now.last + 1, at_ns, spi, counter, command)
@@ -454,10 +451,7 @@ class Scheduling:
 
 
 def utc_of(text: str) -> int:
-    """Return the ns since 1970 of a UTC text in ISO 8601 format.
-
-    Raises CommandError for an invalid text and for a time after 2262-04-11.
-    """
+    """Return the ns since 1970 of a UTC in ISO 8601 format, at most 2262-04-11. Raises CommandError."""
     try:
         time = datetime.fromisoformat(text)
     except ValueError as error:

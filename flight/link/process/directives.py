@@ -43,10 +43,7 @@ _RESTARTS = "restarts flight and link with another configuration or release"
 
 
 class _Directive:
-    """Directive whose attributes have the names of the fields of its packet.
-
-    The text `says` describes the directive; `{0}` stands for the directive.
-    """
+    """Directive with the attributes of its packet's fields; in the text `says`, `{0}` is the directive."""
 
     __slots__ = ()
     packet: ClassVar[Packet]
@@ -134,10 +131,7 @@ class Joiner:
         self._portions: list[Portion] = []
 
     def add(self, portion: Portion) -> bytes:
-        """Return the packet after its last segment, and an empty value before.
-
-        Raises CommandError if an earlier segment is missing.
-        """
+        """Return the packet after its last segment, else b"". Raises CommandError for a missing segment."""
         before, self._portions = self._portions, []
         if portion.number == 1 and 2 <= portion.total <= _MOST_PORTIONS:
             before = []
@@ -393,10 +387,7 @@ def name_of(directive: Directive) -> str:
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
-    """Return a directive encoded as a packet.
-
-    Raises CommandError for values that do not fit into the packet.
-    """
+    """Return a directive encoded as a packet. Raises CommandError for values that do not fit."""
     packet, values = directive.packet, dict[str, Any]()
     for one in packet.fields:
         value = getattr(directive, one.name)
@@ -424,10 +415,7 @@ def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
 
 
 def unpack(data: bytes) -> Directive | None:
-    """Return the directive in a packet, or None for a packet that is not a directive.
-
-    Raises CommandError for a damaged packet and for invalid values.
-    """
+    """Return the directive in a packet, or None. Raises CommandError for a damaged or invalid packet."""
     layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))
     if layout is None:
         return None

@@ -186,10 +186,7 @@ class Filing:
         return [replace(done, stage=Stage.STARTED, text=text)]
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file name.
-
-        Raises FileError for a missing file or a path outside the two folders.
-        """
+        """Return the path of a file name. Raises FileError for a missing file or a path outside."""
         root, _, rest = name.partition("/")
         if (problem := problem_of_name(name)) or root not in self._roots:
             raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
@@ -377,10 +374,7 @@ class Renewal:
                 self._utc_offset_ns = int(row["utc_ns"]) - now_ns
 
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
-        """Record the contact with the ground, and return new reports of the privileged part.
-
-        The number of authentic frames since the start of the link is `admitted`.
-        """
+        """Record the contact of `admitted` authentic frames so far, and return new reports of the program."""
         contact = (str(admitted), self._fault)
         if contact != self._recorded and now_ns >= self._due_ns and self._status.parent.exists():
             self._due_ns = now_ns + CONTACT_NS

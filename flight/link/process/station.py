@@ -109,10 +109,7 @@ class Line(Protocol):
 
 
 class UdpLine:
-    """UDP line with one frame per datagram.
-
-    Telemetry is sent to the fixed address, and to each sender for one minute after its last authentic frame.
-    """
+    """UDP line; sends to the fixed address, and to each sender for a minute after an authentic frame."""
 
     def __init__(
         self,
@@ -302,10 +299,7 @@ class TcpLine:
 
 
 class TncLine(Line):
-    """Client of a terminal node controller (TNC), such as Direwolf, by KISS over TCP.
-
-    A lost connection is opened again after five seconds.
-    """
+    """Client of a TNC, such as Direwolf, by KISS over TCP; reconnects after five seconds."""
 
     def __init__(self, address: str, framing: Framing) -> None:
         """Connect to the address HOST:PORT as soon as frames can be sent."""
@@ -332,10 +326,7 @@ class TncLine(Line):
         return [(frame, None) for frame in self._stream.add(data)]
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send telemetry frames, each as the data of one KISS frame.
-
-        Frames are discarded without a connection, or if the TNC is slow.
-        """
+        """Send each frame as the data of one KISS frame, or discard it without a connection or if slow."""
         if self._socket is None and now_ns >= self._next_ns:
             self._next_ns = now_ns + _RECONNECT_NS
             self._stream = self._framing.stream()
@@ -623,10 +614,7 @@ class Station:
         self._hand_over(sent, admitted.data, now_ns)
 
     def _joined(self, admitted: Admitted) -> Admitted:
-        """Return the content of a frame, or the whole packet if the frame contains its last segment.
-
-        Raises CommandError if an earlier segment is missing.
-        """
+        """Return the content of a frame, or the whole packet of its last segment. Raises CommandError."""
         if is_unit(admitted.data, UP) or not isinstance(portion := directives.unpack(admitted.data), Portion):
             return admitted
         whole = self._joiner.add(portion)

@@ -288,10 +288,7 @@ def _numbered(archive: Path) -> list[tuple[int, Path]]:
 
 
 def _make_room(runs: list[Path], room_bytes: int) -> int:
-    """Delete the oldest runs until the remaining runs fit into `room_bytes`.
-
-    Return the number of deleted runs.
-    """
+    """Delete the oldest runs until the others fit into `room_bytes`; return the number of deleted runs."""
     sizes = [_size(run) for run in runs]
     total, dropped = sum(sizes), 0
     while dropped < len(runs) and (total > room_bytes or len(runs) - dropped >= MOST_RUNS):
@@ -424,10 +421,7 @@ class FlightLog:
         return ""
 
     def close(self) -> None:
-        """Write the queue, sync and close the log.
-
-        The call waits at most five seconds for a hung disk. Calling `close` again has no effect.
-        """
+        """Write the queue, sync and close the log, waiting at most 5 s. May be called twice."""
         if self._closed:
             return
         self._ticker.stop()
@@ -555,10 +549,7 @@ class Recorder:
         self.lost_text = ""
 
     def record(self, packet: Packet, time_ns: int, **values: Any) -> bytes | None:
-        """Pack values and write the packet to the flight log.
-
-        Returns the packet, or None if the values do not fit into the packet.
-        """
+        """Write a packet of values to the flight log, and return it, or None if the values do not fit."""
         packed = self._pack(self._flight_packer, packet, time_ns, values)
         if packed is not None:
             self._newest[packet.name] = packed

@@ -46,10 +46,7 @@ class TelemetryError(FlightError):
 
 
 def crc16(data: bytes) -> int:
-    """Return the CRC-16 of CCSDS 232.0-B (also called CCITT-FALSE).
-
-    The result is 0 for data that end with their own correct CRC.
-    """
+    """Return the CRC-16 of CCSDS 232.0-B (CCITT-FALSE), which is 0 for data that end with their CRC."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 
@@ -146,10 +143,7 @@ class Layout:
 
 
 def compile_layouts(packets: Iterable[Packet]) -> dict[str, Layout]:
-    """Return the layouts of packet definitions by packet name.
-
-    Raises TelemetryError for inconsistent definitions, for example for an APID that is used twice.
-    """
+    """Return the layouts of packets by name. Raises TelemetryError, for example for an APID used twice."""
     layouts = {packet.name: Layout(packet) for packet in packets}
     apids = [layout.packet.apid for layout in layouts.values()]
     if len(set(apids)) != len(apids):
@@ -267,10 +261,7 @@ def walk(data: bytes) -> Iterator[tuple[Layout, int, int]]:
 
 
 def truncated_bytes(data: bytes, begin: int) -> int:
-    """Return the length (bytes) of an incomplete packet at the end of `data`, 0 if there is none.
-
-    The argument `begin` is the end offset of the last valid packet.
-    """
+    """Return the length of an incomplete packet after the last valid packet, which ends at `begin`, or 0."""
     position, end = begin, len(data)
     while position < end:
         if _cut_short(data, position):
