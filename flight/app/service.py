@@ -186,10 +186,7 @@ class SeparationInhibit:
         self._elapsed: float | None = None
 
     def check(self, folder: Path, seconds: float) -> None:
-        """Raise InhibitedError unless the satellite has had power for `seconds` s.
-
-        The counted time is stored in `folder` at each call until it is complete.
-        """
+        """Store the time with power in `folder`. Raises InhibitedError until it is `seconds` s."""
         if seconds == 0.0:
             return
         path = folder / "powered"

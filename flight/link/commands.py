@@ -56,10 +56,7 @@ def crc_of(values: Sequence[float]) -> int:
 
 
 def problem_of(values: Mapping[str, float]) -> str:
-    """Return the problem of a parameter table, or an empty text if the table is valid.
-
-    A problem is a missing key, an unknown key or a value out of range.
-    """
+    """Return why a parameter table is invalid (missing or unknown key, value out of range), or ""."""
     if lacking := [key for key in PARAMETER_KEYS if key not in values]:
         return f"{lacking[0]} is missing: give all parameters of the table"
     if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
@@ -329,10 +326,7 @@ IDENTIFIERS = tuple(_BY_IDENTIFIER)
 
 
 def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
-    """Return the command in the fields of a packet.
-
-    Raises CommandError for values that the packet definition forbids.
-    """
+    """Return the command in the fields of a packet. Raises CommandError for forbidden values."""
     check(packet, fields)
     return MAKERS[packet.name](fields)
 
@@ -358,10 +352,7 @@ class CommandPacker:
         self._packer = Packer(LAYOUTS)
 
     def pack(self, command: Command, utc_ns: int) -> bytes:
-        """Return a command encoded as a packet.
-
-        Raises CommandError for values that the definition forbids.
-        """
+        """Return a command encoded as a packet. Raises CommandError for forbidden values."""
         check(command.packet, command.fields)
         try:
             return self._packer.pack(command.packet, utc_ns, command.fields)
@@ -608,10 +599,7 @@ class DatagramChannel:
                 self._path.unlink()
 
     def _look(self, path: Path) -> None:
-        """Bind the socket again if its file was removed or replaced.
-
-        After a failure, the next check tries to bind the socket again.
-        """
+        """Bind the socket again if its file was removed or replaced; retry at the next check."""
         if self._file is not None and _identity(path) == self._file:
             return
         try:
@@ -664,10 +652,7 @@ def _bound_unix(path: Path) -> socket.socket:
 
 
 def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
-    """Bind a UDP socket to HOST:PORT, which accepts only senders in `peers` unless `peers` is None.
-
-    Raises UsageError if the address cannot be bound.
-    """
+    """Bind a UDP socket to HOST:PORT for senders in `peers`, or for all senders. Raises UsageError."""
     host, _, port = address.rpartition(":")
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

@@ -227,10 +227,7 @@ class HorizonCameraFeed:
         )
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
-        """Start the filter with the measured directions, or update it.
-
-        Return whether the direction of the Sun was used, and whether nadir was used.
-        """
+        """Start or update the filter with the directions; return whether Sun and nadir were used."""
         self._structure |= found.structure
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
@@ -374,10 +371,7 @@ def _contradicts(sight: VectorObservation, turn: FloatArray, claim: FloatArray) 
 
 
 def _says_more(sight: VectorObservation, claim: FloatArray) -> bool:
-    """Return whether a direction makes an attitude estimate more accurate about at least one axis.
-
-    The matrix `claim` (3, 3), rad^2, is the covariance of the attitude estimate.
-    """
+    """Return whether a direction improves an attitude with the covariance `claim` (3, 3) about some axis."""
     across = tangent_basis(sight.observed)
     rows = across @ np.cross(sight.observed, np.eye(3)).T
     known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T

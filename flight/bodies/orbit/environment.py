@@ -237,10 +237,7 @@ class EstimatedEnvironment:
         return UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
 
     def fix(self, reading: GpsReading, witness: Witness | None = None) -> bool:
-        """Accept a report of the GPS receiver, and return whether it is used.
-
-        `witness` holds the measurements of other sensors, which can contradict the receiver.
-        """
+        """Accept a GPS fix that the `witness` does not contradict, and return whether it is used."""
         self.refusal = ""
         if not reading.valid:
             return False

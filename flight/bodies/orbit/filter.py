@@ -314,10 +314,7 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in the step with index `place`, and discard all earlier estimates.
-
-        The flag `doubted` states whether the earlier estimates were contradicted.
-        """
+        """Start from an attitude in step `place`; `doubted` earlier estimates were contradicted."""
         first = self.steps[place]
         self.free.start(
             attitude.quaternion,
@@ -373,10 +370,7 @@ class StepReplay:
         return rotation if left_ns == 0 else None
 
     def take_again(self, first: int) -> set[int]:
-        """Return to the start of step `first`, and process all steps again from there.
-
-        Return the object IDs of the late measurements used.
-        """
+        """Process all steps from step `first` again; return the object IDs of the late measurements used."""
         while first < len(self.steps) and self.steps[first].before is None:
             first += 1
         if first == len(self.steps):
@@ -484,11 +478,7 @@ class OrbitFilter:
     def __init__(
         self, settings: OrbitFilterSettings, around: Callable[[int], FilterEnvironment | None]
     ) -> None:
-        """Create a filter without an estimate.
-
-        The function `around` returns the orbit environment at a time of the clock, or None while the orbit is
-        unknown.
-        """
+        """Create a filter without an estimate in the environment `around` at a time, or None if unknown."""
         self._settings, self._around = settings, around
         # Dipoles are kept longer than the history, because its first step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
@@ -594,10 +584,7 @@ class OrbitFilter:
         return {**self._free.description(), "camera_attitude_sigma": np.sqrt(camera.diagonal())}
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
-        """Record the coil currents (n,), A, that flow from `time_ns` on.
-
-        The flag `known` states whether the coils certainly carry these currents.
-        """
+        """Record the coil currents (n,), A, from `time_ns` on, and whether they are certainly known."""
         coils, gain = self._settings.coils, self._settings.free.errors.coil_gain
         x, y, z = coils.dipole(currents).tolist()
         if coils.is_redundant:
@@ -691,10 +678,7 @@ class OrbitFilter:
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements that arrive after later measurements were applied.
-
-        The callback `applied` receives, for each measurement, whether the measurement passed the gate.
-        """
+        """Apply measurements of past times, and call `applied` with flags of those that passed the gate."""
         self._close()
         places = [self._replay.place(m.time_ns) for m in late]
         inside = [k for k in places if k is not None and self._steps[k].before is not None]

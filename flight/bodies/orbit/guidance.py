@@ -78,10 +78,7 @@ near the end, because the time is too short for a new plan."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Followed:
-    """A path that is followed from `begin_ns` on; its times count from `origin_ns`.
-
-    The attribute `slew` is None for a path without a slew.
-    """
+    """A path that is followed from `begin_ns` on, with or without a slew; times count from `origin_ns`."""
 
     law: PointingLaw
     origin_ns: int
@@ -158,10 +155,7 @@ class PointingPaths:
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
     def running(self, now_ns: int) -> RunningSlew | None:
-        """Return the slew whose rest may be planned again, or None.
-
-        The result is None before the slew begins, near its end, and while the newest plan has not begun.
-        """
+        """Return the slew whose rest may be planned again, or None before it begins and near its end."""
         point, followed = self.sample(now_ns), self._followed
         if point is None or followed is None or followed.slew is None or self._next is not None:
             return None
@@ -250,10 +244,7 @@ class PointingTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target that the command with the number `number` sets.
-
-        Raises UsageError if the command gives a q2, as for the testbed.
-        """
+        """Return the target of command `number`. Raises UsageError for a q2, as for the testbed."""
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite needs a pointing goal; a target q2 is for the testbed")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:

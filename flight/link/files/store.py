@@ -97,10 +97,7 @@ def overwrite(path: Path, data: bytes) -> bool:
 
 @contextmanager
 def locked(path: Path, problem: str) -> Iterator[None]:
-    """Hold the lock of a file.
-
-    Raises UsageError with the text `problem` if another process holds the lock.
-    """
+    """Hold the lock of a file. Raises UsageError with the text `problem` if it is held elsewhere."""
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         try:
@@ -184,10 +181,7 @@ class _Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def problem_of_name(name: str) -> str:
-    """Return why a file name is not allowed, or an empty text.
-
-    An allowed name never leads out of the folder of received files.
-    """
+    """Return why a name is not allowed, or ""; an allowed name stays in the folder of received files."""
     parts = name.split("/")
     if len(name.encode(errors="replace")) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
         return f"{name[:LONGEST_NAME]!r} is too long for the name of a file"

@@ -65,10 +65,7 @@ class FileSum:
         self._at = self._value = 0
 
     def step(self) -> int | None:
-        """Process the next 1 MiB and return the checksum at the end of the file, None before.
-
-        Raises OSError if the file cannot be read or is too short.
-        """
+        """Process the next 1 MiB; return the checksum at the end of the file, None before. Raises OSError."""
         if self._left:
             with self._path.open("rb") as file:
                 file.seek(self._at)
@@ -136,10 +133,7 @@ class Ranges:
         self._begins[first:last], self._ends[first:last] = [begin], [end]
 
     def take(self, most: int) -> tuple[int, int]:
-        """Remove and return at most `most` bytes at the beginning of the first range.
-
-        Raises IndexError if the set is empty.
-        """
+        """Remove and return at most `most` bytes of the first range. Raises IndexError if there is none."""
         begin, end = self._begins[0], min(self._ends[0], self._begins[0] + most)
         self._begins[0] = end
         if end == self._ends[0]:
@@ -588,10 +582,7 @@ _SUSPENDED = "suspended"
 
 
 class Origin(NamedTuple):
-    """Frame (SPI and counter) and packet (first 16 bits and sequence count) of the command for a transfer.
-
-    All numbers are zero for a transfer without command.
-    """
+    """Frame and packet (first 16 bits, sequence count) of a transfer's command, or zeros without command."""
 
     spi: int = 0
     counter: int = 0
@@ -622,10 +613,7 @@ class Progress:
 
 
 class Entity:
-    """CFDP entity `number`: all file transfers of one end of the link. Not thread-safe.
-
-    The caller empties the queue `ended` of ended transfers.
-    """
+    """CFDP entity: all transfers of one end of the link; the caller empties `ended`. Not thread-safe."""
 
     def __init__(
         self,
@@ -636,10 +624,7 @@ class Entity:
         now_ns: int,
         unit_bytes: int = LONGEST_UNIT,
     ) -> None:
-        """Continue the open transfers of the store, rejecting incoming files of more than `most` bytes.
-
-        File data and requests for gaps are sent in PDUs of at most `unit_bytes` bytes.
-        """
+        """Continue the stored transfers of at most `most` bytes, in PDUs of at most `unit_bytes` bytes."""
         self.number = number
         self._segment_bytes = min(SEGMENT_BYTES, (unit_bytes - FILE_DATA_OVERHEAD) // 4 * 4)
         self._most_requests = min(MOST_REQUESTS, (unit_bytes - NAK_OVERHEAD) // REQUEST_BYTES)
@@ -713,10 +698,7 @@ class Entity:
         side.suspend(suspended)
 
     def take(self, unit: bytes, now_ns: int) -> None:
-        """Process a received PDU and ignore PDUs for other entities.
-
-        Raises PduError for an invalid PDU and FileError if the disk cannot be written.
-        """
+        """Process a received PDU for this entity. Raises PduError, and FileError if the disk fails."""
         transaction, content = unpack(unit)
         if transaction.source == self.number:
             replies = self._take_as_sender(transaction, content, now_ns)
@@ -788,10 +770,7 @@ class Entity:
         return receiver.take(content, now_ns)
 
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
-        """Open an incoming transfer.
-
-        If too many transfers are open, cancel the transfer that has received no data for the longest time.
-        """
+        """Open an incoming transfer, in place of the stalest one if too many are open."""
         if len(self._in) >= MOST_OPEN:
             stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
             stalest.stop(Condition.CANCELLED, "given up for a newer one")
