@@ -177,10 +177,8 @@ class Code(Protocol):
 
 
 _WRONG_MARKER_BITS = 3
-"""Maximum number of wrong bits in a sync marker that is accepted directly after a valid codeblock.
-
-At a bit error rate of 0.8 %, at which the Reed-Solomon code fails, one of 8,000 markers has more wrong bits.
-"""
+"""Maximum number of wrong bits in a sync marker that is accepted directly after a valid codeblock. At a bit
+error rate of 0.8 %, at which the Reed-Solomon code fails, one of 8,000 markers has more wrong bits."""
 
 
 class TelemetryCode:

@@ -103,13 +103,10 @@ class Sampling:
 
 NEWEST = Sampling(0.2, 1.0)
 """Error bounds of one ADC sample at an unknown time in its window. The PWM chopping of the current alone
-causes an error of 18 % (`hal.drivers.current_monitors`).
-"""
+causes an error of 18 % (`hal.drivers.current_monitors`)."""
 MEAN = Sampling(0.02, 0.25)
-"""Error bounds of the mean of five ADC samples.
-
-An error of 7 % that is common to all readings is part of the gain error instead.
-"""
+"""Error bounds of the mean of five ADC samples. An error of 7 % that is common to all readings is part of the
+gain error instead."""
 
 
 @dataclass(frozen=True, slots=True)

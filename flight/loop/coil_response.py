@@ -177,10 +177,8 @@ _MEMORY_NS = 20_000_000_000
 """Time (ns) for which residual accelerations are stored."""
 _STALE_NS = 200_000_000
 _REACH_NS = 3_000_000_000
-"""Time (ns) for which commands are stored.
-
-The time is long, because samples arrive late and in a burst after a stall of the loop.
-"""
+"""Time (ns) for which commands are stored. The time is long, because samples arrive late and in a burst after
+a stall of the loop."""
 _LEAST_CHANGE = 4.0e-3
 """Smallest detectable change of the angular acceleration, rad/s^2."""
 LARGEST_GAIN = 1.5

@@ -301,10 +301,8 @@ class CyclicExecutive:
 
 
 BUDGET = 10
-"""Number of consecutive unexpected exits of a worker after which restarts pause.
-
-The delays of the restarts before the pause add up to 127.5 s.
-"""
+"""Number of consecutive unexpected exits of a worker after which restarts pause. The delays of the restarts
+before the pause add up to 127.5 s."""
 FIRST_NS = SECOND_NS // 2
 STEADY_NS = 60 * SECOND_NS
 """Running time (ns) after which a worker's budget of restarts is reset."""

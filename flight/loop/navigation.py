@@ -48,9 +48,7 @@ from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 _AT_A_TIME = 16
 """Number of filter updates that one control cycle repeats after a late measurement, which takes a few ms.
-
-Repeating the filter updates of one second takes a few control cycles.
-"""
+Repeating the filter updates of one second takes a few control cycles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,11 +156,9 @@ class Navigation:
         self._available = estimation.coil_monitor.available
         self._has_rate = True
         self.speed = 0.0
-        """Body rate (rad/s) of the newest reading, including the gyro bias.
-
-        Without a gyro, the value is the rate of the estimate, or the largest likely rate from the
-        magnetometer, or infinity while the rate is unknown.
-        """
+        """Body rate (rad/s) of the newest reading, including the gyro bias. Without a gyro, the value is the
+        rate of the estimate, or the largest likely rate from the magnetometer, or infinity while the rate is
+        unknown."""
 
     def begin(self, time_ns: int) -> None:
         """Ignore readings made before the release of the body at `time_ns`."""

@@ -31,10 +31,8 @@ LONGEST_STEP = 5.0
 """Longest time (s) over which one current is integrated, and largest age (s) of a reading."""
 STUCK_FOR, STUCK_RANGE = 10.0, 0.02
 """A monitor counts as stuck if its reading does not change for `STUCK_FOR` s, while the voltage of the other
-monitor changes by `STUCK_RANGE` V.
-
-Both monitors measure the same voltage, and 0.02 V are five steps of the converter.
-"""
+monitor changes by `STUCK_RANGE` V. Both monitors measure the same voltage, and 0.02 V are five steps of the
+converter."""
 CELL_RANGE = (1.0, 4.6)
 """Range (V) of the voltage of a cell, outside which a reading is wrong."""
 DIFFERENCE = 0.1

@@ -173,19 +173,15 @@ def as_testbed(config: Config) -> TestbedConfig:
 
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
-"""Range of valid magnetometer readings, T.
-
-At a height of 200 km the field is up to 6.5e-5 T, and the coils may add as much. The field is at least 7e-6 T
-up to a height of 2,840 km, the apogee of the highest orbit that is flown.
-"""
+"""Range of valid magnetometer readings, T. At a height of 200 km the field is up to 6.5e-5 T, and the coils
+may add as much. The field is at least 7e-6 T up to a height of 2,840 km, the apogee of the highest orbit that
+is flown."""
 
 _FIELD = 3.3e-5
 """Typical magnetic field in a low orbit, T."""
 _PRESSURE = 5.0e-6
-"""Expected pressure (Pa) by air drag and solar radiation on a face at an altitude of 500 km.
-
-The expected pressure is a tenth of the largest pressure (solar maximum, perpendicular incidence).
-"""
+"""Expected pressure (Pa) by air drag and solar radiation on a face at an altitude of 500 km. The expected
+pressure is a tenth of the largest pressure (solar maximum, perpendicular incidence)."""
 _LARGEST_PRESSURE = 10.0
 """Ratio of the largest to the expected pressure."""
 _DIPOLE, _MOMENT = 3.0e-4, 1.047e-3

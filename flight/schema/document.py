@@ -542,11 +542,9 @@ BaudRate = Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
 Vector = tuple[float, float, float]
 Inertia = tuple[float | Vector, float | Vector, float | Vector]
-"""Three moments of inertia about the body axes, or the three rows of the inertia tensor, kg m^2.
-
-The function `inertia_problem` checks the moments. Bounds in this type would damage memory: msgspec 0.22
-cannot distinguish a number with a bound from a tuple of fixed length.
-"""
+"""Three moments of inertia about the body axes, or the three rows of the inertia tensor, kg m^2. The function
+`inertia_problem` checks the moments. Bounds in this type would damage memory: msgspec 0.22 cannot distinguish
+a number with a bound from a tuple of fixed length."""
 Quaternion = tuple[float, float, float, float]
 PlainMode = Literal["testbed-demo", "hold", "detumble", "safe"]
 CommandedMode = Literal[PlainMode, "sun", "point"]

@@ -41,20 +41,16 @@ from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCamera
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
-"""Shortest interval (ns) between the solar cell readings that are checked.
-
-Readings at shorter intervals have correlated errors.
-"""
+"""Shortest interval (ns) between the solar cell readings that are checked. Readings at shorter intervals have
+correlated errors."""
 OVERHEAD_ALBEDO = 0.2
 """Irradiance of a cell by the fully lit Earth at an albedo of 0.3, as a fraction of sunlight."""
 CLOUDS = 0.5
 """Relative variation of the Earth's irradiance due to clouds."""
 LEAST_ALBEDO = 0.02
 STUCK = 3
-"""Number of consecutive identical solar cell readings that indicate a fault.
-
-Readings of working cells differ by noise.
-"""
+"""Number of consecutive identical solar cell readings that indicate a fault. Readings of working cells differ
+by noise."""
 SUNLIT = 0.99
 """Visible fraction of the solar disc above which the solar cells are expected to measure the Sun."""
 CONTRADICTED = 3
@@ -156,8 +152,7 @@ def _sky(around: FilterEnvironment, sun: FloatArray) -> KnownDirections:
 DIRECTIONS_START_SIGMA = math.radians(15.0)
 """Largest standard deviation (rad), about the worst axis, of an attitude that may start the filter."""
 NEEDED_SIGMA = math.radians(0.05)
-"""Attitude standard deviation (rad), about the worst axis, above which the horizon cameras are used.
-"""
+"""Attitude standard deviation (rad), about the worst axis, above which the horizon cameras are used."""
 ROUGH_SIGMA = 0.3
 """Largest standard deviation (rad) of an attitude that is used as a prior in the search for the horizon."""
 IMPROBABLE = 1e-6

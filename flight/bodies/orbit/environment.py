@@ -50,12 +50,10 @@ CONFIRMED = 420.0
 _LEAST_FIXES, _SEQUENCES, _LONGEST_GAP = 5, 4, 200.0
 """`_LEAST_FIXES` is the minimum number of fixes that replace the orbit known before. `_SEQUENCES` is the
 maximum number of fix sequences, each of which is a candidate orbit. `_LONGEST_GAP` is the longest time (s)
-between two fixes of one sequence.
-"""
+between two fixes of one sequence."""
 FIRST_FIXES, TIGHT = 3, 1e4
 """Number of consistent fixes that start an orbit without elements, and largest standard deviation (m) of
-elements with which a single fix starts an orbit.
-"""
+elements with which a single fix starts an orbit."""
 UNCONFIRMED_SIGMA = 1e6
 """Standard deviation (m) of a position that follows from a few fixes without elements."""
 EXACT, STEEPEST = 3e3, 3.0

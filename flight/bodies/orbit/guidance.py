@@ -440,11 +440,8 @@ class LearnedBody:
 
 ACROSS = 0.03
 """Largest dipole moment normal to the plane of two usable coils in a slew, as a fraction of the weakest
-coil's.
-
-The limit reduces the torque little, because a dipole moment in the plane of the two coils can produce nearly
-every possible torque.
-"""
+coil's. The limit reduces the torque little, because a dipole moment in the plane of the two coils can produce
+nearly every possible torque."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

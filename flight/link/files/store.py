@@ -117,10 +117,8 @@ _KEPT_ENDINGS = 64
 _FREE_BYTES = 64 << 20
 """Free disk space (bytes) that received files must not use."""
 _LONGEST_RECORD = 4 << 20
-"""Maximum length (bytes) of a stored record.
-
-The record of a 64 MiB file of which every second segment is missing needs less than 1 MB.
-"""
+"""Maximum length (bytes) of a stored record. The record of a 64 MiB file of which every second segment is
+missing needs less than 1 MB."""
 
 _Entity = Annotated[int, Meta(ge=0, le=(1 << 16) - 1)]
 _Long = Annotated[int, Meta(ge=0, le=HIGHEST_NUMBER)]

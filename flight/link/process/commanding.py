@@ -51,10 +51,8 @@ class Stage(IntEnum):
     COMPLETED = 4
     FAILED = 5
     REPEATED = 6
-    """A frame with an already used counter was refused.
-
-    The refusal does not show whether the command that used the counter was executed.
-    """
+    """A frame with an already used counter was refused. The refusal does not show whether the command that
+    used the counter was executed."""
 
     @property
     def final(self) -> bool:

@@ -81,10 +81,8 @@ _HEARD_NS = 60_000_000_000
 _CONNECTIONS = 4
 """Maximum number of TCP connections that have sent an authentic frame."""
 _STRANGERS = 256
-"""Maximum number of TCP connections that have not sent an authentic frame.
-
-If 200 unauthenticated clients connect per second, a new connection has 1.3 s for its first frame.
-"""
+"""Maximum number of TCP connections that have not sent an authentic frame. If 200 unauthenticated clients
+connect per second, a new connection has 1.3 s for its first frame."""
 _UNSENT = 1 << 18
 _PIECE = 1 << 14
 _RECONNECT_NS = 5 * SECOND_NS
@@ -409,10 +407,8 @@ def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Map
 RESTORED = "the keys were restored from a backup: set a new key of SPI 1 by a command of SPI 2"
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250
-"""Period (ns) of the loop while frames arrive.
-
-A Linux socket buffers about 50 ms of traffic at 10,000 frames/s.
-"""
+"""Period (ns) of the loop while frames arrive. A Linux socket buffers about 50 ms of traffic at 10,000
+frames/s."""
 _LABEL_NS = 10 * SECOND_NS
 _UTC_WAIT_NS = 120 * SECOND_NS
 """Longest time (ns) for which scheduled commands wait for the UTC of the flight."""

@@ -213,10 +213,8 @@ LEAST_FREE_BYTES = 64 << 20
 """Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""Error numbers (errno) of a full or failing disk.
-
-A different error number indicates a wrong path of the log.
-"""
+"""Error numbers (errno) of a full or failing disk. A different error number indicates a wrong path of the
+log."""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
@@ -514,10 +512,8 @@ def _clear(folder: Path, stem: str, overwrite: bool) -> None:
 
 _STATUS = (RUN, CONTROL, ATTITUDE, HOUSEKEEPING, HEALTH)
 _STATUS_EVENTS = 2
-"""Number of events in a status report.
-
-The number is small enough for a status report and a command answer to fit into one Ethernet frame.
-"""
+"""Number of events in a status report. The number is small enough for a status report and a command answer to
+fit into one Ethernet frame."""
 
 
 class Log(Protocol):
