@@ -289,10 +289,7 @@ class CltuStream:
     """
 
     def __init__(self, kind: str | None, count: Callable[[int], object]) -> None:
-        """Decode frames that were randomised by the sequence `kind`.
-
-        The function `count` receives the number of corrected bits of each valid frame.
-        """
+        """Decode frames randomised by the sequence `kind`; `count` receives numbers of corrected bits."""
         self._kind, self._count = kind, count
         self._data = b""
 

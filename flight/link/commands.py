@@ -361,10 +361,7 @@ class CommandPacker:
 
 
 def unpack(data: bytes) -> Command:
-    """Return the command in a packet.
-
-    Raises MalformedError for bytes that are not a command packet and CommandError for invalid values.
-    """
+    """Return the command in a packet. Raises MalformedError or, for wrong values, CommandError."""
     if len(data) < HEADER_BYTES:
         raise MalformedError(f"{len(data)} bytes are too short for a packet")
     layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))

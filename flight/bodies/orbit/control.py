@@ -139,10 +139,7 @@ invertible."""
 
 
 def commanded(dipole: FloatArray, coils: FloatArray) -> FloatArray:
-    """Return the command (3,), A m^2, with which the coils cause a dipole (3,), A m^2.
-
-    `coils` (3, 3) is the estimated matrix from the commanded to the true dipole.
-    """
+    """Return the command (3,) of a dipole (3,), A m^2; `coils` (3, 3) maps commands to dipoles."""
     errors = np.clip(coils - np.eye(3), -_LARGEST_COIL_ERROR, _LARGEST_COIL_ERROR)
     return np.asarray(np.linalg.solve(np.eye(3) + errors, dipole))
 

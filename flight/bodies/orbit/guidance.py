@@ -559,10 +559,7 @@ class PointingPlanner:
             self._after_ns = now_ns + REST_AGAIN_NS
 
     def _new_job(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> PointingJob | None:
-        """Return the planner's job for a slew from an estimate to a goal, or None while the orbit is unknown.
-
-        Raises UsageError if the coils that are not isolated are parallel.
-        """
+        """Return a job for a slew, or None without an orbit. Raises UsageError for parallel usable coils."""
         orbit, craft = self._environment.state(now_ns), self._craft
         if orbit is None:
             return None

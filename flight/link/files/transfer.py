@@ -215,10 +215,7 @@ class Sender:
         fresh: bool,
         segment_bytes: int = SEGMENT_BYTES,
     ) -> None:
-        """Begin a transfer if `fresh` is true; otherwise continue a stored transfer by metadata and EOF.
-
-        Each PDU contains at most `segment_bytes` bytes of the file.
-        """
+        """Begin a `fresh` or continue a stored transfer, with PDUs of at most `segment_bytes` file bytes."""
         self._segment_bytes, self.record = segment_bytes, record
         self.transaction = Transaction(source, record.number, record.destination)
         self.condition: int | None = None
@@ -376,10 +373,7 @@ class Receiver:
         now_ns: int,
         most_requests: int = MOST_REQUESTS,
     ) -> None:
-        """Begin or continue the transfer `record`, rejecting a file of more than `most` bytes.
-
-        Each NAK PDU requests at most `most_requests` ranges.
-        """
+        """Begin or continue a transfer of at most `most` bytes; NAKs request `most_requests` ranges."""
         self._most_requests, self.record = most_requests, record
         self.closed = False
         self.said = ""
