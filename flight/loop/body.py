@@ -149,12 +149,7 @@ class ReadingAgreement:
 
 @dataclass(frozen=True, slots=True)
 class FixVerdict:
-    """Use of a GPS fix by the body; a fix that is neither used nor refused awaits further fixes.
-
-    Attributes:
-        used: whether the fix updates the orbit.
-        refusal: why the fix is refused; empty if it is not.
-    """
+    """Whether a GPS fix is used, or why it is refused; another fix, with no refusal, awaits further fixes."""
 
     used: bool = False
     refusal: str = ""
@@ -492,10 +487,8 @@ class FlightBody:
 class BodyKind:
     """A kind of body.
 
-    Attributes:
-        plan: function of the planner worker, from a job to a plan, or None without a planner.
-        make: function that builds the body from a configuration and the parameters that an earlier boot
-            learned.
+    The function `plan` of the planner worker converts a job to a plan; it is None without a planner. The
+    function `make` builds the body from a configuration and the parameters that an earlier boot learned.
     """
 
     plan: Callable[[Any], Any] | None

@@ -302,12 +302,8 @@ axis."""
 class CoilMonitor:
     """Detects broken coils from the commands and readings of the last seconds.
 
-    The class is longer than 200 lines, because its methods share the state of one suspected fault from its
-    detection to its diagnosis.
-
-    Attributes:
-        tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
-        correction: signs and gains of the coils.
+    Corrections are reviewed, and broken coils are tried again, below the body rate `tumble_rate` (rad/s). The
+    attribute `correction` holds the signs and gains of the coils.
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:

@@ -369,12 +369,8 @@ class ModeSettings:
 class ModeControl:
     """Holds the mode state machine, and the targets that commands set.
 
-    The class is longer than 200 lines, because commands, reactions and reached goals all change the same mode
-    and target.
-
-    Attributes:
-        restart: reason why the process must be restarted; empty if no restart is needed.
-        wanted: target that a hold, a slew, the mode SUN or a command to point has set, or None.
+    The text `restart` states why the process must be restarted; it is empty if no restart is needed. A hold,
+    a slew, the mode SUN or a command to point sets the target `wanted`.
     """
 
     def __init__(

@@ -467,8 +467,6 @@ REFUSALS_TO_RESTART = 3
 class OrbitFilter:
     """The satellite's filter; implements `flight.loop.body.Filter`.
 
-    The class exceeds 200 lines because the loop, the feeds and the telemetry use many of its short methods.
-
     Attributes:
         restarts: number of estimates that were discarded.
         contradictions: texts about learned states that measurements have contradicted so far.

@@ -89,9 +89,8 @@ class _Followed:
 class PointingPaths:
     """The path that the satellite follows; implements `flight.loop.body.FlownPaths`.
 
-    Attributes:
-        off: angle (rad) between body and path at the last command; zero for a new path.
-        astray: damping and replanning state of a body far off its path.
+    The angle (rad) between body and path at the last command is `off`. The attribute `astray` holds damping
+    and replanning of a body far off its path.
     """
 
     def __init__(self, limit: float | FloatArray, fastest: float) -> None:
@@ -295,12 +294,7 @@ class Sensor:
 
 
 class ObjectAim:
-    """Adapts the planner's jobs to a target that is an object.
-
-    Attributes:
-        seeks: whether the target is an object to be searched for or followed.
-        moved: whether the followed track has changed since the last plan.
-    """
+    """Adapts the planner's jobs to an object it `seeks`, whose track has `moved` since the last plan."""
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
         """Start without an object.

@@ -221,12 +221,7 @@ _NAME = re.compile(r"run-(\d{6,})")
 
 @dataclass(frozen=True, slots=True)
 class NewRun:
-    """Result of starting a run.
-
-    Attributes:
-        folder: path of the run's folder, which does not exist if the disk cannot be written.
-        dropped: number of old runs that were deleted.
-    """
+    """Folder of a new run, which a failing disk does not contain, and number of dropped old runs."""
 
     folder: Path
     dropped: int
