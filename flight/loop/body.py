@@ -209,19 +209,13 @@ class WindowedLaw(Protocol):
         """Begin without knowledge of the magnetic field."""
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a magnetic field (3,), T, and a gyro rate (3,), rad/s, measured at `time_ns`.
-
-        The sample is ignored unless the coils have been off and their field has decayed.
-        """
+        """Accept a field (3,), T, and a gyro rate (3,), rad/s; used only if the coils' field has decayed."""
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the present command, which is zero while the field is measured or the rate is unknown."""
 
     def sent(self, currents: FloatArray) -> None:
-        """Accept the currents (3,), A, that were sent to the driver.
-
-        The sent currents differ from the command if a coil is excluded.
-        """
+        """Accept the sent currents (3,), A, which differ from the command if a coil is excluded."""
 
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the present magnetic field (3,), T, in body axes, or None before it is known."""
@@ -372,25 +366,18 @@ class BodyEstimation(Protocol):
         return learned_of(estimate)
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Adapt the estimation to corrected coil dipoles: the former dipoles multiplied by `change` (n,).
+        """Adapt to coil dipoles that were multiplied by `change` (n,), with the relative `deviations` (n,).
 
-        The relative standard deviations of the corrected dipoles are `deviations` (n,). The default method
-        does nothing, for a filter that does not estimate the coils separately.
+        The default method does nothing, for a filter that does not estimate the coils separately.
         """
         del change, deviations
 
     def coils_used(self, used: BoolArray) -> None:
-        """Adapt the estimation to the coils in use, flagged by `used` (n,); the other coils are isolated.
-
-        The default method does nothing, for a body whose estimation does not depend on the allocation.
-        """
+        """Adapt to the coils that are `used` (n,) and not isolated; by default, nothing depends on them."""
         del used
 
     def magnetometer_changed(self) -> None:
-        """Adapt the estimation to another magnetometer, from which the later magnetic fields come.
-
-        The default method does nothing, for a body that estimates no errors of the magnetometer.
-        """
+        """Adapt to another magnetometer; by default, no errors of the magnetometer are estimated."""
         return
 
     def is_accurate(self, estimate: Estimate) -> bool:
@@ -398,17 +385,11 @@ class BodyEstimation(Protocol):
         return True
 
     def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
-        """Return the rate (3,), rad/s, that replaces the gyro's rate, or None without an accurate rate.
-
-        The default method returns None, which suits a body whose control laws need no rate.
-        """
+        """Return the rate (3,), rad/s, that replaces the gyro's, or None; the default needs no rate."""
         return None
 
     def fastest_by_field(self) -> float:
-        """Return the largest likely body rate (rad/s) from the magnetometer while the gyro gives no rate.
-
-        The default method returns infinity, for a body whose rate is not estimated from the magnetometer.
-        """
+        """Return the largest likely body rate (rad/s) from the magnetometer, by default infinity."""
         return math.inf
 
     def knowledge(self) -> Knowledge:

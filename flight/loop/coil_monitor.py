@@ -241,10 +241,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
-        """Drive the next untried axis of `axes` by a square wave, and return the end time (ns) of the wave.
-
-        The axis `prime` is tried first. The result is None if all axes have been tried.
-        """
+        """Drive the next untried axis, `prime` first; return the end time (ns), or None if all were tried."""
         candidates = axes - self._tried
         if not candidates:
             self._tried.clear()
@@ -708,10 +705,9 @@ class CoilMonitor:
         return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
 
     def _look_further(self, axes: set[int], now_ns: int) -> None:
-        """Apply the probe to the next suspected axis; after the last axis, collect new evidence.
+        """Probe the next suspected axis; after the last axis, collect new evidence.
 
-        New evidence is needed, because no hypothesis explains an intermittent fault or a faulty current
-        monitor.
+        Until then, no hypothesis explained the evidence, as with an intermittent fault or a faulty monitor.
         """
         ends_ns = self._probe.begin(axes, now_ns, self._prime)
         self._evidence.begin_segment()

@@ -833,10 +833,7 @@ class Evidence:
         ]
 
     def shows_working_monitor(self, known: Mapping[int, CoilFault]) -> bool:
-        """Return whether the current monitor measured the current of a healthy coil in a probe.
-
-        Such a reading shows more clearly than the motion of a tumbling body that the monitor works.
-        """
+        """Return whether a healthy coil's current was measured in a probe, which is the clearest proof."""
         return any(
             fits(segment, self._bounds, known) and any(one.mean[:, 0].any() for one in segment)
             for segment in list(self._segments)[1:]

@@ -212,11 +212,7 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update a monitored condition.
-
-        The flag `holds` states whether the condition is true; it is None if unknown. If the condition becomes
-        active or inactive, an event with the text `text` is reported.
-        """
+        """Update a condition, which `holds` or is unknown (None); report a change as an event with `text`."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -379,10 +375,7 @@ class StreamWatch:
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the readings are stale, slow or invalid, and why.
-
-        The first result is None if the state is unknown, or if another monitored condition reports it.
-        """
+        """Return whether the readings are poor (None if unknown or reported otherwise), and why."""
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"

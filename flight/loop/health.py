@@ -673,11 +673,7 @@ class Shedding:
         frames: Callable[[], tuple[int, int]],
         services: Services,
     ) -> None:
-        """Start at the shedding level without reductions.
-
-        The function `apply` applies a shedding level to navigation and imaging. The function `frames` returns
-        the numbers of frames not taken, and of frames that are late.
-        """
+        """Start without reductions; `apply` applies a level, and `frames` counts untaken and late frames."""
         self._signs, self._plans, self._apply, self._frames = tuple(signs), plans, apply, frames
         self._recorder, self._events = services.recorder, services.events
         self._level = 0

@@ -445,8 +445,7 @@ class ObjectTracks:
     ) -> None:
         """Accept the points of light `seen` in a frame without identified stars.
 
-        The streaks give the motion of the camera over the exposure. The `attitude` of the camera is estimated
-        for mid-exposure, or None if unknown.
+        The `attitude` of the camera at mid-exposure is estimated, or None if unknown.
         """
         predicted = self._predicted(middle_ns, motion, attitude)
         pixel = float(seen.sigma.min(initial=1.0)) / FLOOR_PX
@@ -491,10 +490,7 @@ class ObjectTracks:
     def _track(
         self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int, to_estimate: FloatArray
     ) -> None:
-        """Record the sightings of a frame, update the tracks, and report new and ended tracks.
-
-        The matrix `to_estimate` (3, 3) rotates the axes of the sightings to those of the attitude estimate.
-        """
+        """Record sightings, update the tracks, and report changes; `to_estimate` (3, 3) rotates the axes."""
         x, y = np.reshape(sighted.points, (-1, 2)).T
         self._recorder.record(
             SIGHTINGS,

@@ -323,10 +323,7 @@ class PointingWatch:
         self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
 
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
-        """Update TUMBLING and HOLD_IMPOSSIBLE from the pointing error `off` (rad), and return this error.
-
-        While no attitude is required, `off` is None and the returned error is 0.
-        """
+        """Update TUMBLING and HOLD_IMPOSSIBLE; return the pointing error `off` (rad), or 0 for None."""
         settings = self._settings
         self.watch_rate(self._targets.speed(estimate), now_ns)
         error = 0.0 if off is None else off

@@ -428,10 +428,7 @@ class StateStore:
         self._order: tuple[str, ...] = COPIES
 
     def load(self) -> StoredState:
-        """Return the newest valid copy of the state, or the defaults if there is none. Never raises.
-
-        A lost state counts as an unclean shutdown.
-        """
+        """Return the newest valid copy, or defaults. A lost state is an unclean shutdown. Never raises."""
         read = [self._read(name) for name in COPIES]
         whole = [r for r in read if r.copy is not None]
         newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)

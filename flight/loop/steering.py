@@ -231,10 +231,7 @@ class Steering:
         self._has_rate = True  # whether a body rate is known: from the newest reading or a substitute
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
-        """Follow the path or hold its end. The estimate must be None unless it is based on measurements.
-
-        If an estimate existed before (`ever_started`), an estimate of None is a loss of control.
-        """
+        """Follow the path or hold its end; without a measured estimate, control is lost if `ever_started`."""
         control = self._body.control
         reference = control.paths.sample(now_ns)
         reason = "measurement too old or estimate too inaccurate for control: coils set to zero"

@@ -140,10 +140,9 @@ class PointingPaths:
         return ""
 
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
-        """Record how far the body is from its path, and return whether the body still follows the path.
+        """Record the deviation of the body from its path, and return whether the body still follows the path.
 
-        The argument `turn` is the rotation vector (3,), rad, between path and body, and `rate` is the body
-        rate (3,), rad/s.
+        The deviation is the rotation vector `turn` (3,), rad, and the body rate is `rate` (3,), rad/s.
         """
         self.off = float(np.linalg.norm(turn))
         self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
@@ -467,11 +466,7 @@ class PointingPlanner:
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """Start without a plan.
-
-        The function `learned` returns the present estimates of body and torques. The function `usable`
-        returns the flags (n,) of the coils that are not isolated.
-        """
+        """Start without a plan; `learned` returns the estimated body, `usable` flags of coils in use."""
         self._craft, self._paths, self._environment = craft, paths, environment
         self._learned, self._usable, self._objects = learned, usable, objects
         self._areas = box_areas(craft.inertia)
