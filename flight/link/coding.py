@@ -79,10 +79,7 @@ _DUAL_BASE_ROOT = 117  # exponent of beta = alpha^117; the basis of the symbols 
 
 
 class ReedSolomon:
-    """Reed-Solomon code (255,223) of CCSDS 131.0-B-5, section 4, in the dual basis.
-
-    The code has corrected `corrected` symbols, and `uncorrectable` codewords had too many errors.
-    """
+    """Code (255,223) of CCSDS 131.0-B-5, 4, dual basis; counts corrected symbols and lost codewords."""
 
     def __init__(self, depth: int) -> None:
         """Prepare a code that interleaves `depth` codewords."""
@@ -311,10 +308,7 @@ class CltuStream:
         return found
 
     def _frame(self, coded: bytes) -> tuple[bytes, int] | None:
-        """Return the frame in codeblocks, and the number of bytes in valid codeblocks.
-
-        The frame is empty if the codeblocks contain no valid frame. Returns None if more bytes are needed.
-        """
+        """Return the frame (b"" if invalid) and the bytes of valid codeblocks, or None for want of bytes."""
         data, corrected, length = b"", 0, _BLOCK_DATA
         for end in range(_BLOCK, len(coded) + 1, _BLOCK):
             block = coded[end - _BLOCK : end]

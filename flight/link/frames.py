@@ -230,10 +230,7 @@ def _packet_starts(data: bytes) -> list[int]:
 
 
 def open_telemetry(frame: bytes, spacecraft: int) -> tuple[bytes, bytes, int]:
-    """Return the header, the protected data and the virtual channel of a telemetry frame.
-
-    Raises FrameError for a frame that is too short or comes from another spacecraft.
-    """
+    """Return header, protected data and virtual channel of a frame of the spacecraft. Raises FrameError."""
     if len(frame) < TELEMETRY_HEADER.size + CRC_BYTES:
         raise FrameError("its length is wrong")
     (first,) = struct.unpack_from(">H", frame)

@@ -236,10 +236,7 @@ class Vault:
         return written
 
     def advance(self, association: Association) -> int:
-        """Write both copies of an association unless another process has stored a newer association.
-
-        Returns the number of valid stored copies, 0 if the disk fails or is read-only.
-        """
+        """Write both copies unless a newer association is stored; return the number of valid copies."""
         try:
             with self.locked():
                 newest = self.read(association.spi)

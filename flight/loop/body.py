@@ -66,10 +66,7 @@ class TargetLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target and its number in packets.
-
-    The number is the index of a configured step, at least COMMANDED for a commanded target, or KEPT.
-    """
+    """A target; its number in packets is that of a step, at least COMMANDED for a command, or KEPT."""
 
     index: int
     law: TargetLaw
@@ -401,10 +398,7 @@ class BodyEstimation(Protocol):
         return None
 
     def velocity(self, time_ns: int) -> FloatArray | None:
-        """Return the velocity (3,), m/s, relative to the Sun in reference axes, for stellar aberration.
-
-        If the method returns None, the configured velocity is used.
-        """
+        """Return the velocity (3,), m/s, relative to the Sun, or None for the configured velocity."""
         return None
 
     def accept_fix(self, reading: GpsReading) -> FixVerdict:

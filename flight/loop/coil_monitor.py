@@ -145,10 +145,7 @@ class SelfTest:
         self._tested.clear()
 
     def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
-        """Return the test currents (n,), A, that replace the `wanted` currents (n,), or None without a test.
-
-        The currents `wanted` are effective currents. Only coils that are `usable` (n,) are tested.
-        """
+        """Return the currents (n,), A, of a test of a `usable` coil instead of `wanted` ones, or None."""
         if (np.abs(wanted) > _QUIET * self._settings.limits).any():
             self._loud_ns, self._running = now_ns, None
         for axis, shown_ns in enumerate(self._shown_ns):
@@ -229,10 +226,7 @@ class CoilMonitorSettings:
 
 
 class Probe:
-    """Drives one axis after another alone by a square wave with zero mean.
-
-    The two halves of the wave last `half_ns` each, with the currents +`current` and -`current` (A).
-    """
+    """Drives an axis alone with +`current` and then -`current` (A), each for `half_ns`."""
 
     def __init__(self, current: float, half_ns: int, coils: int) -> None:
         self._current, self._coils = current, coils
@@ -558,10 +552,7 @@ class CoilMonitor:
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     def test_wave(self, wanted: FloatArray) -> FloatArray | None:
-        """Return the actual coil currents (n,), A, of a self-test of a coil, or None without a test.
-
-        The test replaces the `wanted` effective currents (n,), A, which are small.
-        """
+        """Return the actual currents (n,), A, of a self-test instead of `wanted` ones, or None."""
         if self._self_test is None or not self._commands:
             return None
         if self.suspicion or self._leg.is_searching:

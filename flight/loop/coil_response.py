@@ -59,10 +59,7 @@ _NOTED_LATE_NS = 25_000_000
 
 
 class CoilCommands:
-    """A record of the commanded currents and the braking.
-
-    The attribute `braked` holds the indices of the bridges that are braked now.
-    """
+    """A record of the commanded currents and of the braking; `braked` are the bridges braked now."""
 
     def __init__(self, reach_ns: int) -> None:
         """Store commands for `reach_ns` ns."""
@@ -106,10 +103,7 @@ class CoilCommands:
         return np.array(sampled)
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
-        """Return the newest ADC sample, with the bounds of the current that healthy coils would draw.
-
-        The mapping `known` gives the known fault of each broken axis.
-        """
+        """Return the newest ADC sample with the bounds for healthy coils besides `known` faults."""
         sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
         unsure = [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]
@@ -367,10 +361,7 @@ class CoilResponse:
 
     @property
     def strength(self) -> FloatArray | None:
-        """Angular acceleration (n,), rad/s^2 per ampere, by each coil in the quiet magnetic field.
-
-        The quiet field is measured in a pause of the coils. The result is None before the first pause.
-        """
+        """Angular acceleration (n,), rad/s^2/A, of the coils in the last pause's field, or None."""
         if self._quiet_field is None:
             return None
         per_ampere = self._directions @ cross_matrices(self._quiet_field[None])[0] @ self._per_field
@@ -743,10 +734,7 @@ motion is inconclusive."""
 
 
 class MotionWitness:
-    """Checks diagnoses that are based on the supply current against the torque observed in the body's motion.
-
-    The text `doubt` states why the current monitor is considered faulty; it is empty while it is trusted.
-    """
+    """Checks diagnoses by the body's motion; `doubt` states why the current monitor seems faulty."""
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, ...]) -> None:
         """Set the current `full_current` (n,), A, of each coil that is fully on."""

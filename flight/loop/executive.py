@@ -340,10 +340,7 @@ _REAPED_WITHIN_S = 1.0
 
 
 class WorkerProcess:
-    """A running worker process. Only one thread may use this object.
-
-    The attribute `ready` states whether the worker has imported its function.
-    """
+    """A worker process for one thread; it is `ready` once it has imported its function."""
 
     def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
         """Start the process on the given cores; an empty set permits all cores. Raises OSError."""

@@ -63,10 +63,7 @@ _NAN4 = np.full(4, np.nan)
 
 @dataclass(frozen=True, slots=True)
 class LoopTasks:
-    """The tasks of the loop, in the order in which data flow through them.
-
-    A task is None if the configuration has no device or command channel for it.
-    """
+    """The tasks of the loop, in the order of the data flow; None without a device or command channel."""
 
     navigation: Navigation
     imaging: Imaging | None

@@ -301,10 +301,7 @@ CONTROL = "control"
 
 
 class PerformanceObserver:
-    """Records the cycles that the executive reports, and reports skipped slots and failures as events.
-
-    The attribute `lost` is the number of skipped control cycles.
-    """
+    """Records cycles, and reports skipped slots (`lost` control cycles) and failures as events."""
 
     def __init__(self, coils: TorqueCoils, services: Services) -> None:
         self._coils, self._clock, self._recorder = coils, services.clock, services.recorder

@@ -640,10 +640,7 @@ class Imaging:
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
 
     def workload(self) -> tuple[int, int]:
-        """Return the numbers of exposures that were left out by `reduce`, and of frames that are late.
-
-        A frame is late if it arrives while the worker is busy, or if its processing takes too long.
-        """
+        """Return the numbers of exposures left out, and of frames that arrived or ended late."""
         return self._shed, self._late
 
     def begin(self, time_ns: int) -> None:

@@ -185,10 +185,7 @@ class ModeChange:
 
 
 class ModeMachine:
-    """State machine of the modes, which determines mode changes but does not carry them out.
-
-    The attribute `since_ns` is the time (ns) at which the mode was entered.
-    """
+    """State machine that determines, but does not carry out, mode changes; `since_ns` is the last one."""
 
     def __init__(self, table: Table = TRANSITIONS) -> None:
         """Begin in BOOT. Raises FlightError for an invalid transition table."""

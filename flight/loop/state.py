@@ -321,10 +321,7 @@ LARGEST_FILE = 1 << 20
 
 
 class LinuxFiles:
-    """The file system calls for storing the state, all of which may raise OSError.
-
-    Tests replace this class to simulate a power loss.
-    """
+    """The file system calls for storing the state, which may raise OSError and be replaced in tests."""
 
     def read(self, path: Path) -> bytes | None:
         """Return the content of a regular file of at most `LARGEST_FILE` bytes, or None without a file."""

@@ -232,10 +232,7 @@ class Craft(Section, frozen=True, kw_only=True):
     accuracy: CraftAccuracy = CraftAccuracy()
 
     def inertia_matrix(self) -> FloatArray:
-        """Return the inertia tensor (3, 3) in body axes, kg m^2.
-
-        Raises ValueError if moments and rows are mixed, or if neither inertia nor mass is known.
-        """
+        """Return the inertia tensor (3, 3), kg m^2. Raises ValueError for mixed or missing values."""
         if self.inertia is not None:
             return inertia_matrix(self.inertia)
         if self.mass is None:

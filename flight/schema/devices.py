@@ -150,10 +150,7 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
 
 
 class MagnetometerSection(SensorsSection, frozen=True, kw_only=True):
-    """A separate magnetometer, which is read while the inertial unit is silent.
-
-    Without a section `inertial_unit`, this magnetometer is the only source of readings.
-    """
+    """A magnetometer for a silent inertial unit, or as the only unit without `inertial_unit`."""
 
     driver: DriverName = "sensors"
 
@@ -278,10 +275,7 @@ class Coils(Section, frozen=True, kw_only=True):
         return tuple(coil.current_limit or self.current_limit for coil in self.slots)
 
     def map(self) -> CoilMap:
-        """Return the map from dipole moments to currents of a satellite's coils.
-
-        Raises ConfigError for a coil without dipole moment, and UsageError if all coils are parallel.
-        """
+        """Return the map from dipole moments to currents. Raises ConfigError and UsageError."""
         strength = np.array([coil.strength() for coil in self.slots])
         dipoles = np.array([coil.direction() for coil in self.slots]).T * strength
         return CoilMap(dipoles, np.array(self.limits), np.array(self.resistance))
@@ -755,10 +749,7 @@ SENSOR_PARTS: Mapping[str, str] = {
 
 
 def axis_matrix(names: Sequence[str]) -> FloatArray:
-    """Return the matrix (3, 3) from sensor axes to axes of the inertial unit.
-
-    The `names` are the signed sensor axes along the axes x, y and z of the unit.
-    """
+    """Return the matrix (3, 3) from sensor to unit axes, for the signed sensor axes along x, y and z."""
     return np.array([[(1.0, -1.0)[name[0] == "-"] * (name[-1] == axis) for axis in "xyz"] for name in names])
 
 

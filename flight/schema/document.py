@@ -439,10 +439,7 @@ def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
 
 
 def _struct_of(annotation: Any, tree: Any) -> Any:
-    """Return the struct class in an annotation such as `Camera | None` or `tuple[Step, ...]`.
-
-    If the annotation holds several tagged structs, return the struct whose tag is in `tree`.
-    """
+    """Return the struct class in an annotation, such as `Camera | None`, by the tag in `tree`."""
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         config = annotation.__struct_config__
         tag = tree.get(config.tag_field) if isinstance(tree, dict) and config.tag_field else config.tag
@@ -483,10 +480,7 @@ def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
 
 
 def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
-    """Return the types that a value at `key` or `index` may have within the type `kind`.
-
-    The type of a union's tag is the literal type of its permitted value.
-    """
+    """Return the types of `key` or `index` within the type `kind`; a union's tag has its literal type."""
     if isinstance(kind, inspect.StructType) and key:
         if key == kind.tag_field:
             return [inspect.LiteralType((kind.tag,))]

@@ -386,10 +386,7 @@ def _fly(verdict: CheckResult) -> None:
 
 
 def flight_problems(result: RunResult) -> list[str]:
-    """Return a text for each problem in the result of a flight.
-
-    Events and alarms are problems only if no faults were injected.
-    """
+    """Return the problems of a flight, with events and alarms only if no faults were injected."""
     ending = result.ending
     problems = [text for text in (result.log_error, result.restart, ending.coil_error) if text]
     if result.interrupted:

@@ -293,10 +293,7 @@ class SatelliteEstimation(BodyEstimation):
         self._renew_redundant_coils()
 
     def _renew_redundant_coils(self) -> None:
-        """Reset the learned matrix of more than three coils after a change of coils or allocation.
-
-        If only parallel coils are in use, the previously learned matrix is kept.
-        """
+        """Reset the learned matrix of redundant coils, unless only parallel coils are in use."""
         if not self._coils.is_redundant:
             return
         with suppress(UsageError):
@@ -330,10 +327,7 @@ class SatelliteEstimation(BodyEstimation):
         return estimate.rate
 
     def fastest_by_field(self) -> float:
-        """Return the likely maximum of the body rate (rad/s) from the magnetometer: estimate plus one sigma.
-
-        The result is infinite while the magnetometer gives no rate.
-        """
+        """Return the magnetometer's body rate (rad/s) plus one sigma, or infinity without a rate."""
         found = self.orbit_filter.rate_by_field()
         if found is None:
             return math.inf

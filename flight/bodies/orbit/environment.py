@@ -490,10 +490,7 @@ class StuckFieldCheck:
         return not self.stuck
 
     def text(self, refused: int) -> str:
-        """Return why the magnetometer is rejected, or an empty text.
-
-        The number `refused` counts consecutive field measurements that contradict the estimate.
-        """
+        """Return why the magnetometer, which was `refused` in a row, is rejected, or an empty text."""
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
         if refused < FIELDS_CONTRADICTED:

@@ -657,10 +657,7 @@ class CageTracker:
     def __init__(
         self, inner: Tracker, reader: ThreadReader, plant: SingleAxisPlant, field: CageField, dipole: float
     ) -> None:
-        """`inner` is a tracker for the constant field of `plant`.
-
-        `dipole` is the dipole moment of each coil per ampere: the number of turns times the area, m^2.
-        """
+        """Use a tracker for a constant field, and coils with `dipole` A m^2 per ampere."""
         self._inner = inner
         self._read = reader.read
         self._plant, self._field, self._dipole = plant, field, dipole

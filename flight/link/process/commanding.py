@@ -324,10 +324,7 @@ class Timetable:
         return entry
 
     def remove(self, number: int) -> None:
-        """Remove an entry from the stored schedule; the number 0 removes all entries.
-
-        Raises TimetableError if there is no such entry or if the schedule cannot be stored.
-        """
+        """Remove an entry, or all for 0, from the stored schedule. Raises TimetableError."""
         left = tuple(entry for entry in self._now.entries if number and entry.number != number)
         if number and len(left) == len(self._now.entries):
             raise TimetableError(f"no command is scheduled with the number {number}")
@@ -408,10 +405,7 @@ class Scheduling:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
 
     def due(self, utc_ns: int) -> Iterator[Report | Sent]:
-        """Yield each due command, or a report that states why the command is not executed.
-
-        Each entry is removed from the stored schedule before its command is yielded.
-        """
+        """Yield each due command after its entry was removed, or a report why it is not executed."""
         for entry in self._timetable.entries:
             unknown = self._mode is None and utc_ns - entry.at_ns <= LATEST_NS
             if entry.at_ns > utc_ns or unknown:

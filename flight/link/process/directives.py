@@ -401,10 +401,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
-    """Yield the segments of a packet, each as a packet with a unique time (UTC, ns) from `utc_ns` on.
-
-    Raises CommandError for a packet that is longer than eight segments.
-    """
+    """Yield packets with the segments of a packet, from `utc_ns` on. Raises CommandError beyond eight."""
     total = -(-len(packet) // _PORTION_BYTES)
     if len(packet) > LONGEST_IN_PORTIONS:
         raise CommandError(f"{len(packet)} bytes exceed the longest command")

@@ -124,10 +124,7 @@ class LogFollower:
 
 
 def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
-    """Yield the packets of a run from mission time `begin` to `end` (s), and empty bytes after each read.
-
-    Empty bytes let the caller interrupt a long search for the first packet.
-    """
+    """Yield packets of mission time `begin` to `end` (s), and b"" after each read, for interruptions."""
     begin_ns, end_ns = begin * 1e9, end * 1e9
     for path in _segments_from(folder, begin_ns):
         stream, offset = _PacketStream(), 0
@@ -295,10 +292,7 @@ class Downlink:
         self._queue.add(packet)
 
     def play(self, source: Iterator[bytes] | None) -> None:
-        """Play back the packets of `source` at the data rate that other traffic leaves free.
-
-        If `source` yields empty bytes, the playback continues at the next call of `frames`.
-        """
+        """Play back packets of `source` at the free data rate, until the next call at each b""."""
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:

@@ -315,10 +315,7 @@ class Renewal:
     """Interface to the privileged program `deploy/renewal.py`, with which it exchanges files."""
 
     def __init__(self, folder: Path, status: Path, command_loss: float) -> None:
-        """Use `folder` for requests and records, and read the reports in the file `status`.
-
-        The time `command_loss` (s) without an authentic frame is passed on to this program.
-        """
+        """Use `folder` for requests, the file `status` for reports; pass on `command_loss` (s)."""
         self._folder, self._status = folder, status
         self._limit = command_loss
         self._session = os.urandom(8).hex()

@@ -143,10 +143,7 @@ class UdpLine:
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the frames and senders of the received datagrams.
-
-        A datagram longer than a CLTU is cut to one byte more than the longest CLTU, so that it stays invalid.
-        """
+        """Return frames and senders; too long datagrams are cut to an invalid length."""
         found = []
         for _ in range(AT_MOST):
             try:
@@ -355,10 +352,7 @@ class SerialLine(Line):
     """Serial line to a radio for frames that follow sync markers, or are coded as configured."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing | None = None) -> None:
-        """Use an open serial port, which reopens automatically if the device is lost.
-
-        Without a `framing`, frames are not coded, and each frame follows a sync marker.
-        """
+        """Use an open port, which reopens itself; without `framing`, frames follow sync markers."""
         self.name, self._port = name, port
         self._framing = framing or LinkCodes().on_board()
         self._stream = self._framing.stream()
@@ -705,10 +699,7 @@ class Station:
         return self._clock.now_ns() + self._utc_offset_ns
 
     def _seal(self, header: bytes, data: bytes) -> bytes:
-        """Protect a frame with the primary telemetry SPI, or with the reserve SPI if the primary fails.
-
-        Raises FlightError if both SPIs fail.
-        """
+        """Protect a frame with the primary SPI, or else the reserve SPI. Raises FlightError."""
         problem: FlightError | None = None
         for sealer in self._sealers.values():
             try:

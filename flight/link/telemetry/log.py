@@ -394,10 +394,7 @@ class FlightLog:
         return self._store.dropped if self._store is not None else 0
 
     def error(self) -> str:
-        """Return the current problem and the number of lost packets, or an empty text if there is no problem.
-
-        A closed log reports a problem if any packet was lost.
-        """
+        """Return the present problem, or the loss of packets of a closed log, or an empty text."""
         problem = self._problem()
         waiting = len(self._queue)
         waits = f", {waiting} waiting" if problem and waiting else ""
@@ -493,10 +490,7 @@ class FlightLog:
 
 
 def _clear(folder: Path, stem: str, overwrite: bool) -> None:
-    """Create the folder of a log and remove an existing log of the same name.
-
-    Raises UsageError if the log exists and `overwrite` is false, and OSError if the folder cannot be written.
-    """
+    """Create the folder of a log, and remove an old log if `overwrite`. Raises UsageError and OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     old = find_segments(folder, stem)
     if old and not overwrite:
