@@ -206,9 +206,7 @@ class _Opened:
 
 
 def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None = None) -> RunResult:
-    """Fly a configuration to its end.
-
-    Raises UsageError for a mistake of the user, and DeviceError for a device that fails.
+    """Fly a configuration to its end. Raises UsageError, and DeviceError for a device that fails.
 
     On a flight computer, the start is retried until it succeeds. Raises StoppedError if a signal ends the
     attempts to start.
@@ -243,10 +241,9 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 
 
 def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:
-    """Return a flight that is ready to begin. `stack` closes it.
+    """Return a flight that is ready to begin; `stack` closes it.
 
-    A flight computer, which has an archive, first waits for the end of the separation inhibit, and then
-    retries the start until it succeeds.
+    A flight computer, which has an archive, waits for the end of the separation inhibit and retries.
     """
     judge = partial(_judge, request)
     if request.archive is None:

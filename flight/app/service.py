@@ -132,10 +132,9 @@ class StartRetry:
 def retried_start(
     judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
-    """Return the result of the first attempt that succeeds; `stack` closes the resources that it opens.
+    """Return the result of the first `attempt` that succeeds, whose resources `stack` closes.
 
-    Each attempt reads and validates a configuration with `judge`, and opens it with `attempt`. Raises
-    UsageError for an invalid configuration, and StoppedError after a signal.
+    Each attempt opens a configuration of `judge`. Raises UsageError, and StoppedError after a signal.
     """
     for pause in pauses():
         try:
@@ -392,11 +391,7 @@ class Supervision:
         coils: Ticker,
         settle: Callable[[], None] | None = None,
     ) -> None:
-        """Connect the supervisors with `coils`, the job of the coil driver.
-
-        The service manager shows the text `status` once the flight is ready. The function `settle` is called
-        once, when all parts of the flight exist, before READY is reported.
-        """
+        """Connect the supervisors with `coils`, the coil driver's job; `settle` runs once before READY."""
         self._guardian, self._overseer, self._clock = guardian, overseer, clock
         # A separate event log is used, because the loop does not exist yet, and no event needs a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
@@ -656,10 +651,9 @@ def _text(path: Path, data: bytes) -> str:
 
 
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
-    """Return the configuration as text and as values; only the values include the changes of the request.
+    """Return the configuration as text (`text`, or that of the file) and as values.
 
-    If `text`, the content of the file, is None, the file is read. Raises ConfigError for a mistake in the
-    file, and UsageError for a mistake in the request.
+    Only the values include the changes of the request. Raises ConfigError and UsageError.
     """
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))

@@ -144,11 +144,7 @@ class CommandError(FlightError):
 
 
 class MalformedError(CommandError):
-    """Raised for bytes that are not a command packet.
-
-    The flight software never answers malformed bytes, so that two flight processes cannot answer each other
-    endlessly.
-    """
+    """Raised for bytes that are not a command; never answered, so that two flights cannot answer forever."""
 
 
 class _Command:
@@ -613,10 +609,9 @@ class DatagramChannel:
 
 
 def open_unix(path: Path) -> DatagramChannel:
-    """Bind a UNIX datagram socket that owner and group may write to.
+    """Bind a UNIX datagram socket that owner and group may write to, in place of a stale socket file.
 
-    A stale socket file without a listening process is replaced. Raises UsageError if a file that is not a
-    socket has this path, if a process listens at this path, or if the socket cannot be bound.
+    Raises UsageError for another file, if a process listens at this path, or if binding fails.
     """
     try:
         bound = _bound_unix(path)

@@ -105,11 +105,7 @@ TELEMETRY_SPIS = (3, 4)
 
 
 def may_change(spi: int, changed: int) -> bool:
-    """Return whether a command of an SPI may change the key of the SPI `changed`.
-
-    Only the reserve SPI may change the keys of reserve SPIs, so that a stolen primary key cannot lock out the
-    reserve.
-    """
+    """Return whether an SPI may change a key: only the reserve SPI may change keys of reserve SPIs."""
     return spi == COMMAND_SPIS[1] or changed not in (COMMAND_SPIS[1], TELEMETRY_SPIS[1])
 
 

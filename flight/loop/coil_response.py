@@ -697,11 +697,9 @@ class CoilCorrection:
         return True
 
     def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
-        """Start from the factors (n,) of an earlier boot; return why they were rejected, or "".
+        """Start from factors (n,) of an earlier boot, with relative deviations (n,).
 
-        Args:
-            factors: signs and gains of the coils.
-            deviations: relative standard deviations of the gains.
+        Return why they were rejected, or "".
         """
         sizes = np.abs(factors)
         if factors.shape != self.factors.shape or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():

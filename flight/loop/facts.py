@@ -43,8 +43,7 @@ Reactor = Callable[[EventKind, int, str], None]
 class EventLog:
     """Passes events to a sink, and limits the number of written events of each kind.
 
-    The attributes `count` and `counts` include the events that were held back. The attribute `first_texts`
-    holds the text of the first event of each kind.
+    The attributes `count` and `counts` include held back events; `first_texts` are texts of first events.
     """
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:

@@ -247,11 +247,7 @@ _SHORTEST_LIMIT_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class WorkerWatch:
-    """A worker to watch.
-
-    The function `busy_since_ns` returns the start time (ns) of the running job, or None while the worker is
-    idle.
-    """
+    """A worker to watch; `busy_since_ns` returns when its job began (ns), or None while it is idle."""
 
     name: str
     busy_since_ns: Callable[[], int | None]

@@ -185,7 +185,7 @@ class ModeChange:
 
 
 class ModeMachine:
-    """State machine that determines, but does not carry out, mode changes; `since_ns` is the last one."""
+    """State machine that determines mode changes, without carrying them out; the last is at `since_ns`."""
 
     def __init__(self, table: Table = TRANSITIONS) -> None:
         """Begin in BOOT. Raises FlightError for an invalid transition table."""

@@ -69,11 +69,7 @@ _WRITE_TIMEOUT_S = 0.5  # maximum wait for a radio that is slower than the confi
 
 @dataclass(frozen=True, slots=True)
 class _JudgedLink:
-    """Values of a validated configuration.
-
-    The attribute `socket` is the command socket of the flight, `inhibit` the duration of the separation
-    inhibit, s, and `problem` the reason why a stored configuration replaces the requested file.
-    """
+    """Values of a valid configuration: `link` section, command `socket` of the flight, and `inhibit` (s)."""
 
     link: Link
     socket: Path
@@ -108,11 +104,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def link(options: argparse.Namespace) -> int:
-    """Open the lines, with retries until this succeeds, and run the link until a signal arrives.
-
-    Raises ConfigError for an invalid configuration. Any other problem ends the process, which the service
-    manager then restarts.
-    """
+    """Run the link until a signal arrives. Raises ConfigError; any other error ends with a restart."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -196,11 +188,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
 
 
 def _witness(keys: Path) -> Path:
-    """Return the path of the reference folder, whose records reveal outdated keys.
-
-    The module `flight.link.security` describes this folder. A service uses its second state folder, and any
-    other process uses a folder beside the keys.
-    """
+    """Return the second state folder of a service, or else a folder beside the keys, for the reference."""
     folders = os.environ.get("STATE_DIRECTORY", "").split(":")
     return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"
 

@@ -347,8 +347,7 @@ def check(options: argparse.Namespace) -> int:
 def check_values(config: Config) -> None:
     """Raise ConfigError for a configuration that cannot be flown, regardless of which devices respond.
 
-    For example, the configuration of a satellite must contain a GPS receiver or two-line elements, because
-    every plan predicts the magnetic field along the orbit.
+    Every plan of a satellite needs a GPS receiver or two-line elements to predict the magnetic field.
     """
     from flight.app.flight import body_kind  # noqa: PLC0415
 

@@ -346,11 +346,7 @@ def horizon_camera_feed(
 def _spread(
     sight: VectorObservation, turn: FloatArray, claim: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compare a direction with an attitude matrix (3, 3).
-
-    Return the deviation (2,) of the direction, its covariance (2, 2), and the covariance (2, 2) due to the
-    attitude.
-    """
+    """Return deviation (2,) and covariance (2, 2) of a direction, and the attitude's covariance (2, 2)."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
     # A small rotation e changes a direction d by the cross product d x e.

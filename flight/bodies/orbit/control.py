@@ -85,8 +85,7 @@ def expected_field(
 ) -> Callable[[int], FieldPrediction | None]:
     """Return a function that predicts the magnetic field at `instants` (n,), s, after a time.
 
-    The predicted field is given in the body axes at the time of the prediction, or in ICRS while the attitude
-    is unknown. The returned function gives None while the orbit is unknown.
+    The field is in body axes, or in ICRS while the attitude is unknown. It is None without an orbit.
     """
     field = FieldAhead()
 

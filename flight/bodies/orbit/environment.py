@@ -211,11 +211,7 @@ class EstimatedEnvironment:
 
     @property
     def clock_doubt(self) -> str:
-        """The reason to doubt the host's clock, or an empty text.
-
-        Before the first fix, the clock is doubted if its date is more than `EARLIEST` days before the
-        elements' epoch.
-        """
+        """Why the clock is doubted before the first fix: it is `EARLIEST` days before the elements; or ""."""
         if self._utc_offset_ns is not None or self._elements is None:
             return ""
         early = self._elements.epoch - UNIX_EPOCH - self._clock.utc_ns() / (DAY * SECOND_NS)
@@ -224,11 +220,7 @@ class EstimatedEnvironment:
         return f"the wall clock is {early:.1f} days before the epoch of the elements: the orbit is unknown"
 
     def julian_date(self, now_ns: int) -> float:
-        """Return the Julian date (UTC) at a time of the host's clock.
-
-        After the first fix, the date follows the GPS receiver. Before it, the date is that of the host's
-        clock.
-        """
+        """Return the Julian date (UTC) at a time, by the GPS receiver or, before a fix, the host's clock."""
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
@@ -437,11 +429,7 @@ class EstimatedEnvironment:
         return False
 
     def _agrees_with_elements(self, fix: GpsFix) -> bool:
-        """Return whether a fix agrees with the elements.
-
-        True is returned without a comparison if the elements are missing, or if confirmed fixes contradicted
-        them.
-        """
+        """Return whether a fix agrees with the elements, or these are missing or contradicted."""
         elements = self._elements
         return elements is None or self._enlarged > 1.0 or _agree(elements, fix, LEAST_GATE)
 
@@ -490,7 +478,7 @@ class StuckFieldCheck:
         return not self.stuck
 
     def text(self, refused: int) -> str:
-        """Return why the magnetometer, which was `refused` in a row, is rejected, or an empty text."""
+        """Return why the magnetometer is rejected after `refused` contradictions, or an empty text."""
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
         if refused < FIELDS_CONTRADICTED:

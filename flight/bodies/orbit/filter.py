@@ -109,8 +109,7 @@ def start_from(
 ) -> tuple[SlowStates, list[str]]:
     """Return the prior of the slow states at a time (UTC, s), and why learned states were rejected.
 
-    The residual dipole that is expected before the first boot is `dipole` (3,), A m^2. Between two boots,
-    each state may have changed by the fraction `changed` of its initial standard deviation.
+    The expected residual dipole is `dipole` (3,), A m^2. States change by `changed` initial sigmas at a boot.
     """
     initial, walks = layout.prior[SLOW, SLOW], layout.walks[SLOW]
     prior = SlowStates(np.zeros(len(initial)), initial.copy())
@@ -264,8 +263,7 @@ class StepReplay:
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
         """Multiply the assumed dipoles of the coils by `change` (n,), and process the steps again.
 
-        The learned matrix of these coils is reset. The steps in which a corrected coil was driven have
-        unknown dipoles, because the coil may have changed during these steps.
+        The dipoles of steps that drove these coils become unknown, because the coils may have changed.
         """
         coils, changed = self._settings.coils, np.flatnonzero(change != 1.0)
         for step in self.steps:
@@ -341,8 +339,7 @@ class StepReplay:
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
         """Return the newest field with the mean gyro rate (3,), rad/s, of its step, or None without a field.
 
-        The covariance of the field includes the unknown magnetometer bias, because the field is used to start
-        an estimate.
+        Its covariance includes the unknown magnetometer bias.
         """
         step = next((step for step in reversed(self.steps) if step.field is not None), None)
         if step is None or step.field is None:
@@ -656,10 +653,9 @@ class OrbitFilter:
         return RateByField(found.rate, found.covariance[RATE, RATE] + change**2 * _EYE)
 
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
-        """Start from an attitude, and return whether the attitude was used.
+        """Start from a finite attitude within the history, and return whether the attitude was used.
 
-        The attitude must be finite, and its time must be within the history. The flag `doubted` states
-        whether the previous estimate was contradicted, which makes its learned states less accurate.
+        The previous estimate was contradicted if `doubted`, which makes its learned states less accurate.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)

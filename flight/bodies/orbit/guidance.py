@@ -94,11 +94,7 @@ class PointingPaths:
     """
 
     def __init__(self, limit: float | FloatArray, fastest: float) -> None:
-        """Start without a path.
-
-        The value `limit` is the largest mean dipole (A m^2) over a control window, either one value for all
-        body axes or one per axis (3,). The value `fastest` is the largest permitted rate (rad/s) of a path.
-        """
+        """Start without a path; `limit` is the largest mean dipole, `fastest` the largest rate (rad/s)."""
         self._limit, self._fastest = limit, fastest
         self._followed: _Followed | None = None
         self._next: _Followed | None = None
@@ -296,11 +292,7 @@ class ObjectAim:
     """Adapts the planner's jobs to an object it `seeks`, whose track has `moved` since the last plan."""
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """Start without an object.
-
-        The value `limit` (A m^2) is the mean over the body axes of the largest dipole. The argument `sensor`
-        is None for a satellite that does not search for objects.
-        """
+        """Start without an object; without a search, `sensor` is None. `limit` is the mean dipole limit."""
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
         self._place: FloatArray | None = None
@@ -337,11 +329,7 @@ class ObjectAim:
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return the planner's job for a target.
-
-        If the target is an object, the planned path points the boresight at the track of the object. Without
-        a track, it points the boresight in the search direction.
-        """
+        """Return a job that points the boresight at the object's track, or in the search direction."""
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:
@@ -439,10 +427,9 @@ nearly every possible torque."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
-    """The planner's model of the satellite.
+    """The planner's model of the satellite, with the inertia tensor (3, 3), kg m^2, in body axes.
 
-    The inertia tensor is `inertia` (3, 3), kg m^2, in body axes. The value `duty` is the fraction of a
-    control window in which the `coils` are driven. The request `slew` holds the constraints of every slew.
+    The coils are driven in the fraction `duty` of a control window; `slew` holds the constraints of slews.
     """
 
     inertia: FloatArray

@@ -293,11 +293,7 @@ class PropagatedEstimate(Estimate):
 
 
 class EstimatePropagation:
-    """Propagates a filter's estimates to times within a filter step.
-
-    The covariance of a propagated estimate takes several times as long as the attitude and the rate, and is
-    computed only if it is read.
-    """
+    """Propagates estimates to times within a step; covariances, which are slow, only if they are read."""
 
     def __init__(self, free: FreeFilter) -> None:
         self._free = free
@@ -392,10 +388,9 @@ class EstimatePropagation:
 
 
 def _moved(begun: _Beginning, seconds: float, dipole: FloatArray) -> _Motion:
-    """Return the motion during `seconds` under a commanded dipole (3,), A m^2.
+    """Return the motion during `seconds` under a dipole (3,), A m^2, by the midpoint rule.
 
-    The midpoint rule is used, because rate and torque change their directions during a step. The code uses
-    plain floats, because for three components numpy takes ten times as long.
+    The code uses plain floats, because for three components numpy takes ten times as long.
     """
     x, y, z = dipole.tolist()
     half, rate = 0.5 * seconds, begun.rate

@@ -252,8 +252,7 @@ class TestbedEstimation(BodyEstimation):
     def is_accurate(self, estimate: Estimate) -> bool:
         """Return whether an estimate is accurate enough to verify an arrival at the target.
 
-        The test uses three standard deviations of the angle, but only one of the rate: an angle error
-        displaces the body, while rate noise averages out within seconds.
+        Three sigmas of the angle, but one of the rate are compared, because rate noise averages out soon.
         """
         variances = estimate.covariance.diagonal()
         largest = np.array([variances[ATTITUDE].max(), variances[RATE].max()])

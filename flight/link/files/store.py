@@ -32,8 +32,7 @@ from knightcube.errors import FlightError, UsageError
 def read_regular(path: Path, most: int) -> bytes | None:
     """Return the content of a file of at most `most` bytes, or None if the file does not exist.
 
-    The file's type and size are checked before reading. Raises OSError for a file longer than `most` bytes
-    and for a path that is not a regular file.
+    Type and size are checked first. Raises OSError, also for a longer file or one that is not regular.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -131,11 +130,7 @@ class FileError(FlightError):
 
 
 class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Stored state of an outgoing transfer.
-
-    The receiver stores the file `path` under the name `name`. The attribute `origin` identifies the command
-    that started the transfer.
-    """
+    """State of an outgoing transfer of the file `path` as `name`, for the command with the `origin`."""
 
     number: _Long
     destination: _Entity

@@ -589,11 +589,7 @@ NOBODY = Origin()
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a file transfer.
-
-    The attribute `condition` is None while the transfer is open. The attribute `said` is a text that
-    describes how the transfer ended, or that it is suspended.
-    """
+    """Progress of a file transfer, open if `condition` is None; `said` describes its end or suspension."""
 
     outgoing: bool
     source: int
@@ -639,10 +635,9 @@ class Entity:
     def send(
         self, path: Path, name: str, destination: int, kind: int, utc_ns: int, now_ns: int, origin: Origin
     ) -> Progress:
-        """Begin or continue to send a file with a checksum of type `kind`.
+        """Begin to send a file with a checksum of type `kind`. Raises FileError.
 
-        If a transfer of this file is already open, it is resumed, and metadata and EOF are sent again, so
-        that the receiver requests the missing ranges. Raises FileError if the file cannot be sent.
+        An open transfer of this file is resumed by metadata and EOF, for requests of the missing ranges.
         """
         try:
             facts = path.stat()

@@ -260,10 +260,9 @@ class TimetableError(FlightError):
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Schedule entry: a command in words and its due time `at_ns`, UTC in ns since 1970.
+    """Schedule entry, with the numbers from 1: a command in words, due at `at_ns`, UTC in ns since 1970.
 
-    Entries have numbers from 1, by which they can be deleted. The values `spi` and `counter` are those of the
-    frame that contained the scheduling command.
+    The values `spi` and `counter` are those of the frame that contained the scheduling command.
     """
 
     number: _Count
@@ -274,11 +273,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Stored copy of the schedule.
-
-    If two copies differ, the copy with the higher version is used. The attribute `last` is the last assigned
-    entry number.
-    """
+    """Stored copy of the schedule with the last entry number; the copy with the higher version counts."""
 
     version: _Count = 0
     last: _Count = 0

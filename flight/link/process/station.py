@@ -681,8 +681,7 @@ class Station:
     def _follow_utc(self, label: bytes, mission_offset_ns: int) -> None:
         """Update the newest run packet, and the offset (ns) of the flight's UTC from the host's clock.
 
-        Each packet gives an offset that is too small by the packet's delay in the log, so the largest offset
-        is the most accurate one.
+        The largest offset is the most accurate one, because packets are delayed in the log.
         """
         if label != self._label:
             self._label, self._utc_offset_ns = label, None

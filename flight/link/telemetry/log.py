@@ -309,11 +309,7 @@ _RECENT_NS = 2_000_000_000
 
 
 class FlightLog:
-    """Log in a folder, with a bounded queue that a periodic task (ticker) writes to disk.
-
-    Only one thread may call `write`. The content of the files depends only on the packets, not on the times
-    at which the queue is written.
-    """
+    """Log with a bounded queue for one thread, which a ticker writes; contents do not depend on timing."""
 
     def __init__(
         self,

@@ -56,10 +56,9 @@ def to_text(value: bytes) -> str:
 
 
 def _to_bytes(value: object, size: int) -> bytes:
-    """Return a text as UTF-8, truncated between characters to less than `size` bytes.
+    """Return a text as UTF-8 of less than `size` bytes, for clients that need a terminating zero.
 
-    Characters that cannot be encoded become '?'. At least one zero byte remains after the text, because
-    clients of the XTCE definition need a terminating zero.
+    The text is truncated between characters. Characters that cannot be encoded become '?'.
     """
     if not isinstance(value, str):
         raise TypeError("a text is needed")
