@@ -356,6 +356,9 @@ class PerformanceObserver:
         )
 
 
+_LINE_COUNTERS = ("packets", "bad_checksum", "discarded_bytes", "out_of_range", "not_finite")
+
+
 class Housekeeping:
     """Writes the housekeeping packet once a second."""
 
@@ -394,11 +397,7 @@ class Housekeeping:
             HOUSEKEEPING,
             now_ns,
             state=int(state),
-            imu_packets=link.packets,
-            imu_bad_checksum=link.bad_checksum,
-            imu_discarded_bytes=link.discarded_bytes,
-            imu_out_of_range=link.out_of_range,
-            imu_not_finite=link.not_finite,
+            **{f"imu_{name}": getattr(link, name) for name in _LINE_COUNTERS},
             coil_faults=self._coils.state().faults,
             coil_voltage=reading.voltage if reading else math.nan,
             coil_current=reading.current if reading else math.nan,
@@ -422,6 +421,8 @@ class Housekeeping:
 
 RUNS_PER_PACKET = 4
 _FAILING_CYCLES = 60
+_RECORDED_STREAMS = ("imu", "field", "coils", "power", "camera")
+_RECORDED_RESOURCES = ("resident", "proportional", "disk_free", "temperature")
 _WORKER_EVENTS = {
     WorkerChange.DIED: events.WORKER_DIED,
     WorkerChange.READY: events.WORKER_READY,
@@ -537,22 +538,15 @@ class HealthWatch:
             now_ns,
             mode=int(self._modes.mode),
             mode_age=(now_ns - self._modes.since_ns) * 1e-9,
-            imu=int(streams.state("imu", now_ns)),
-            field=int(streams.state("field", now_ns)),
-            coils=int(streams.state("coils", now_ns)),
-            power=int(streams.state("power", now_ns)),
-            camera=int(streams.state("camera", now_ns)),
             facts=sum(self._facts.holds(fact) << bit for bit, fact in enumerate(FACTS)),
             coils_in_use=sum(int(used) << axis for axis, used in enumerate(self._drive.available)),
             fed=self._fed,
             slips=self._control.slips,
             clock_steps=self._clock_watch.steps,
             cpu_share=state.cpu_share,
-            resident=sample.resident if sample else math.nan,
-            proportional=sample.proportional if sample else math.nan,
             memory_slope=state.memory_slope,
-            disk_free=sample.disk_free if sample else math.nan,
-            temperature=sample.temperature if sample else math.nan,
+            **{name: int(streams.state(name, now_ns)) for name in _RECORDED_STREAMS},
+            **{name: getattr(sample, name) if sample else math.nan for name in _RECORDED_RESOURCES},
         )
 
 

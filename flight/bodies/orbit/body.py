@@ -636,11 +636,7 @@ class ComparedFeed:
     def __init__(
         self, feed: ReadingFeed, filter_: OrbitFilter, config: OrbitConfig, services: Services
     ) -> None:
-        from knightcube.reference.sensor_fusion import (  # noqa: PLC0415 - seldom needed
-            GyroBiasFilter,
-            KnownAttitude,
-            SeparateDetermination,
-        )
+        from knightcube.reference.sensor_fusion import GyroBiasFilter, KnownAttitude, SeparateDetermination  # noqa: PLC0415 - seldom needed
 
         unit, section = config.inertial_unit, config.estimation
         noise = unit.rate_noise / np.sqrt(unit.rate_hz)
