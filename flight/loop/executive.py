@@ -436,9 +436,7 @@ class WorkerProcess:
             with suppress(subprocess.TimeoutExpired):  # the process may still be writing while it ends
                 status = self._process.wait(0.05)
         self._process.kill()
-        with suppress(
-            subprocess.TimeoutExpired
-        ):  # a process that hangs in the kernel is reaped at a later start
+        with suppress(subprocess.TimeoutExpired):  # one that hangs in the kernel is reaped at a later start
             self._process.wait(_REAPED_WITHIN_S)
         self._socket.close()
         self._slab.close()
@@ -605,10 +603,7 @@ class ProcessRunner:
         return {name: process.process_id for name, process in running if process is not None}
 
     def _supervise(self) -> None:
-        """Serve the workers until `close` is called.
-
-        The kernel kills the workers when the thread that started them ends.
-        """
+        """Serve the workers until `close`; the kernel kills them when the thread that started them ends."""
         while not self._closing.is_set():
             for kept in self._kept.values():
                 results, news = kept.serve()

@@ -341,9 +341,7 @@ class StreamWatch:
     def note(self, time_ns: int, value: float | None = None) -> None:
         """Record a reading made at `time_ns`, and the value that must be within the valid range."""
         if self._times and time_ns - self._times[-1] > self._window_ns // 2:
-            self._since_ns = (
-                time_ns  # after a gap, the rate is measured again; the gap itself makes the stream stale
-            )
+            self._since_ns = time_ns  # after a gap, which makes the stream stale, the rate is measured again
         self._times.append(time_ns)
         if value is not None:
             self._valid = self.stream.low <= value <= self.stream.high  # NaN compares false

@@ -191,13 +191,11 @@ class FrameMeasurer:
         if past is None:
             return None, None
         rate_sigma = math.sqrt(max(float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1]), 0.0))
-        course, spanning = (
-            None,
-            self._navigation.rates(frame.exposure_start_ns, frame.exposure_start_ns + frame.exposure_ns),
-        )
+        begin_ns, course = frame.exposure_start_ns, None
+        spanning = self._navigation.rates(begin_ns, begin_ns + frame.exposure_ns)
         if spanning is not None:
             times, rates = spanning
-            at = np.linspace(0.0, frame.exposure_ns, _COURSE_NODES) + (frame.exposure_start_ns - times[0])
+            at = np.linspace(0.0, frame.exposure_ns, _COURSE_NODES) + (begin_ns - times[0])
             even = np.stack([np.interp(at, times - times[0], rate) for rate in rates.T], axis=1)
             course = Course.of_rates(even @ self._body_to_camera.T, frame.exposure_ns * 1e-9, rate_sigma)
         widest = float(np.linalg.eigvalsh(past.covariance[ATTITUDE, ATTITUDE])[-1])

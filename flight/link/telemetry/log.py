@@ -348,9 +348,7 @@ class FlightLog:
         self._retry_ns = 0
         self._busy_since_ns: int | None = None
         self._closed = False
-        self._draining = (
-            threading.Lock()
-        )  # lock held while the queue is written to disk, never taken by write()
+        self._draining = threading.Lock()  # held while the queue is written to disk, never taken by write()
         self._store: SegmentStore | None = None
 
         def begin() -> SegmentStore:
