@@ -10,7 +10,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,7 @@ from flight.link.security import (
 from flight.link.telemetry.packets import CRC_BYTES
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse, peer_networks
-from flight.schema.sections import Link
+from flight.schema.sections import Config, Link
 from hal.buses.linux_wires import PySerialPort
 from hal.buses.system import ServiceManager, SystemClock
 from hal.interfaces.wires import SECOND_NS
@@ -65,24 +64,6 @@ from knightcube.errors import FlightError, UsageError
 
 _NICE = 10
 _WRITE_TIMEOUT_S = 0.5  # maximum wait for a radio that is slower than the configured rate
-
-
-@dataclass(frozen=True, slots=True)
-class _JudgedLink:
-    """Values of a valid configuration: `link` section, command `socket` of the flight, and `inhibit` (s)."""
-
-    link: Link
-    socket: Path
-    inhibit: float
-    problem: str
-
-
-@dataclass(frozen=True, slots=True)
-class _OpenedLink:
-    """An opened link, and the names of its communication lines as text for the log."""
-
-    station: Station
-    names: str
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -127,38 +108,43 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
         retry = StartRetry(ended)
         stack.callback(retry.close)
         inhibit = SeparationInhibit(SystemClock())
-        opened = retried_start(partial(_judge, config, log), partial(_open, log, inhibit), stack, retry)
+        judge, attempt = partial(_judge, config, log), partial(_open, log, inhibit)
+        station, names = retried_start(judge, attempt, stack, retry)
         overseer = ServiceManager(os.environ, os.getpid())
         stack.callback(overseer.close)
         stack.callback(overseer.stopping)
-        status = f"link open on {opened.names}"
+        status = f"link open on {names}"
         _say("; ".join(filter(None, (status, retry.summary()))))
         overseer.ready(status)
         release = FlownRelease(os.environ)
         if release.note:
-            opened.station.report_problem("release", release.note)
+            station.report_problem("release", release.note)
         release.serve(SystemClock(), stack)
-        opened.station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
+        station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
         release.end()
 
 
-def _judge(config_path: Path, log: Path) -> _JudgedLink:
-    """Read and validate the configuration of the link. Raises UnreadConfigError and ConfigError."""
+def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
+    """Return a valid configuration, and why it replaces the requested one. Raises ConfigError."""
     # A service stores the flown configurations in the folder that also contains its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
         raise ConfigError(str(chosen.path), "no `link` section: there is nothing to connect")
-    socket, inhibit = Path(config.commands.socket), config.separation.inhibit
-    return _JudgedLink(config.link, socket, inhibit, chosen.problem)
+    return config, chosen.problem
 
 
-def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
-    """Open keys and lines after the separation inhibit. Raises errors of problems that may be temporary."""
-    if judged.problem:
-        _say(judged.problem)
-    section, clock = judged.link, SystemClock()
-    inhibit.check(Path(section.keys).absolute().parent, judged.inhibit)
+def _open(
+    log: Path, inhibit: SeparationInhibit, judged: tuple[Config, str], stack: ExitStack
+) -> tuple[Station, str]:
+    """Open the station and name its lines after the inhibit. Errors may be temporary problems."""
+    (config, problem), clock = judged, SystemClock()
+    section, commands = config.link, config.commands.socket
+    assert section is not None
+    assert commands is not None
+    if problem:
+        _say(problem)
+    inhibit.check(Path(section.keys).absolute().parent, config.separation.inhibit)
     vault = Vault(Path(section.keys), _witness(Path(section.keys)))
     if vault.restored:
         _say(f"{section.keys}: {RESTORED}")
@@ -173,7 +159,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
     folder = os.environ.get("RUNTIME_DIRECTORY") or stack.enter_context(
         tempfile.TemporaryDirectory(prefix="knightcube-")
     )
-    control: ControlLine[Sent] = ControlLine(judged.socket, Path(folder))
+    control: ControlLine[Sent] = ControlLine(Path(commands), Path(folder))
     settings = StationSettings(
         section.spacecraft,
         section.frame_bytes,
@@ -184,7 +170,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
         codes=codes,
     )
     station = Station(settings, vault, lines, control, LogFollower(log), clock)
-    return _OpenedLink(station, ", ".join(line.name for line in lines))
+    return station, ", ".join(line.name for line in lines)
 
 
 def _witness(keys: Path) -> Path:
