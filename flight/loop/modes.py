@@ -236,10 +236,8 @@ class HoldTimer:
 class AttitudeWatch:
     """Triggers changes between acquisition and pointing, and controls what a body does in the mode SAFE.
 
-    Attributes:
-        follows: mode that follows the acquisition, or None if the body stays in ACQUIRE.
-        detumbles: whether a body in SAFE is being detumbled.
-        acquires_sun: whether a body in SAFE is being turned to the Sun.
+    The mode `follows` comes after the acquisition, or is None. In SAFE, the flags `detumbles` and
+    `acquires_sun` state whether the body is being detumbled or turned to the Sun.
     """
 
     def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
@@ -370,11 +368,7 @@ class ModeControl:
     def __init__(
         self, settings: ModeSettings, body: FlightBody, steering: Steering, services: Services
     ) -> None:
-        """Connect the state machine with the body, the steering and the event log.
-
-        Raises FlightError for a monitored condition whose event triggers a reaction without effect. Raises
-        ConfigError for an initial mode that the body does not have.
-        """
+        """Connect the machine with body, steering and events. Raises FlightError and ConfigError."""
         facts.check(facts.FACTS, modes_moved_by)
         self._settings = settings.modes
         self._stop = settings.stop
@@ -498,10 +492,9 @@ class ModeControl:
         return self.mode
 
     def command(self, mode: Mode, now_ns: int, wanted: float | PointingTarget | None = None) -> str:
-        """Execute a mode command, and return why it is refused, or an empty text.
+        """Execute a mode command with the target `wanted`, and return why it is refused, or an empty text.
 
-        The value `wanted` is the target of SLEW or POINT. After a command POINT without a target, the body
-        follows the configured targets again.
+        After a command POINT without a target, the body follows the configured targets again.
         """
         trigger = COMMANDS.get(mode)
         if trigger is None or mode not in self._modes:

@@ -106,8 +106,7 @@ class CoilKnowledge:
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
         """Return which currents are known, from the driver's state and the time since the last call.
 
-        `suspected` states whether the supply current contradicts a healthy circuit; if so, a coil may carry
-        any current.
+        A coil may carry any current if a supply current is `suspected` to contradict a healthy circuit.
         """
         obeyed, self._obeys = self._obeys, not in_force.error
         was_suspected, self._suspected = self._suspected, suspected
@@ -300,11 +299,7 @@ class Navigation:
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
-        """Apply the measurements of a frame at their times, over the next cycles.
-
-        The function `report` is called now or in a later cycle with flags that state which measurements
-        passed the gate.
-        """
+        """Apply measurements of a frame over the next cycles; `report` gets flags of those accepted."""
         if self._filter.started:
             self._filter.measure_late(late, report)
         else:

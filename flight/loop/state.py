@@ -193,8 +193,7 @@ class Noted:
 def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
     """Return the state of the next boot, marked as running; a crash of the last boot is recorded in it.
 
-    Parameters that were learned for other `devices` are discarded. After a crash, a table that is not proven
-    is replaced by the previous table.
+    Parameters of other `devices` are discarded. After a crash, the previous table replaces an unproven one.
     """
     unclean = state.unclean
     if state.running:
@@ -275,8 +274,7 @@ def start_from(
 ) -> tuple[SlowPrior, list[str]]:
     """Return the filter's prior, and the reasons why learned parameters were rejected.
 
-    The prior without learned parameters is `configured`. A value may have changed since the last boot. The
-    standard deviation of this change is `changed` times the standard deviation of the value in `configured`.
+    Without learned parameters, the prior is `configured`. Values may have changed by `changed` of its sigmas.
     """
     problems: list[str] = []
 
@@ -519,11 +517,8 @@ class Notices:
 class StateKeeper:
     """Keeps the stored state up to date from the start of a boot to its end.
 
-    Attributes:
-        record: information about earlier boots.
-        learned: parameters that earlier boots learned, by name.
-        counted: whether the number of this boot was written to disk.
-        table: table of onboard parameters to be used.
+    The `record` and the parameters `learned` are those of earlier boots. The flag `counted` states whether
+    the number of this boot was written. The `table` of onboard parameters is to be used.
     """
 
     def __init__(

@@ -49,11 +49,7 @@ class CoilDriveSettings:
 
 
 class CoilDrive:
-    """Commands the coils, and monitors their response.
-
-    The command of this cycle has the effective currents `command` (n,), A. The flags `available` (n,) mark
-    the axes that are not excluded.
-    """
+    """Commands the `available` coils with effective currents (n,), A, and monitors their response."""
 
     def __init__(
         self,
@@ -108,8 +104,7 @@ class CoilDrive:
     ) -> None:
         """Compare the command in force with supply current and motion; called once in each control cycle.
 
-        If `known` is false, the coil currents since the last cycle are unknown, and all earlier evidence is
-        discarded.
+        All earlier evidence is discarded unless the currents since the last cycle are `known`.
         """
         watch = self._watch
         if in_force.written_ns >= 0:
@@ -164,11 +159,7 @@ class CoilDrive:
     def send(
         self, currents: FloatArray, field: Callable[[], FloatArray | None], *, testable: bool = False
     ) -> None:
-        """Command the currents (3,) A per axis. If the coils are `testable`, a self-test may replace them.
-
-        The function `field` returns the magnetic field (3,), T, in body axes, for the reallocation of
-        currents.
-        """
+        """Command the currents (3,), A, which a self-test may replace, reallocated in the `field` (3,), T."""
         watch, settings = self._watch, self._settings
         sizes = watch.correction.sizes
         # A weak coil reaches its limit at a smaller effective current.

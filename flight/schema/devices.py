@@ -609,10 +609,9 @@ def camera_model(camera: Camera | WideCamera) -> CameraModel:
 
 
 def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
-    """Return the mask (rows, columns) of the pixels that show the spacecraft itself.
+    """Return the mask (rows, columns) of the pixels that show the spacecraft, without `of_file` by polygons.
 
-    Without `of_file`, only the polygons are used. Raises UsageError for a file that cannot be read or has
-    another size, and if more than half of the image is hidden.
+    Raises UsageError for a wrong file, and if more than half of the image is hidden.
     """
     mask = polygon_mask(camera.rows, camera.columns, camera.structure)
     if of_file and camera.structure_file is not None:
@@ -764,8 +763,7 @@ def fitted_devices(config: Any) -> list[tuple[str, str, Any]]:
 def driver_of(kind: str, section: Any, key: str = "") -> Driver:
     """Return the registration of the driver that a section names. Raises ConfigError.
 
-    On a flight computer, only built-in drivers and permitted objects are imported
-    (`flight.schema.document.imported`).
+    A flight computer imports only permitted objects (`flight.schema.document.imported`).
     """
     named = getattr(section, "driver", None) or section.__struct_config__.tag
     return _named(kind, named, key or f"{kind}.driver")

@@ -83,12 +83,9 @@ configuration may import, in addition to the known objects."""
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
-    """Return an object that a configuration names as `module:object`, or by a key of `known`.
+    """Return the object `module:object`, or that of a key of `known`. Raises ConfigError.
 
-    On a flight computer, only known objects and those in the file of the variable `KNIGHTCUBE_MODULES` are
-    imported.
-
-    Raises ConfigError for an object that is not permitted or cannot be imported.
+    A flight computer imports only known objects and those in the file of the variable `KNIGHTCUBE_MODULES`.
     """
     place = known.get(named, named)
     module, colon, name = place.partition(":")

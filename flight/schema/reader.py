@@ -385,10 +385,9 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
 
 
 def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
-    """Return the networks from which the link accepts frames; without UDP, TCP and KISS there are none.
+    """Return the networks from which the link accepts frames, as its sandbox does. Raises ValueError.
 
-    The sandbox of the systemd service (`deploy/board_dropin.py`) blocks packets of all other networks. Raises
-    ValueError for an invalid network, and for an address that requires `link.peers`.
+    Without UDP, TCP and KISS there are none.
     """
     lines = (link.udp, link.tcp, link.kiss) if link.peers is None else (link.kiss,)
     hosts = [address.rpartition(":")[0] for address in lines if address is not None]
@@ -487,11 +486,7 @@ def placed(error: UsageError, text: str, name: str) -> UsageError:
 
 
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
-    """Return the `simulation` section of a configuration text as `shape`, or None if there is none.
-
-    The type `shape` of the `simulation` section is defined by the simulator, which this package does not
-    import. Raises ConfigError.
-    """
+    """Return the `simulation` section as the simulator's type `shape`, or None. Raises ConfigError."""
     document = read_document(text, name)
     return None if document.values.get("simulation") is None else convert(document, shape, "simulation")
 
