@@ -432,7 +432,7 @@ def _saturation(camera: Camera) -> float:
 
 
 def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
-    """Return the estimator of rates from streaks that a camera selects. Raises ConfigError if absent."""
+    """Return the estimator of rates from streaks that a camera selects. Raises ConfigError without one."""
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))
     if body.streak_estimator is None:

@@ -79,7 +79,7 @@ _DUAL_BASE_ROOT = 117  # exponent of beta = alpha^117; the basis of the symbols 
 
 
 class ReedSolomon:
-    """Code (255,223) of CCSDS 131.0-B-5, 4, dual basis; counts corrected symbols and lost codewords."""
+    """Reed-Solomon code (255,223) in the dual basis (CCSDS 131.0-B-5, section 4), with error counts."""
 
     def __init__(self, depth: int) -> None:
         """Prepare a code that interleaves `depth` codewords."""
@@ -331,7 +331,7 @@ class CltuStream:
 
 
 class CommandCode:
-    """Code of telecommands: CLTUs with or without pseudo-randomiser, or none; `corrected` counts bits."""
+    """Code of telecommands: CLTUs, randomised or not, or no code; `corrected` is the number of wrong bits."""
 
     def __init__(self, cltu_kind: str | None) -> None:
         """Encode frames in CLTUs of the kind "plain" or "randomised", or not at all for None."""

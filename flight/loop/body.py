@@ -146,7 +146,7 @@ class ReadingAgreement:
 
 @dataclass(frozen=True, slots=True)
 class FixVerdict:
-    """Whether a GPS fix is used, or why it is refused; another fix, with no refusal, awaits further fixes."""
+    """Use of a GPS fix: used, refused for a reason, or, without a `refusal`, awaiting further fixes."""
 
     used: bool = False
     refusal: str = ""
@@ -382,7 +382,7 @@ class BodyEstimation(Protocol):
         return True
 
     def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
-        """Return the rate (3,), rad/s, that replaces the gyro's, or None; the default needs no rate."""
+        """Return the rate (3,), rad/s, that replaces the gyro's, or None, as by default."""
         return None
 
     def fastest_by_field(self) -> float:

@@ -137,7 +137,7 @@ def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
 def _open(
     log: Path, inhibit: SeparationInhibit, judged: tuple[Config, str], stack: ExitStack
 ) -> tuple[Station, str]:
-    """Open the station and name its lines after the inhibit. Errors may be temporary problems."""
+    """Open the station after the separation inhibit, and return it with the names of its lines."""
     (config, problem), clock = judged, SystemClock()
     section, commands = config.link, config.commands.socket
     assert section is not None

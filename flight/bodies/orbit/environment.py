@@ -211,7 +211,7 @@ class EstimatedEnvironment:
 
     @property
     def clock_doubt(self) -> str:
-        """Why the clock is doubted before the first fix: it is `EARLIEST` days before the elements; or ""."""
+        """Why the host's clock is doubted: it precedes the elements by `EARLIEST` days; or an empty text."""
         if self._utc_offset_ns is not None or self._elements is None:
             return ""
         early = self._elements.epoch - UNIX_EPOCH - self._clock.utc_ns() / (DAY * SECOND_NS)

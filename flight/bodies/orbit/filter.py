@@ -312,7 +312,7 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in step `place`; `doubted` earlier estimates were contradicted."""
+        """Start from an attitude in step `place`; if `doubted`, earlier estimates were contradicted."""
         first = self.steps[place]
         self.free.start(
             attitude.quaternion,
@@ -473,7 +473,7 @@ class OrbitFilter:
     def __init__(
         self, settings: OrbitFilterSettings, around: Callable[[int], FilterEnvironment | None]
     ) -> None:
-        """Create a filter without an estimate in the environment `around` at a time, or None if unknown."""
+        """Create a filter without an estimate; `around` returns the environment at a time, or None."""
         self._settings, self._around = settings, around
         # Dipoles are kept longer than the history, because its first step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)

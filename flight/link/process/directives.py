@@ -401,7 +401,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
-    """Yield packets with the segments of a packet, from `utc_ns` on. Raises CommandError beyond eight."""
+    """Yield the segments of a packet as packets, with times from `utc_ns` on. Raises CommandError."""
     total = -(-len(packet) // _PORTION_BYTES)
     if len(packet) > LONGEST_IN_PORTIONS:
         raise CommandError(f"{len(packet)} bytes exceed the longest command")

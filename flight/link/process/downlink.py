@@ -292,7 +292,7 @@ class Downlink:
         self._queue.add(packet)
 
     def play(self, source: Iterator[bytes] | None) -> None:
-        """Play back packets of `source` at the free data rate, until the next call at each b""."""
+        """Play back the packets of `source` at the free data rate; each b"" ends a call of `frames`."""
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:

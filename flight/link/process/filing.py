@@ -186,7 +186,7 @@ class Filing:
         return [replace(done, stage=Stage.STARTED, text=text)]
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file name. Raises FileError for a missing file or a path outside."""
+        """Return the path of a file. Raises FileError if it is missing or outside of the two folders."""
         root, _, rest = name.partition("/")
         if (problem := problem_of_name(name)) or root not in self._roots:
             raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
@@ -315,7 +315,7 @@ class Renewal:
     """Interface to the privileged program `deploy/renewal.py`, with which it exchanges files."""
 
     def __init__(self, folder: Path, status: Path, command_loss: float) -> None:
-        """Use `folder` for requests, the file `status` for reports; pass on `command_loss` (s)."""
+        """Write requests to `folder` with the limit `command_loss` (s), and read reports in `status`."""
         self._folder, self._status = folder, status
         self._limit = command_loss
         self._session = os.urandom(8).hex()

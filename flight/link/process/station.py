@@ -143,7 +143,7 @@ class UdpLine:
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return frames and senders; too long datagrams are cut to an invalid length."""
+        """Return frames and senders of datagrams; a too long datagram is cut to an invalid length."""
         found = []
         for _ in range(AT_MOST):
             try:

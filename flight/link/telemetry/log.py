@@ -221,7 +221,7 @@ _NAME = re.compile(r"run-(\d{6,})")
 
 @dataclass(frozen=True, slots=True)
 class NewRun:
-    """Folder of a new run, which a failing disk does not contain, and number of dropped old runs."""
+    """Folder of a new run, which does not exist if the disk fails, and number of deleted old runs."""
 
     folder: Path
     dropped: int
