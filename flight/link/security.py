@@ -498,9 +498,7 @@ class Sealer:
         self._spi = int(str(name).partition("-")[0])
         self._mask, self._block, self._shared, self._encrypted = mask, block, shared, encrypted
         self._salt = secrets.randbits(_SALT_BITS) << _COUNTER_BITS
-        self._next = 0
-        self._end = 0
-        self._generation = 0
+        self._next = self._end = self._generation = 0
         self._cipher: AESGCM | None = None
 
     def replace_key(self, generation: int, key: bytes) -> bool:

@@ -302,8 +302,7 @@ class CoilMonitor:
         self._bounds = Bounds(settings.full_current)
         self._commands = CoilCommands(2 * _WINDOW_NS)
         self._reading_ns = -(1 << 62)
-        self._fresh = 0
-        self._strange = 0
+        self._fresh = self._strange = 0
         self._suspected_ns: int | None = None
         self._judge_ns = 0  # time (ns) after which a diagnosis may leave the kind of fault open
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current

@@ -250,8 +250,7 @@ class CoilResponse:
         self._expected: FloatArray = np.ones((2 * coils + 2, coils))
         self._expected[coils + 2 :][each] = -1.0
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0,) * coils)])
-        self._known_ns = 0
-        self._last_ns = 0
+        self._known_ns = self._last_ns = 0
         self.gain: FloatArray = np.ones(coils)
         self.largest: FloatArray = np.full(coils, LARGEST_GAIN)
         self.sigma: FloatArray = np.full(coils, np.inf)

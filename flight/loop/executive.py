@@ -185,14 +185,8 @@ class RateGroup:
         if period_ns <= 0:
             raise FlightError(f"rate group {name}: a period of {period_ns} ns is not positive")
         self.name, self.period_ns, self.task = name, period_ns, task
-        self.cycles = 0
-        self.completed = 0
-        self.slips = 0
-        self.overruns = 0
-        self.total_execution_ns = 0
-        self.max_execution_ns = 0
-        self._slot = 0
-        self._epoch_ns = 0
+        self.cycles = self.completed = self.slips = self.overruns = self.total_execution_ns = 0
+        self.max_execution_ns = self._slot = self._epoch_ns = 0
 
     def begin(self, epoch_ns: int) -> None:
         """Start the grid of slots, of which slot 0 is due at `epoch_ns`."""

@@ -115,9 +115,7 @@ class ControlCycle:
         self._tasks, self._body, self._jobs = tasks, body, services.jobs
         self._recorder, self._streams = services.recorder, services.streams
         self._knowledge = CoilKnowledge()
-        self._ever_started = False
-        self._had_estimate = False
-        self._was_measured = False
+        self._ever_started = self._had_estimate = self._was_measured = False
         self._target: Target | None = None
 
     def run(self, cycle: Cycle) -> ControlOutput:

@@ -601,8 +601,7 @@ class Imaging:
         self._ordered: tuple[int, int] | None = None  # start and duration (ns) of an ordered exposure
         self._due_ns: int | None = None  # time (ns) after which the oldest trigger's frame is late
         self._rows = RepeatedRows()
-        self._busy_since_ns = 0
-        self._frames = 0
+        self._busy_since_ns = self._frames = 0
         self._objects = objects
         self._lens, self._lens_ns = settings.lens, 0
         self._spare = True  # whether there was time to search the last frame for objects

@@ -384,8 +384,7 @@ class ModeControl:
             starts = ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))
             raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {starts}")
         self._crashed, self._too_many_crashes = 0, False
-        self._commands = 0
-        self._measured_ns = 0
+        self._commands = self._measured_ns = 0
         self._slow = HoldTimer(settings.low_for)
         self._arrived = HoldTimer(settings.modes.arrived_for)
         self._pointing = PointingWatch(settings.modes, body.control.targets, services.facts)

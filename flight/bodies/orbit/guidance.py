@@ -298,8 +298,7 @@ class ObjectAim:
         self._place: FloatArray | None = None
         self._tracks: tuple[Track, ...] = ()
         self._followed = 0
-        self._escapes = False
-        self.seeks = self.moved = False
+        self._escapes = self.seeks = self.moved = False
 
     def aim(self, target: PointingTarget) -> None:
         """Set the target."""
@@ -461,8 +460,7 @@ class PointingPlanner:
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = self._held = False
-        self._after_ns = 0
-        self._count = self._accepted = self._refused = 0
+        self._after_ns = self._count = self._accepted = self._refused = 0
 
     def busy_since_ns(self) -> int | None:
         """Return the time (ns) at which the worker began its plan, or None while the worker is idle."""

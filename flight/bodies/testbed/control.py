@@ -237,11 +237,7 @@ class Planning:
         self._job: PlanJob | None = None
         self._goal_ns: int | None = None
         self._due_ns: int | None = None
-        self._asked_ns = 0
-        self._count = 0
-        self._accepted = 0
-        self._refused = 0
-        self.flown = 0
+        self._asked_ns = self._count = self._accepted = self._refused = self.flown = 0
 
     def counts(self) -> tuple[int, int]:
         """Return how many plans were accepted, and how many were rejected, since the start."""

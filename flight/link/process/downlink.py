@@ -269,8 +269,7 @@ class Downlink:
         self._urgent: deque[bytes] = deque(maxlen=_URGENT)
         self._queue = LiveQueue(rate * _WAITING_S)
         self._source: Iterator[bytes] | None = None
-        self.sent = self.displaced = 0
-        self.played_ns = 0
+        self.sent = self.displaced = self.played_ns = 0
 
     @property
     def thinned(self) -> int:

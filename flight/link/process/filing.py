@@ -322,9 +322,7 @@ class Renewal:
         self._fault = ""
         self._utc_offset_ns: int | None = None  # receiver's UTC minus the time of the host's clock
         self._recorded = ("", "")
-        self._due_ns = 0
-        self._modified_ns = 0
-        self._reported = 0
+        self._due_ns = self._modified_ns = self._reported = 0
         with suppress(OSError, *_DAMAGED):
             self._reported = int(decoded(read_regular(folder / "reported", _LARGEST) or b""))
 

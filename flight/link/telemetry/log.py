@@ -99,10 +99,7 @@ class SegmentStore:
         self._folder, self._stem, self._segment_bytes = folder, stem, segment_bytes
         self._budget_bytes, self._opener = budget_bytes, opener
         self._finished: deque[tuple[Path, int]] = deque()  # paths and sizes (bytes), oldest first
-        self._number = 0
-        self.packets = 0
-        self.doubtful = 0
-        self.dropped = 0
+        self._number = self.packets = self.doubtful = self.dropped = 0
         self._unsynced = 0  # written packets since the last sync
         self._open_next()
 
@@ -523,8 +520,7 @@ class Recorder:
         self._performance_packer = Packer()
         self._newest: dict[str, bytes] = {}
         self._events: deque[bytes] = deque(maxlen=_STATUS_EVENTS)
-        self.epoch_ns = 0
-        self.lost = 0
+        self.epoch_ns = self.lost = 0
         self.lost_text = ""
 
     def record(self, packet: Packet, time_ns: int, **values: Any) -> bytes | None:
