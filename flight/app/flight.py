@@ -179,11 +179,6 @@ def next_whole_second(clock: Clock) -> int:
     return -(-(clock.now_ns() + SECOND_NS // 2) // SECOND_NS) * SECOND_NS
 
 
-def mission_zero(clock: Clock) -> int:
-    """Return mission time zero in real time: the start of the third slot from now in the 40 Hz grid."""
-    return (clock.now_ns() // _GRID_NS + 3) * _GRID_NS
-
-
 @dataclass(frozen=True, slots=True)
 class _Judged:
     """A valid configuration of a request, read from `chosen`; `merged` includes the extended files."""
@@ -225,7 +220,9 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
             release.serve(rig.clock, stack)
         simulated = judged.config.simulation is not None
         label = RunLabel(judged.merged, rig.seed, simulated, rig.realtime)
-        epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
+        epoch_ns = next_whole_second(rig.clock)
+        if rig.realtime:  # the start of the third slot from now in the 40 Hz grid
+            epoch_ns = (rig.clock.now_ns() // _GRID_NS + 3) * _GRID_NS
         rig.release(epoch_ns)
         signals.end(loop)
         reason = loop.run(epoch_ns, label)

@@ -64,18 +64,13 @@ def utc_ns() -> int:
     return SystemClock().utc_ns()
 
 
-def utc_text() -> str:
-    """Return the machine's UTC as text for names of folders."""
-    return f"{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
-
-
 _NEWEST = 4
 """Number of newest runs whose folders are searched for the number of the last boot."""
 
 
 def default_folder(config_path: Path) -> Path:
     """Return the default folder of a run, which is named after its configuration and the time."""
-    return Path("runs") / f"{config_path.stem}-{utc_text()}"
+    return Path("runs") / f"{config_path.stem}-{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
 
 
 def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:

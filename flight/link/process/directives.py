@@ -381,11 +381,6 @@ LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 
-def name_of(directive: Directive) -> str:
-    """Return the name of the packet that carries a directive."""
-    return directive.packet.name
-
-
 def pack(directive: Directive, utc_ns: int) -> bytes:
     """Return a directive encoded as a packet. Raises CommandError for values that do not fit."""
     packet, values = directive.packet, dict[str, Any]()

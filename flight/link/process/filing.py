@@ -19,6 +19,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -222,7 +223,9 @@ class Filing:
                 if full.startswith(under) and path.is_file() and not problem_of_name(full):
                     facts = path.stat()
                     files.append({"name": full, "bytes": facts.st_size, "modified": round(facts.st_mtime)})
-        files = sorted((file for file in files if int(str(file["bytes"])) <= LONGEST_FILE), key=_name_of)
+        files = sorted(
+            (file for file in files if int(str(file["bytes"])) <= LONGEST_FILE), key=itemgetter("name")
+        )
         free = shutil.disk_usage(self._folder).free
         path = self._folder / LISTING
         write_whole(path, json.dumps({"free": free, "files": files}).encode())
@@ -270,10 +273,6 @@ class Filing:
             if problem is not None:
                 self._checks.remove(check)
                 yield replace(done, stage=Stage.FAILED, text=problem) if problem else done
-
-
-def _name_of(file: dict[str, Any]) -> str:
-    return str(file["name"])
 
 
 def values_of(progress: Progress) -> dict[str, Any]:

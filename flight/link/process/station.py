@@ -629,7 +629,7 @@ class Station:
 
     def _obey(self, admitted: Admitted, directive: Directive) -> None:
         """Execute a directive and report the stages of its execution."""
-        name, text = directives.name_of(directive), str(directive)
+        name, text = directive.packet.name, str(directive)
         request = request_of(admitted.data)
         done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
         self._report(replace(done, stage=Stage.ACCEPTED))
