@@ -44,12 +44,7 @@ from knightcube.gnc.estimation.estimate import (
     Knowledge,
     MeanRateMeasurement,
 )
-from knightcube.gnc.tracker import (
-    FrameSightings,
-    ObjectTracker,
-    Track,
-    TrackSettings,
-)
+from knightcube.gnc.tracker import FrameSightings, ObjectTracker, Track, TrackSettings
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraModel, Exposures
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings

@@ -220,12 +220,8 @@ class Navigation:
         if doubted and not self._doubted:
             self._estimation.coil_monitor.test_soon()
         self._doubted = doubted
-        text = (
-            "the body rate contradicts the commands"
-            if doubted
-            else "the body rate agrees with the commands again"
-        )
-        self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
+        text = "contradicts the commands" if doubted else "agrees with the commands again"
+        self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, f"the body rate {text}")
         return used
 
     def _or_magnetometer(
@@ -355,6 +351,7 @@ GPS_DELAY_NS = 100_000_000
 FIX_PERIOD_NS = 10 * SECOND_NS
 """Shortest time (ns) between two recorded fixes, and between two records of the line's counters."""
 _COUNTERS = tuple(field.name for field in GPS_LINK.fields)
+_RECORDED = ("utc_ns", "position", "velocity", "sigma", "velocity_sigma", "satellites")
 
 
 class Positioning:
@@ -439,12 +436,7 @@ class Positioning:
         self._recorder.record(
             FIX,
             now_ns,
-            utc_ns=reading.utc_ns,
-            position=reading.position,
-            velocity=reading.velocity,
-            sigma=reading.sigma,
-            velocity_sigma=reading.velocity_sigma,
-            satellites=reading.satellites,
+            **{name: getattr(reading, name) for name in _RECORDED},
             used=used,
             clock_off=math.nan if self._off_ns is None else self._off_ns * 1e-9,
         )
