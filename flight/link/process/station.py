@@ -89,7 +89,7 @@ _RECONNECT_NS = 5 * SECOND_NS
 
 
 class Line(Protocol):
-    """Interface of a communication line to the ground, which by default trusts all senders."""
+    """Interface of a communication line to the ground."""
 
     name: str
 
@@ -97,7 +97,8 @@ class Line(Protocol):
         """Return the received frames with their senders, oldest first. Never raises."""
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Record that a sender has sent an authentic frame."""
+        """Record that a sender has sent an authentic frame; by default, nothing is recorded."""
+        return
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames to all listeners. Never raises."""
