@@ -14,11 +14,10 @@ from typing import Any, Literal
 
 from flight.link.commands import DUMP_PARAMETERS, LOAD_PARAMETERS, POINT, SLEW
 from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
-from flight.link.events import EVENTS
-from flight.link.modes import ORBITAL, TESTBED, Mode
+from flight.link.events import EVENTS, ORBITAL, TESTBED, Mode
 from flight.link.process.directives import LAYOUTS as DIRECTIVE_LAYOUTS
 from flight.link.process.directives import SCHEDULE
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.definitions import Field, Packet
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout, wraps_at
 from flight.loop.facts import FACTS
 from hal.interfaces.devices import COIL_NAMES

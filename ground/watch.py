@@ -16,9 +16,8 @@ import numpy as np
 from flight.app.run import utc_ns
 from flight.link import events
 from flight.link.commands import CommandPacker, Ping
-from flight.link.telemetry.definitions import COMMAND, EVENT, FACTS, MODES, SEVERITIES, STEERING
+from flight.link.telemetry.definitions import COMMAND, EVENT, FACTS, MODES, SEVERITIES, STEERING, States
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
-from flight.link.telemetry.fields import States
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange

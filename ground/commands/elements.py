@@ -17,9 +17,8 @@ import numpy as np
 
 from flight.app.cli import PROGRAM
 from flight.schema import reader as configuration
-from flight.schema.bodies import as_orbit
+from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import config_path, read_text
-from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive, print_result, utc
 from ground.report.text import number, table
 from ground.satellite_description import check_values, read_value

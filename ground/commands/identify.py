@@ -21,8 +21,6 @@ from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, TestbedConfig
 from flight.schema.document import config_path
-from flight.schema.orbit import OrbitConfig
-from flight.schema.testbed import TestbedConfig
 from ground.commands.options import positive, print_result, write_new
 from ground.identification.fit import (
     DURATION,

@@ -16,7 +16,6 @@ from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import config_path
-from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive, print_result, utc
 from knightcube import plan_slew, plan_step
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply

@@ -21,8 +21,8 @@ from flight.app.cli import PROGRAM
 from flight.app.run import utc_ns
 from flight.app.service import EndingSignals
 from flight.link import commands
+from flight.link.events import Mode
 from flight.link.files.store import Store
-from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.filing import LISTING
@@ -33,10 +33,8 @@ from flight.link.telemetry.definitions import (
     PARAMETER_KEYS,
     PARAMETERS,
     VERIFICATION,
-    Field,
     Packet,
 )
-from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
 from flight.link.telemetry.packets import TelemetryError
 from flight.schema.document import read_document, read_text, to_yaml

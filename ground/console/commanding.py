@@ -20,9 +20,8 @@ import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link import commands
-from flight.link.events import EVENTS
+from flight.link.events import EVENTS, Mode
 from flight.link.files.store import Store, problem_of_name
-from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage, utc_of
 from flight.link.process.directives import KINDS, LIST, SCHEDULE, ListFiles, SendFile
@@ -148,8 +147,8 @@ def _text_of(data: bytes) -> str:
     """Return a text that describes a command packet. Raises CommandError for invalid values."""
     directive = directives.unpack(data)
     if isinstance(directive, directives.Scheduled):
-        return f"at {directive.at}: {commands.command_of_words(directive.words).text}"
-    return commands.unpack(data).text if directive is None else str(directive)
+        return f"at {directive.at}: {commands.command_of_words(directive.words)}"
+    return str(commands.unpack(data) if directive is None else directive)
 
 
 def _value(name: str, field: Field, given: Any) -> Any:

@@ -40,8 +40,8 @@ import numpy as np
 from scipy.special import gammaincc
 
 from flight.schema import reader as configuration
+from flight.schema.bodies import Plant, Step, TestbedConfig
 from flight.schema.document import to_yaml
-from flight.schema.testbed import Plant, Step, TestbedConfig
 from ground.identification.record import HorizontalField, IdentificationError, Record, Timeline
 from knightcube.astro.arrays import FloatArray, IntArray
 

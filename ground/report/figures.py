@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import SHED
 from flight.link.telemetry.packets import PacketArray
 from ground.report import orbit, panels

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from flight.link import events
 from flight.link.events import POINTING, Mode
 from flight.link.telemetry.packets import PacketArray
+from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import FAST, Camera
-from flight.schema.orbit import OrbitConfig
 from ground.report.signals import PowerHistory, seconds, true_quaternions
 from ground.report.steps import judge
 from ground.telemetry import Run, text_of

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.modes import STEERING
+from flight.link.events import STEERING
 from ground.report.signals import ThreadMotion, seconds
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray

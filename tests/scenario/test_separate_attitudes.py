@@ -10,7 +10,6 @@ import pytest
 from flight.schema import reader as configuration
 from flight.schema.bodies import as_orbit
 from flight.schema.document import FOLDER
-from flight.schema.orbit import as_orbit
 from knightcube.astro.quaternion import angle_between
 from sim_hal.settings import Simulation
 from tests.support.flights import fly

@@ -15,14 +15,16 @@ from flight.loop.coil_currents import (
     NEWEST,
     PLACE,
     Bounds,
+    BrakeProof,
     CoilFault,
     Predicted,
+    StuckLeg,
     Supplied,
     fits,
     predict,
     supply_currents,
 )
-from flight.loop.coil_monitor import BrakeProof, CoilMonitor, CoilMonitorSettings, StuckLeg
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import Evidence
 from hal.interfaces.devices import NO_AXES, ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from flight.schema.bodies import as_testbed
 from flight.schema.reader import parse
-from flight.schema.testbed import as_testbed
 from ground.identification.fit import (
     NAMES,
     AbsolutePlant,

@@ -10,7 +10,7 @@ import numpy as np
 
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
-from flight.schema.testbed import Identification, TestbedConfig
+from flight.schema.bodies import Identification, TestbedConfig
 from ground.identification.fit import (
     DIPOLE_ERROR,
     FIELD_ERROR,

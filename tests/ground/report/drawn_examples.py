@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from flight.bodies.testbed.control import plant_of
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.events import Mode
 from ground.report import figures, panels
 from ground.report.panels import RunSignals
 from ground.telemetry import Run

@@ -12,12 +12,11 @@ import pytest
 from flight.link import events
 from flight.link.events import Mode
 from flight.link.telemetry import definitions as table
-from flight.link.telemetry.definitions import ORBIT_TRUTH, SPIN
-from flight.link.telemetry.fields import Packet
+from flight.link.telemetry.definitions import ORBIT_TRUTH, SPIN, Packet
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Layout, Packer, PacketArray
 from flight.schema import reader
-from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.bodies import OrbitConfig, as_orbit
 from ground.identification.orbit import learned_lens
 from ground.report import draw, summarise
 from ground.report.orbit import JUDGED, dipole_errors, star_camera

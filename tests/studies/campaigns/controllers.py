@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.testbed import PidGains, Step, TestbedConfig
+from flight.schema.bodies import PidGains, Step, TestbedConfig
 from ground import report
 from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.report.steps import STEADY_STATE_S

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.schema.orbit import FieldDetumble
+from flight.schema.bodies import FieldDetumble
 from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray

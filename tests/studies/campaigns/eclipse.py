@@ -18,7 +18,7 @@ import numpy as np
 
 from flight.bodies.orbit.body import filter_settings
 from flight.schema import reader as configuration
-from flight.schema.orbit import as_orbit
+from flight.schema.bodies import as_orbit
 from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector

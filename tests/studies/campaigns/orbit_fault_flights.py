@@ -15,7 +15,7 @@ from sgp4.api import WGS72, Satrec
 from sgp4.exporter import export_tle
 
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, TargetStep
+from flight.schema.bodies import OrbitConfig, TargetStep
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.link.modes import POINTING, Mode
+from flight.link.events import POINTING, Mode
 from flight.link.telemetry.packets import to_text
 from ground.campaigns.runner import Result
 from ground.report.orbit import FINE, LOST, attitude_errors

@@ -23,7 +23,6 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.bodies import Step, TestbedConfig
 from flight.schema.sections import Commands, CommandStep, Telemetry
-from flight.schema.testbed import Step, TestbedConfig
 from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry

@@ -28,7 +28,7 @@ import numpy as np
 from flight.link import events
 from flight.link.events import POINTING, Mode
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig
+from flight.schema.bodies import OrbitConfig
 from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.report.orbit import (
     FINE,

@@ -28,7 +28,7 @@ import numpy as np
 
 from flight.link.events import Mode
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig
+from flight.schema.bodies import OrbitConfig
 from ground.campaigns.runner import Case, Result, Summary, summary
 from sim_hal.settings import Simulation
 from tests.studies.campaigns.statistics import grouped, median
