@@ -609,7 +609,7 @@ class DatagramChannel:
 
 
 def open_unix(path: Path) -> DatagramChannel:
-    """Bind a UNIX datagram socket that owner and group may write to, in place of a stale socket file.
+    """Bind a UNIX datagram socket that owner and group may write to, instead of a stale socket file.
 
     Raises UsageError for another file, if a process listens at this path, or if binding fails.
     """

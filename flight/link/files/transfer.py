@@ -759,7 +759,7 @@ class Entity:
         return receiver.take(content, now_ns)
 
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
-        """Open an incoming transfer, in place of the stalest one if too many are open."""
+        """Open an incoming transfer, instead of the stalest one if too many are open."""
         if len(self._in) >= MOST_OPEN:
             stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
             stalest.stop(Condition.CANCELLED, "given up for a newer one")
