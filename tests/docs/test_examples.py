@@ -161,7 +161,7 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> None:
-    """Under PD control, the torsion of the thread deflects the body by the angle k theta / (J w^2)."""
+    """Under PD control, the suspension thread's torsion deflects the body by the angle k theta / (J w^2)."""
     printed = printed_by("pointing_body")
     found = re.search(r"pointing error ([\d.]+) deg", printed)
     assert found is not None

@@ -182,7 +182,7 @@ def test_each_form_of_point_takes_degrees_and_is_the_command_in_words(
 
 
 def test_the_states_of_the_table_are_those_of_the_code() -> None:
-    """The state names of the packet table equal those of the code.
+    """The state names of the packet table equal the names in the code.
 
     The link cannot import these names, because loop and bodies define them.
     """

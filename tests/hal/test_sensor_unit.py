@@ -165,7 +165,7 @@ def test_another_or_no_part_on_the_spi_bus_is_refused(answer: bytes, error: type
 def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    """The ioctl numbers and the 32 bytes of struct spi_ioc_transfer equal those of linux/spi/spidev.h."""
+    """The ioctl numbers and the 32 bytes of struct spi_ioc_transfer agree with linux/spi/spidev.h."""
     device = tmp_path / "spidev0.0"
     device.touch()
     calls: list[tuple[int, bytes]] = []

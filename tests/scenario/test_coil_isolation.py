@@ -54,7 +54,7 @@ def flown(fault: str, folder: Path, duration: float, initial: str = "testbed-dem
 
 
 def torque(currents: FloatArray, quaternions: FloatArray) -> FloatArray:
-    """Return the torque (k,), N m, about the thread, of currents (k, 3), A, at attitudes (k, 4)."""
+    """Return the torque (k,), N m, about the thread, caused by currents (k, 3), A, at attitudes (k, 4)."""
     fields = np.array([attitude_matrix(quaternion) @ FIELD for quaternion in quaternions])
     made: FloatArray = np.cross(DIPOLE * currents, fields)[:, 1]
     return made
@@ -71,7 +71,7 @@ def test_an_axis_that_breaks_is_left_out_and_the_others_keep_the_direction_of_th
     assert text.startswith("coil x")
     truth, count = run["truth"], len(wishes)
     after = np.arange(count) * 0.025 > isolated + 0.5
-    # The true current at the start of a cycle is that of the previous cycle's command.
+    # At the start of a cycle, the true current follows the previous cycle's command.
     carried, attitude = truth["current"][1 : count + 1], truth["quaternion"][:count]
     assert np.abs(carried[after, 0]).max() < 1e-9, "the broken coil carries nothing"
     wanted, made = torque(wishes, attitude)[after], torque(carried, attitude)[after]

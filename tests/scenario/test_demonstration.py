@@ -121,8 +121,8 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(
 def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any], power: dict[str, float]) -> None:
     """The demonstration is nearly as good as the physics permits, with all simulated noise.
 
-    The errors are those of the true attitude relative to the target. R I^2 is compared with the optimum of
-    the true plant.
+    The errors are angles from the target to the true attitude. R I^2 is compared with the optimum of the true
+    plant.
     """
     found = summary["steps"]
     assert max(step["steady_state_deg"] for step in found) <= 0.05
@@ -207,7 +207,8 @@ def test_every_frame_gives_an_attitude_that_the_estimate_takes(demonstration: Ru
 def test_the_star_attitudes_are_as_good_as_they_say(demonstration: Run) -> None:
     """The mean normalised squared error of the star attitudes is below its upper bound.
 
-    The mean normalised squared error about the thread, the only rotation axis, is also above a lower bound.
+    The mean normalised squared error about the suspension thread, the only rotation axis, is also above a
+    lower bound.
     """
     error, covariance = star_errors(demonstration)
     about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])

@@ -19,7 +19,8 @@ from tests.support.flights import Rigged, config_for, demo_config, demo_world, e
 BEGIN, END, DURATION, LONG = 2.0, 5.0, 8.0, 12.0
 """Start and end (s) of a fault; duration (s) of a flight, and of a flight that returns to its target."""
 AT_TARGET = released(-0.3, 0.0)
-"""World in which the body starts at rest at its target; the thread alone would rotate it by 6 deg in 6 s."""
+"""World in which the body starts at rest at its target; the suspension thread alone would rotate it by 6 deg
+in 6 s."""
 SHAM = 0.5
 """Start (s) of a camera fault, between the first and the second frame."""
 WITHIN = 0.1
@@ -106,8 +107,8 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
     time = run["truth"]["time_ns"] * 1e-9
     error = np.degrees(np.abs(angle - 2 * np.arcsin(-0.3)))
     assert error[(time > 13.0) & (time < 14.0)].max() < 0.1
-    # Without control, the thread would rotate the body by k theta / (2 J) t^2 = 0.17 deg during the fault of
-    # one second.
+    # Without control, the suspension thread would rotate the body by k theta / (2 J) t^2 = 0.17 deg during
+    # the fault of one second.
     assert error[time > 14.0].max() < 0.3
     assert error[time > 18.5].max() < 0.1
 

@@ -26,7 +26,7 @@ from tests.support.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 16.0
 GOOD_PLANS = 2
-"""Number of valid plans; the second is made at 5 s and ends at 15 s."""
+"""Number of valid plans; the second plan is made at 5 s and ends at 15 s."""
 
 Spoil = Callable[[PlanJob, StepPlan], StepPlan]
 

@@ -24,7 +24,7 @@ def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> Tes
 
 
 def true_angle(run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the mission times (n,), s, and the true rotation angles (n,), rad, about the thread."""
+    """Return mission times (n,), s, and true rotation angles (n,), rad, about the suspension thread."""
     truth = run["truth"]
     return truth["time_ns"] * 1e-9, 2.0 * np.arcsin(truth["quaternion"][:, 1])
 

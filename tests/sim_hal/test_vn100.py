@@ -538,7 +538,7 @@ def command(bench: Bench, *words: object) -> tuple[str, ...]:
     ],
 )
 def test_factory_settings_of_the_filters_registers(register: int, default: str) -> None:
-    """Names, lengths and factory settings of filter registers are those of VectorNav UM001 and the SDK."""
+    """Filter registers have the names, lengths and factory settings of VectorNav UM001 and the SDK."""
     bench = Bench().quiet()
     assert command(bench, "RRG", register) == ("RRG", str(register), *default.split(","))
 
@@ -547,7 +547,7 @@ def test_factory_settings_of_the_filters_registers(register: int, default: str) 
 def test_what_is_written_is_echoed_kept_and_saved(register: int) -> None:
     """Written values are echoed, kept and saved.
 
-    The commands are those of the SDK: numbers with six decimals, and register numbers with two digits.
+    The commands have the format of the SDK: numbers with six decimals, and register numbers with two digits.
     """
     bench = Bench().quiet()
     length = {36: 9, 38: 9, 50: 3, 51: 3}[register]

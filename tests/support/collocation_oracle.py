@@ -181,7 +181,7 @@ class _InteriorPoint:
         by_u = 0.5 * self.h * self.gain * cos
         half, drag = 0.5 * self.h, 0.5 * self.h * self.drag
         last = np.ones(self.n)
-        # no interval follows the last point, so its multiplier rows are those of the unit matrix
+        # no interval follows the last point, so its multiplier rows are rows of the unit matrix
         last[-1] = 0.0
         # Derivatives of the defects of interval k with respect to the states of points k and k + 1.
         put(3, 0, -last)

@@ -30,7 +30,7 @@ CURRENT_BOUND = 3.5e-3
 GAIN_SIGMA = 0.1
 """Standard deviation of the coils' torque relative to its nominal value."""
 MOST_STIFFNESS, MOST_DAMPING = 2e-5, 4e-6
-"""Largest stiffness (N m/rad) and damping (N m s/rad) of the thread."""
+"""Largest stiffness (N m/rad) and damping (N m s/rad) of the suspension thread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class World(Protocol):
 
 
 class SuspendedWorld:
-    """The testbed of sim_hal, with a thread that the filter does not know, and with a torque of the air.
+    """The testbed of sim_hal, with an air torque and a suspension thread that the filter does not know.
 
     A coil current that causes the same torque represents the torque of the air.
     """

@@ -1,4 +1,4 @@
-"""A Dask cluster on this machine: a scheduler and two workers, each a process in a folder."""
+"""A Dask cluster on this machine: a scheduler process and two worker processes."""
 
 from __future__ import annotations
 

@@ -73,10 +73,10 @@ def slope_per_hour(
 ) -> tuple[float, float, float]:
     """Return the slope per hour of a noisy level and its 95 % interval (low, high), or NaN.
 
-    The slope is NaN if the samples cover too short a time. A process allocates and frees memory as it works.
-    The level of each block of time is therefore its 10 % quantile, which a leak increases too. The slope is
-    the median of all pairwise slopes of the blocks, and its interval follows from Kendall's tau (Sen 1968,
-    doi 10.1080/01621459.1968.10480934).
+    The slope is NaN if the samples cover too short a time. The level is noisy, because a process allocates
+    and frees memory as it works. The level of each block of time is therefore its 10 % quantile, which a leak
+    increases too. The slope is the median of all pairwise slopes of the blocks, and its interval follows from
+    Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
     """
     from scipy import stats  # noqa: PLC0415 - the bench is not to share the flight's libraries while it flies
 

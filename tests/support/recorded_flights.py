@@ -227,7 +227,7 @@ FLIGHTS: dict[str, Callable[[], tuple[Config, Simulation | None]]] = {
 }
 """Functions that return the configuration and the world of a flight, by the name of the flight.
 
-The world None means that of the demonstration.
+If the world is None, the world of the demonstration is used.
 """
 
 

@@ -1,6 +1,6 @@
 """Slews with known optima, and a model of the motion that shares no code with the planner.
 
-Problems, magnetic fields and optima in the file are those of an independent direct collocation. `flown`
+Problems, magnetic fields and optima in the file come from an independent direct collocation. `flown`
 integrates the equations of motion that the file states as `model`.
 """
 

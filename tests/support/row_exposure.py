@@ -1,8 +1,8 @@
 """Frames of a rolling shutter, summed over instants, independent of the estimator's model.
 
 At each instant a star is a Gaussian that is integrated over each pixel of a patch. The light of an instant is
-added only to the rows that are exposed at this instant. The method is simple and slow. The noise is that of
-the simulator.
+added only to the rows that are exposed at this instant. The method is simple and slow. The pixels have the
+noise of the simulator.
 """
 
 from __future__ import annotations

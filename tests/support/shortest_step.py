@@ -2,8 +2,8 @@
 
 The method is independent of planner and collocation. The motion is integrated forward from the start at one
 current limit, and backward from the end at the opposite limit. The current switches where both curves meet in
-the phase plane. A single switch is optimal if the slew takes less than half a period of the thread. In the
-tests, half a period is more than 20 s.
+the phase plane. A single switch is optimal if the slew takes less than half a period of the torsion pendulum.
+In the tests, half a period is more than 20 s.
 """
 
 from __future__ import annotations

@@ -102,7 +102,10 @@ def known_optima() -> list[KnownOptimum]:
 
 
 def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0, 20.0)) -> list[Problem]:
-    """Return random slews over the range of the testbed. A third of the slews has a thread."""
+    """Return random slews over the range of the testbed.
+
+    In a third of the slews, the body is suspended by a thread.
+    """
     rng = np.random.default_rng(seed)
     problems = []
     for _ in range(count):
@@ -126,8 +129,8 @@ def feasible_problems(
 ) -> list[tuple[Problem, float]]:
     """Return slews that last `share` times their shortest feasible duration, each with this duration (s).
 
-    A third of the plants has no thread, and two thirds have a thread of one of two stiffnesses. Half of the
-    plants have a disturbance, and half of the slews end with a rate.
+    A third of the plants has no suspension thread, and two thirds have a suspension thread of one of two
+    stiffnesses. Half of the plants have a disturbance, and half of the slews end with a rate.
     """
     rng = np.random.default_rng(seed)
     problems: list[tuple[Problem, float]] = []

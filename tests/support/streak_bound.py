@@ -2,7 +2,7 @@
 
 The electrons of a pixel are Poisson distributed, and the read noise is Gaussian. The Fisher information of
 parameters p is the sum over pixels of (dm/dp)(dm/dp)^T / (floor + m), with the mean signal m and the variance
-`floor` of all other noise (read noise squared, dark current, rounding). The signal is that of a point that
+`floor` of all other noise (read noise squared, dark current, rounding). The signal comes from a point that
 moves at a constant rate, with a Gaussian point spread integrated over each pixel. The signal is integrated by
 Gauss-Legendre quadrature in time, exact to rounding, and independent of the faster model that the estimator
 fits. Position, flux and background of every star are unknown, and optionally also the common width of the

@@ -38,7 +38,7 @@ def test_one_endpoint_has_the_published_bound(row: tuple[float, ...]) -> None:
 
 
 def test_a_star_at_rest_is_bounded_as_a_gaussian_spot_of_photons_is() -> None:
-    """The position of a star at rest is bounded by sigma / sqrt(N), as that of a Gaussian spot of N photons.
+    """The position of a star at rest is bounded by sigma / sqrt(N), as for N photons in a Gaussian spot.
 
     The bound holds for photon noise alone and fine pixels.
     """

@@ -1,4 +1,4 @@
-"""A reduced control loop for tests of controllers: body on the thread, filter and controller at 40 Hz."""
+"""A reduced control loop for tests of controllers: suspended body, filter and controller at 40 Hz."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def fly(
 ) -> FloatArray:
     """Return rows (t, theta, omega, current) of a run with `noise` times the noise of the testbed.
 
-    The filter assumes a plant without a thread. The input of the filter is the current of the previous
-    cycle's command, with the uncertainty of the testbed.
+    The filter assumes a plant without a suspension thread. The input of the filter is the current of the
+    previous cycle's command, with the uncertainty of the testbed.
     """
     rng = np.random.default_rng(seed)
     filter_ = SingleAxisFilter(BELIEVED, FilterSettings(2e-3, PERIOD, 5e-4))

@@ -47,7 +47,7 @@ def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
 
 
 def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -> Simulation:
-    """Return a world with random errors of another seed, and optionally with a fault at `at` s."""
+    """Return a world with the given random seed, and optionally with a fault at `at` s."""
     entries = (FaultEntry(fault=fault, at=at),) if fault else ()
     return configuration.replace(world, seed=seed, faults=entries)
 
@@ -55,7 +55,7 @@ def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -
 def with_other_body(
     world: Simulation, moments: Sequence[float], axes_deg: float, seed: int, fault: str = ""
 ) -> Simulation:
-    """Return a world whose body has other principal moments (3,), kg m^2, and axes, and maybe a fault."""
+    """Return a world with given principal moments (3,), kg m^2, and axes of the body, and a fault."""
     body = world.free_body
     assert body is not None
     craft = body.craft or CraftSection()

@@ -1,4 +1,4 @@
-"""Compares all packet fields that `space-packet-parser` reads by the XTCE file with those of our reader.
+"""Compares all packet fields that `space-packet-parser` reads by the XTCE file with the fields of our reader.
 
 `python -m tests.support.xtce_fields RUN...` prints the number of equal fields in the logs of the runs. The
 exit status is 1 if a field differs, a packet is not read, or a deliberately shifted field is not detected.

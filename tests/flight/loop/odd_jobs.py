@@ -37,5 +37,5 @@ def cores(_: Any) -> list[int]:
 
 
 def function(_: Any) -> Any:
-    """Return a function, a type of result that a worker cannot send."""
+    """Return a function, because a worker cannot send a function as a result."""
     return function

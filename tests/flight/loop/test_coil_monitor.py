@@ -215,7 +215,8 @@ def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
     """Currents 13 % below and 10 % above their nominal values cause no suspicion.
 
-    At 60 degrees C, the resistance of copper has changed by 15 %. All three axes have changing commands.
+    At 60 degrees C, the resistance of copper has changed by 15 %. The commands of all three axes change
+    during the run.
     """
     seen = observe(hold(TARGET, noise=0.005, others=0.04), 20.0, gain=(0.87, 1.1, 1.0))
     assert seen.found == []

@@ -71,7 +71,7 @@ PERSISTENCE = {
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
 """Numbers of updates until a fact (a monitored condition) becomes true and until it ends, and its modes.
 
-The second number is None if the fact latches. The modes are those in which the fact is monitored; an empty
+The second number is None if the fact latches. `modes` are the modes in which the fact is monitored; an empty
 string means all modes.
 
 All other facts become true and end immediately, and are monitored in all modes.

@@ -116,7 +116,7 @@ def pointing(satellite: Satellite) -> Satellite:
 
 @pytest.fixture(scope="module")
 def orbit() -> Satellite:
-    """Return a satellite that has flown through an eclipse with full coils, and then in sunlight."""
+    """Return a satellite after an eclipse with the largest coil currents, and a flight in sunlight."""
     satellite = pointing(Satellite())
     satellite.fly(END)
     return satellite

@@ -55,9 +55,9 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
 
 
 def test_the_simulation_case_is_the_thesis_s() -> None:
-    """step_simulation.yaml is the case of chapter 5 of the thesis, without a thread and a camera.
+    """The file step_simulation.yaml is the case of chapter 5 of the thesis, without suspension and camera.
 
-    Control, plant and devices in step_simulation.yaml are those of step_thesis.yaml.
+    The files step_simulation.yaml and step_thesis.yaml have equal sections of control, plant and devices.
     """
     loop, case = (
         as_testbed(reader.load(FOLDER / name)) for name in ("step_thesis.yaml", "step_simulation.yaml")

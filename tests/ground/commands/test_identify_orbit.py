@@ -56,7 +56,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 def ratio_errors(folder: Path) -> list[float]:
     """Return the largest element error of J / trace(J) for each inertia in the log of a run.
 
-    The first inertia is that of the configuration, and all later inertias are estimates of the flight.
+    The first inertia comes from the configuration, and all later inertias are estimates from the flight.
     """
     elements = read_run(folder)["description"]["inertia"].astype(float)
     true = TRUE[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)] / np.trace(TRUE)
@@ -187,7 +187,7 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
 def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, dict[str, Any]]) -> None:
     """The fragment contains the estimated lens.
 
-    The accuracies of the lens are those of the packet `lens`, rounded up.
+    The accuracies of the lens come from the packet `lens` and are rounded up.
     """
     place, _ = flown
     config = as_orbit(load(place / "first" / "config.yaml"))

@@ -27,7 +27,7 @@ def controller(**changes: float) -> ExcitationController:
 def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_reach() -> None:
     """Under the pulses of a manoeuvre, a free body comes to rest within the reach of the excitation.
 
-    The motion is integrated exactly, as that of a double integrator.
+    The motion is integrated exactly, as for a double integrator.
     """
     strength, reach = 0.02, 0.5
     for manoeuvre in manoeuvres(strength, reach, 45.0):

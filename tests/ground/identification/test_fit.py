@@ -113,7 +113,7 @@ def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
 def test_coloured_noise_is_noticed_and_the_uncertainty_grows() -> None:
     """Coloured noise is detected and increases the uncertainty.
 
-    The attitude error has a correlation time of half a second, like that of a filter inside the unit.
+    The attitude error has a correlation time of half a second, like the error of a filter inside the unit.
     """
     record = fly_bare(USUAL, 40.0)
     rng = np.random.default_rng(8)

@@ -75,11 +75,11 @@ def changed(packet: bytes, at: int, value: int) -> bytes:
         (changed(PING, 0, PING[0] & ~0x08), 0),  # packet without a secondary header
         (changed(PING, 1, 0xFF), 1),  # a packet with the APID of another application
         (changed(PING, 2, 0x40), 2),  # a packet that is a segment of a sequence
-        (changed(PING, 4, 1), 4),  # a length greater than that of any ping
+        (changed(PING, 4, 1), 4),  # a length that exceeds the length of any ping
         (changed(PING, 5, PING[5] + 1), 5),
         (changed(PING, 5, PING[5] - 1), 5),
         (changed(PING, 6, PING[6] + 1), 6),  # packet of an unknown version of the definition
-        (changed(UNIT, 4, 0xFF), 4),  # a length greater than that of any frame
+        (changed(UNIT, 4, 0xFF), 4),  # a length that exceeds the length of any frame
         (changed(UNIT, 4, 0)[:5] + b"\x00", 5),  # a length shorter than the headers
         (UnitPacker(DOWN).pack(b"unit", 1), 0),
         (Packer().pack(HEALTH, 1, plain_contents(HEALTH)), 0),

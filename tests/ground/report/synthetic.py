@@ -24,8 +24,8 @@ RELEASE_Q2 = 0.2
 TARGETS = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
 DAMPING, FREQUENCY = 0.7, 0.5
 RATE_BIAS = 1e-4  # bias of the estimated rate, rad/s
-STAR_ERROR = 3e-5  # error of each star attitude about the thread, rad, alternating in sign
-STREAK_ERROR = 2e-4  # error of each streak rate about the thread, rad/s, alternating in sign
+STAR_ERROR = 3e-5  # error of each star attitude about the suspension thread, rad, alternating in sign
+STREAK_ERROR = 2e-4  # error of each streak rate about the suspension thread, rad/s, alternating in sign
 
 
 @dataclass(frozen=True)

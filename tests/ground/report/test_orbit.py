@@ -191,7 +191,7 @@ def test_without_an_estimate_nothing_is_said() -> None:
 LAST_S = 200
 """Duration (s) of the run."""
 PERIOD, FINE_PERIOD, FINE_FROM = 5, 10, 100
-"""Periods (s) of the configured camera, and the time (s) from which the attitude is fine."""
+"""Periods (s) of the configured camera, and the time (s) from which the attitude quality is "fine"."""
 FAST_UNTIL, HIDDEN = 20, (50, 80)
 """Time (s) until which the body is too fast for the camera, and interval (s) with the Earth in the
 exclusion cone."""

@@ -73,7 +73,7 @@ def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
 
 
 def test_supply_power_and_heat_are_means_from_the_true_energies(full: Run) -> None:
-    """Mean powers and energies are those of a coil that carries 0.1 A for a tenth of the time."""
+    """Mean powers and energies result from a coil current of 0.1 A for a tenth of the time."""
     power = summarise(full)["power"]
     assert power["source"] == "truth"
     assert power["heat_average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)

@@ -47,7 +47,7 @@ class IoctlCamera:
         lag: number of frames until a changed control takes effect.
         stamp_source, clock_flag, stamp_offset_ns: reported source and clock of the time stamps, and their
             error.
-        stamps_packets: whether time stamps are those of the first USB packet, as with uvcvideo.
+        stamps_packets: whether a frame's time stamp is the time of its first USB packet, as with uvcvideo.
         spoil, shorten: numbers of the frames with an error flag, and of the frames with half their bytes.
         frozen: whether the sequence number stays constant.
         belies_exposure: whether the interval of frames is always `shortest_ns`, whatever the exposure.

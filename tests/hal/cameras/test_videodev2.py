@@ -1,4 +1,4 @@
-"""Tests that structures and request codes equal those of the kernel's videodev2.h."""
+"""Tests that structures and request codes equal the definitions in the kernel's videodev2.h."""
 
 from __future__ import annotations
 

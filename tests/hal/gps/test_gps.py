@@ -99,7 +99,7 @@ def test_a_frame_with_one_wrong_byte_is_never_accepted(at: int, mask: int) -> No
 
 
 def test_a_fix_is_where_the_satellite_was_at_the_epoch() -> None:
-    """The position of a fix is that of the satellite at its epoch, within centimetres (protocol resolution).
+    """A fix gives the satellite's position at its epoch, within centimetres (protocol resolution).
 
     The flight software propagates fixes to later times.
     """

@@ -171,7 +171,7 @@ def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[Li
 
 
 class CoilTruth:
-    """True coil currents on the machine's monotonic clock; `current` (n,), A, is that of coil x."""
+    """True coil currents on the machine's monotonic clock; `current` (n,), A, is the current of coil x."""
 
     def __init__(self, folder: Path, devices: Path | None = None) -> None:
         """Read the run in `folder`, after the truth log was moved there from the folder `devices`."""

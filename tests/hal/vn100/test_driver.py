@@ -498,7 +498,7 @@ def test_an_answer_belongs_to_its_command_and_register() -> None:
 def test_only_errors_of_the_line_are_worth_another_try() -> None:
     """Only errors of the line are retried.
 
-    The codes are those of UM001 Table 18; -1 is an unreadable code.
+    The codes come from UM001 Table 18; -1 is an unreadable code.
     """
     assert {-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF} == PASSING_ERRORS
     assert BAUD_RATES == (115200, 230400, 921600, 460800, 57600, 38400, 19200, 9600)

@@ -116,7 +116,7 @@ def test_rotation_vector_round_trip(axis: FloatArray, angle: float) -> None:
 
 @given(UNIT_QUATERNIONS)
 def test_rotation_vector_agrees_with_scipy(q: FloatArray) -> None:
-    """The rotation vector equals that of scipy, although the attitude matrix is the transpose of scipy's.
+    """The rotation vector agrees with scipy, although the attitude matrix is the transpose of scipy's.
 
     At a rotation by pi, both signs of the vector are correct.
     """
@@ -189,7 +189,7 @@ def test_turns_about_axis_y_round_trip(angle: float) -> None:
 
 @given(ANGLES, st.floats(0.0, 6.28), st.floats(0.0, 1.5))
 def test_the_twist_about_y_leaves_out_a_tilt(angle: float, azimuth: float, tilt: float) -> None:
-    """The twist about y does not change if the thread is tilted, i.e. rotated about a horizontal axis."""
+    """The twist about y is unaffected by a tilt of the suspension thread about a horizontal axis."""
     swing = quaternion.from_rotation_vector(tilt * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)]))
     q = quaternion.multiply(swing, quaternion.about_axis_y(angle))
     assert quaternion.angle_about_axis_y(q) == pytest.approx(angle, abs=1e-9)

@@ -152,7 +152,7 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
 def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None:
     """Two equally bright objects that cross keep their track numbers, in twenty tested pairs.
 
-    While the objects are within 3 px, the frame shows one object with the flux of both.
+    While the objects are within 3 px, the frame shows one object with the summed flux.
     """
     rng = np.random.default_rng(77)
     times = np.arange(0.0, 30.0, 1.0)

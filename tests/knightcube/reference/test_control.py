@@ -17,7 +17,7 @@ SETTINGS = AdaptiveSettings(bandwidth=1.0, adaptation=10.0, reference_bandwidth=
 
 
 def test_with_the_plant_known_the_body_follows_the_reference_model() -> None:
-    """With known plant parameters, the angle is that of the reference model, 1 - (1 + wt) exp(-wt).
+    """With known plant parameters, the angle follows the reference model, 1 - (1 + wt) exp(-wt).
 
     The reference model is critically damped and of second order.
     """
@@ -78,7 +78,7 @@ def placed(bandwidth: float) -> PidController:
 
 
 def test_a_small_step_is_the_response_of_three_equal_poles() -> None:
-    """The response to a small step is that of three equal poles, 1 - (1 + wt + (wt)^2/2) exp(-wt).
+    """The response to a small step is the response of three equal poles, 1 - (1 + wt + (wt)^2/2) exp(-wt).
 
     With b = 0, the target acts only through the integral.
     """

@@ -87,7 +87,7 @@ def test_the_errors_of_attitude_and_rate_are_of_the_size_that_they_are_said_to_b
 def test_a_wrong_direction_of_time_leaves_the_attitude_at_mid_exposure_and_turns_the_rate() -> None:
     """If the order of the ends is wrong, the attitude at mid-exposure is right, and the rate is reversed.
 
-    A frame does not show which end was first.
+    A frame does not show which end of a streak was exposed first.
     """
     frame = _frame(1)
     streaks = _streaks(frame)

@@ -88,7 +88,7 @@ def test_curved_streaks_about_an_axis_near_the_boresight_are_measured(theta_deg:
 def test_the_covariance_is_that_of_the_errors_over_many_frames() -> None:
     """The normalised squared errors of 40 frames are in the chi-square band, widened for the bias.
 
-    The bias is that of the corner detector.
+    The corner detector causes the bias.
     """
     settings = dataclasses.replace(StreakSettings(), endpoint_bias_sigma=0.0)
     nees = []

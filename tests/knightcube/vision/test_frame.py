@@ -192,7 +192,7 @@ def test_weights_interpolate_between_block_centres_and_are_constant_beyond() -> 
 
 
 def test_moments_are_those_of_a_uniform_line_on_any_side_of_a_point_spread() -> None:
-    """The moments of a region are those of a uniform line in any direction, blurred by a point spread.
+    """A region has the moments of a uniform line in any direction, blurred by a point spread.
 
     The line is 12 px long, and each of its 12,001 points is spread evenly over 1 px^2.
     """
@@ -310,7 +310,7 @@ def test_levels_between_counts_and_beyond_the_type_compare_as_numbers_do() -> No
 @pytest.mark.parametrize("size", [1, 2, 24, 25, 64, 255])
 @pytest.mark.parametrize("sigma", [0.0, 0.4, 3.0, 500.0])
 def test_the_compiled_moments_of_blocks_equal_those_in_numpy(size: int, sigma: float) -> None:
-    """The compiled moments of blocks equal those of numpy.
+    """The compiled moments of blocks equal the moments by numpy.
 
     With little noise, many pixels have equal integer counts. Each block contains a bright object.
     """
@@ -355,7 +355,7 @@ def test_the_compiled_reduction_of_a_frame_equals_that_in_numpy(dtype: type[np.g
 
 
 def test_the_compiled_moments_of_regions_equal_those_in_numpy() -> None:
-    """The compiled moments of regions equal those of numpy.
+    """The compiled moments of regions equal the moments by numpy.
 
     One region has no pixels, and one region has only pixels without light.
     """

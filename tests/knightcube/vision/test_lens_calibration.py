@@ -226,7 +226,7 @@ def test_the_terms_that_the_stars_show_are_fitted_and_others_stay_zero(shape: di
 
 
 def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None:
-    """The lens of mirrored images is that of the images as given.
+    """The lens of mirrored images describes the images as given.
 
     Image and sky have left and right swapped.
     """
@@ -352,7 +352,7 @@ def test_missing_distortion_and_an_undetermined_centre_are_omitted() -> None:
 def test_the_distortion_is_stated_if_it_is_below_half_of_the_prior(share: float, known: bool) -> None:
     """The distortion is stated if its uncertainty is below half of the prior uncertainty.
 
-    The expected displacement of a corner is that for k1 = 1 and k2 = 3 at a squared tangent of 0.25.
+    The displacement of a corner is computed for k1 = 1 and k2 = 3 at a squared tangent of 0.25.
     """
     lens = Lens(1024, 1024, 2.0 * math.hypot(511.5, 511.5), (511.5, 511.5), 0.0, 0.0)
     corner = math.hypot(1.0 * 0.25, 3.0 * 0.25**2)

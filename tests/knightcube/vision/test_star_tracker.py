@@ -32,7 +32,7 @@ def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) ->
     assert solution
     assert (solution.status, solution.reason) == ("solved", "")
     error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))
-    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # 99.9 % of chi-square with 3 degrees
+    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # 99.9 % quantile, 3 degrees of freedom
     assert np.linalg.norm(error[:2]) < 15.0 * ARCSECOND
     assert solution.field_of_view_deg == pytest.approx(12.0, abs=0.01)
     assert not solution.mirrored

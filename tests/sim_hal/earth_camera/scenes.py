@@ -104,8 +104,8 @@ def random_sun_scene(
         ray = model.lens.unit_vectors(point[None, :])[0]
         sun = random_direction(generator)
         roll = random_direction(generator)
-        # The attitude follows from two triads of vectors, in camera axes and in inertial axes. Each triad is
-        # that of the Sun direction and a second direction.
+        # The attitude follows from two triads of vectors, in camera axes and in inertial axes. Each triad
+        # consists of the Sun direction and a second direction.
         camera = _triad(ray, np.array([0.6, 0.8, 0.0]))
         attitude = quaternion.from_matrix(camera.T @ _triad(sun, roll))
         position = (SEMI_MAJOR_AXIS + generator.uniform(*altitudes)) * random_direction(generator)

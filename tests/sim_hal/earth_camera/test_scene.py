@@ -123,7 +123,7 @@ def test_the_night_side_is_dark_and_its_limb_too() -> None:
 
 
 def test_brightness_under_the_sun_is_that_of_matt_ground_seen_through_air() -> None:
-    """Below the Sun, the brightness is between those of sea and clouds, plus scattered light.
+    """Below the Sun, the brightness is between the brightness of sea and of clouds, plus scattered light.
 
     The atmosphere dims the light of sea and clouds twice.
     """

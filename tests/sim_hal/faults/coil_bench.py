@@ -88,7 +88,7 @@ def observe(
 ) -> Watched:
     """Drive the coils for some time, and return the results of a coil monitor.
 
-    `gain` is a factor of the configured resistance.
+    The resistance of each simulated coil is the configured resistance divided by `gain`.
     """
     config = demo_config(duration, camera=False)
     entries = tuple(FaultEntry(fault=fault) for fault in faults)

@@ -131,7 +131,7 @@ def test_a_turn_about_plus_y_moves_stars_to_the_left() -> None:
 
 
 def test_a_star_on_the_axis_of_rotation_does_not_move() -> None:
-    """A star on the axis of rotation does not move: its image is that of a star at rest, at any rate."""
+    """At any rate, a star on the axis of rotation has the image of a star at rest."""
     point = np.array([[120.3, 60.8]])
     axis = MODEL.pinhole.unit_vectors(point)[0]
     image = expected_electrons(MODEL, at_pixels(MODEL, point), [2.0], *turning(1.5 * axis, samples=3))
@@ -348,7 +348,7 @@ def test_streaks_that_an_edge_cuts_are_exact(start: tuple[float, float]) -> None
 def test_a_track_under_a_rolling_shutter_is_a_star_under_the_opposite_turn() -> None:
     """Under a rolling shutter, an object that passes a camera at rest has the image of a star.
 
-    The image is that of a star in a camera that rotates in the opposite sense.
+    The image equals the image of a star in a camera that rotates in the opposite sense.
     """
     times, attitudes = _history(np.array([100.0, -120.0, 0.0]) / ROLLING_FOCAL, 23)
     star = at_pixels(ROLLING_MODEL, [40.0, 40.0])
@@ -371,7 +371,7 @@ def test_a_still_camera_sees_what_a_global_shutter_sees() -> None:
 
 
 def test_with_hardly_any_line_time_a_field_of_streaks_is_a_global_shutters() -> None:
-    """With a very short line time, a field of streaks equals that of a global shutter.
+    """With a very short line time, a field of streaks equals the field of a global shutter.
 
     Stars on and around the detector cross each edge, and a few stars are behind the camera.
     """

@@ -104,8 +104,8 @@ def test_the_camera_shows_an_object_as_a_streak_of_its_rate_and_magnitude() -> N
     weights, places = light[rows, columns], np.stack([columns, rows], axis=1).astype(float)
     middle = np.average(places, axis=0, weights=weights)
     assert np.hypot(*(middle - (camera.columns - 1) / 2)) == pytest.approx(length / 2, abs=0.5)
-    # Along a uniform line of length L, the variance is L^2 / 12 plus that of the spot. Across the line, the
-    # variance is that of the spot.
+    # Along a uniform line of length L, the variance is L^2 / 12 plus the variance of the spot. Across the
+    # line, only the spot contributes to the variance.
     across, along = np.linalg.eigvalsh(np.cov(places.T, aweights=weights))
     assert np.sqrt(12.0 * (along - across)) == pytest.approx(length, rel=0.05)
 

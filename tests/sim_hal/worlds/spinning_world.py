@@ -1,4 +1,4 @@
-"""A third-party world in which a body rotates at a constant rate about the thread."""
+"""A third-party world in which a body rotates at a constant rate about the suspension thread."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def both(
 
 
 def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradient() -> None:
-    """Orbit, field and rotation of both worlds agree, with coils and gravity gradient.
+    """Two worlds with coils and gravity gradient agree in orbit, field and rotation.
 
     The degree 13 of IGRF-14, which WMM2025 does not have, changes the attitude by a milliradian.
     """

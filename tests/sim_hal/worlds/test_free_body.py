@@ -104,7 +104,7 @@ def test_the_errors_of_craft_and_coils_are_as_large_as_asked_for() -> None:
 
 
 def test_drag_on_a_box_is_its_arm_across_the_force_on_its_shadow() -> None:
-    """For a convex box, the drag torque is that of the total force at the centre of the box."""
+    """For a convex box, the drag torque equals the torque of the total force at the centre of the box."""
     arm, flow = np.array([0.01, -0.005, 0.015]), np.array([5000.0, 4000.0, -3000.0])
     faces = box((0.3, 0.1, 0.2), arm, np.zeros(6))
     shadow = np.array([0.02, 0.06, 0.03]) @ np.abs(flow)
@@ -269,7 +269,7 @@ def test_without_torque_energy_and_momentum_are_kept(speed: float) -> None:
 def test_a_body_at_the_stable_attitude_swings_with_the_known_period() -> None:
     """Near the stable attitude, a body oscillates in pitch with omega^2 = 3 n^2 (J_x - J_z) / J_y.
 
-    The formula is that of Wertz 1978, 18.3.
+    The formula is in Wertz 1978, 18.3.
     """
     inertia = (0.0333, 0.0333, 0.0066)
     rotation, n = Rotation(inertia), 1.1e-3
@@ -291,7 +291,7 @@ FOLDER = Path(__file__).resolve().parents[3] / "config"
 
 @pytest.mark.parametrize("name", ["orbit.yaml", "orbit_3u.yaml", "orbit_object.yaml", "orbit_object_1u.yaml"])
 def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
-    """The coils and the inertia of the configuration are those of the world, within a few per cent.
+    """The configuration has the coils and the inertia of the world, within a few per cent.
 
     Entirely different coils would be a wrong configuration.
     """

@@ -125,7 +125,7 @@ def _by_kepler(elements: KeplerianElements, time: float) -> FloatArray:
 def test_two_bodies_keep_keplers_laws(elements: KeplerianElements) -> None:
     """The motion of two bodies obeys Kepler's laws for 55,000 s, about nine revolutions.
 
-    The orbit is that of the thesis. The positions agree to 1 cm, at up to 66,000 km from the Earth's centre.
+    The thesis uses this orbit. The positions agree to 1 cm, at up to 66,000 km from the Earth's centre.
     """
     orbit = propagate(elements, 55_000.0, j2=0.0)
     for time in (0.0, 17.3, 5000.0, 31_234.5, 55_000.0):
@@ -311,7 +311,8 @@ def test_the_sun_stands_where_it_was_published(
 def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float, longitude: float) -> None:
     """At equinoxes and solstices, the Sun's longitude is a multiple of 90 deg.
 
-    The longitudes are those of date. Longitudes of J2000 are smaller by the precession, 50.29" a year.
+    The longitudes refer to the equinox of date. Longitudes of J2000 are smaller by the precession, 50.29" a
+    year.
     """
     when = julian_date + 69.0 / DAY
     x, y, z = sun_position(when)

@@ -121,8 +121,8 @@ RADIUS, CURRENT, MEASURED = 0.15, 2.19, 9.98e-4
 """Radius (m), current (A) and field (T) by the thesis: "approximately 15 cm", "9.98 gauss ... at a current
 of 2.19 A"."""
 TURNS = 76
-"""Number of turns of each coil, from eq. 5.34 and the measured field. The thesis does not state the number.
-"""
+"""Number of turns of each coil, from eq. 5.34 and the measured field. The thesis does not state the number of
+turns."""
 
 
 def test_the_measured_field_is_that_of_76_turns() -> None:

@@ -482,7 +482,7 @@ def test_the_dipole_of_a_corrected_coil_is_unknown_in_the_steps_before() -> None
 
 
 def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_less_certain() -> None:
-    """If the currents of redundant coils are not those of least heat, the dipole is less certain."""
+    """If the currents of redundant coils do not cause the least heat, the dipole is less certain."""
     flown = acquired()
     pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
     coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
@@ -534,7 +534,7 @@ def test_star_fixes_give_attitude_and_rate_of_a_tumbling_body_without_a_gyro(
 ) -> None:
     """Without a gyro, star fixes every 2 or 5 s determine attitude and rate of a tumbling body.
 
-    The first fix leaves the rate about the field unknown. The second fix must not discard the first.
+    The first fix leaves the rate about the field unknown. The second fix must not discard the first fix.
     """
     flown = Flown(pulses)
     flown.rate, flown.has_gyro = TUMBLE, False

@@ -73,7 +73,7 @@ def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_
     feed, filter_ = feed_of()
     for step in range(40):
         feed.accept(reading(step * PERIOD_NS, FIELD))
-    # A dipole along the axis of the thread gives no torque.
+    # A dipole along the axis of the suspension thread gives no torque.
     filter_.command(40 * PERIOD_NS, np.array([0.0, 0.05, 0.0]))
     offset = attitude_matrix(about_axis_y(0.1)) @ FIELD
     for step in range(40, 240):

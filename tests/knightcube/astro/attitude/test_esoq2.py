@@ -124,8 +124,8 @@ def test_the_covariance_and_the_loss_are_those_of_the_errors() -> None:
         error = to_rotation_vector(multiply(found.quaternion, conjugate(q)))
         squared.append(error @ np.linalg.solve(found.covariance, error))
         losses.append(2.0 * found.loss)
-    # The expected means are those of chi-squares with 3 and with 2n - 3 = 9 degrees of freedom. The tolerance
-    # is three standard errors.
+    # The expected means are the means of chi-squares with 3 and with 2n - 3 = 9 degrees of freedom. The
+    # tolerance is three standard errors.
     assert np.mean(squared) == pytest.approx(3.0, abs=3.0 * np.sqrt(6.0 / runs))
     assert np.mean(losses) == pytest.approx(9.0, abs=3.0 * np.sqrt(18.0 / runs))
 

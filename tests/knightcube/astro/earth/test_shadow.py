@@ -52,7 +52,7 @@ def test_the_umbra_ends_where_hipparchus_had_it() -> None:
 @pytest.mark.parametrize("share_of_way", [0.1, 0.3, 0.5, 0.8])
 @pytest.mark.parametrize("depth", [2500e3, 42_164e3])
 def test_in_penumbra_the_share_is_that_of_rays_that_pass_the_earth(depth: float, share_of_way: float) -> None:
-    """In penumbra, the sunlit fraction is that of 200,000 rays from the Sun's disc that pass the Earth."""
+    """In penumbra, the sunlit fraction equals the part of 200,000 rays from the Sun that pass the Earth."""
     width = depth * 2.0 * SUN_RADIUS / ASTRONOMICAL_UNIT
     middle = EARTH_RADIUS + depth * EARTH_RADIUS / ASTRONOMICAL_UNIT
     position = _behind(depth, middle + (share_of_way - 0.5) * width)
@@ -79,7 +79,7 @@ def test_between_earth_and_sun_it_is_day_everywhere() -> None:
 def test_the_cylinder_is_as_wide_as_the_earth() -> None:
     """The edge of the cylindrical shadow is one Earth radius from its axis, at any distance behind the Earth.
 
-    By the errata to equation 2.15, the position in this equation is that of the object.
+    By its errata, equation 2.15 contains the position of the object.
     """
     for depth in (1000e3, 42_164e3):
         assert sunlit_share(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical") == 0.0

@@ -62,7 +62,7 @@ def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_no
 def test_redundant_coils_share_a_dipole_with_the_least_heat_within_their_limits(
     seed: int, count: int
 ) -> None:
-    """The feasible dipoles equal those of linear programming, and the heat that of a general optimiser."""
+    """The feasible dipoles agree with linear programming, and the heat agrees with a general optimiser."""
     generator = np.random.default_rng(seed)
     dipoles = generator.standard_normal((3, count))
     limits, ohms = generator.uniform(0.05, 1.0, count), generator.uniform(5.0, 60.0, count)
@@ -174,9 +174,9 @@ def test_the_covariance_of_coils_along_the_body_axes_is_that_of_gain_and_misalig
 
 
 def test_the_field_of_a_coil_is_that_of_a_loop_on_its_axis_and_of_a_dipole_far_away() -> None:
-    """The field of a coil on its axis is that of a loop, B = mu0 m / (2 pi (a^2 + z^2)^1.5).
+    """On its axis, a coil has the field of a loop, B = mu0 m / (2 pi (a^2 + z^2)^1.5).
 
-    The formula is that of Jackson, section 5.5. Far away, the field is that of a dipole.
+    The formula is in Jackson, section 5.5. Far away, the coil has the field of a dipole.
     """
     area, height = 0.0081, 0.04
     moment = 0.648 * np.array([0.6, 0.0, 0.8])

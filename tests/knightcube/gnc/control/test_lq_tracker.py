@@ -26,7 +26,7 @@ WEIGHTS = 20.0, 1.0
 @settings(deadline=None)
 @given(st.floats(0.01, 1e4), st.floats(0.01, 1e3))
 def test_gains_are_those_of_a_general_solver(state_weight: float, input_weight: float) -> None:
-    """The gains (5.28-5.32) for the state (e', e) are those of scipy's solution of the Riccati equation."""
+    """The gains (5.28-5.32) for the state (e', e) agree with scipy's solution of the Riccati equation."""
     integrators, entry = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])
     riccati = solve_continuous_are(integrators, entry, state_weight * np.eye(2), [[input_weight]])
     expected = (entry.T @ riccati)[0] / input_weight

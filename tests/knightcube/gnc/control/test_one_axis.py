@@ -83,7 +83,7 @@ def test_near_the_path_the_law_is_that_of_the_thesis_with_the_disturbance_subtra
 def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float) -> None:
     """A large error e is reduced at most at the rate sqrt(2 a e - r^2), at which no torque is demanded.
 
-    The acceleration a is 0.8 of that by the available torque, and r = a K_e' / K_e.
+    The acceleration a is 0.8 of the acceleration by the available torque, and r = a K_e' / K_e.
     """
     tracker = LqTracker(PLANT, 20.0, 1.0)
     error = 0.5
@@ -193,7 +193,7 @@ def cycles(controller: ExcitationController, count: int, angle: float, rate: flo
 def test_a_manoeuvre_begins_after_a_second_at_rest(angle: float, rate: float, moves: bool) -> None:
     controller = ExcitationController(PLANT, PERIOD, SETTINGS)
     cycles(controller, 41, angle, rate)
-    # A pulse demands half of the current limit. Without a pulse, the current is that of the tracker.
+    # A pulse demands half of the current limit. Without a pulse, the tracker commands the current.
     pulses = {round(abs(one.demanded), 9) for one in cycles(controller, 20, angle, rate)}
     assert (pulses == {0.074}) is moves
 

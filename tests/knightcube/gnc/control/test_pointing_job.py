@@ -135,7 +135,7 @@ def test_a_slew_with_an_isolated_coil_is_made_by_the_other_two_within_their_limi
     assert np.abs(currents).max() < LIMIT
     missed = np.linalg.norm(torques - [found.torque for found in made], axis=1)
     assert missed.sum() < 0.05 * np.linalg.norm(torques, axis=1).sum()
-    # The heat of the plan is that of the remaining coils.
+    # The heat of the plan is computed for the remaining coils.
     heat = 5.0 * float((currents**2).sum(axis=1).mean()) * path.horizon
     assert heat < 1.2 * path.heat(left.heat)
 

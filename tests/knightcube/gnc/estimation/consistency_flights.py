@@ -11,8 +11,9 @@ of its packets, and sends nothing in two intervals of 0.5 to 1 s. Every 5 s the 
 rate over 1 s with a full covariance if the stars are streaks, and on the free body also an attitude. The
 camera's results are delayed by 0.2 to 0.6 s.
 
-NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band is that of chi-square over
-independent runs. NIS divided by its degrees of freedom has a similar band, over all accepted measurements.
+NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band follows from the
+chi-square of independent runs. NIS divided by its degrees of freedom has a similar band, over all accepted
+measurements.
 """
 
 from __future__ import annotations
@@ -131,7 +132,7 @@ class Camera:
 
 
 class Pilot:
-    """Control by the estimate: steps of q2 on the thread, or excitation of all axes of a free body."""
+    """Control by the estimate: steps of q2 of a suspended body, or excitation of all axes of a free body."""
 
     def __init__(self, rng: np.random.Generator, suspended: bool) -> None:
         self._suspended = suspended

@@ -1,9 +1,9 @@
-"""A linear Kalman filter of the rotation about the thread, a reference for the three-axis filter.
+"""A linear Kalman filter of the rotation about the suspension thread, a reference for the three-axis filter.
 
 The states of the filter are angle, rate and disturbance. The angle theta = 2 asin q2 is used instead of q2,
-because its kinematics are linear (Sease 5.9 is not): theta' = omega and omega' = u + d. The acceleration u is
-that of the plant model for the known current. The disturbance d, such as the thread's torque, is a random
-walk. Each measurement is applied at its own time. After a late measurement, the later measurements are
+because its kinematics are linear (Sease 5.9 is not): theta' = omega and omega' = u + d. The plant model gives
+the acceleration u for the known current. The disturbance d, such as the torque of the suspension thread, is a
+random walk. Each measurement is applied at its own time. After a late measurement, the later measurements are
 applied again. A rate from a streaked image is the mean rate over its exposure. Until the exposure ends, the
 angle at its start is an additional state (stochastic cloning, Roumeliotis and Burdick 2002), so an
 acceleration within the exposure does not contradict the mean.

@@ -25,7 +25,7 @@ ANGLE_SIGMA, RATE_SIGMA = 2.02e-3, 1.01e-4
 def simulate(
     rng: np.random.Generator, cycles: int, stiffness: float = 1e-5
 ) -> tuple[FloatArray, list[float], list[Measurement]]:
-    """Return truth (cycles, 2) of angle and rate, commands and noisy measurements of a body on a thread."""
+    """Return truth (cycles, 2) of angle and rate, commands and noisy measurements of a suspended body."""
     angle, rate = rng.normal(0.0, 0.3), rng.normal(0.0, 0.02)
     truth, commands, measurements = np.empty((cycles, 2)), [], []
     for cycle in range(cycles):

@@ -147,7 +147,7 @@ def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out(
 
 
 def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
-    """The filter of a body on a thread ignores the measured motion about the other axes, such as a swing."""
+    """The filter of a suspended body ignores the measured motion about the other axes, such as a swing."""
     flight = fly(6, 60, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)

@@ -349,7 +349,7 @@ def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time()
 
 
 def test_after_a_large_correction_the_remaining_error_is_that_of_the_corrected_axes() -> None:
-    """After a large correction, the covariance is that of errors in the corrected axes.
+    """After a large correction, the covariance refers to errors in the corrected axes.
 
     A direction that a measurement determines accurately is fixed in inertial space, not in the body.
     """

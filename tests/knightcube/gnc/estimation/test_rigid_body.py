@@ -56,7 +56,7 @@ def test_free_it_obeys_eulers_equation() -> None:
 def test_its_derivatives_are_those_of_its_acceleration(suspended: bool) -> None:
     thread = {"stiffness": 1e-5, "damping": 2e-6} if suspended else {}
     body = RigidBody(SKEWED, DIPOLE, FIELD, suspended, **thread)
-    # For a rotation about another axis than the thread, the twist changes at a different rate.
+    # For a rotation about another axis than the suspension thread, the twist changes at a different rate.
     q = exponential(0.0, 0.7, 0.0) if suspended else Q
     model = body.linearise(q, RATE, body.parameters, body.torquing(CURRENTS), 0.0)
     step = 1e-6

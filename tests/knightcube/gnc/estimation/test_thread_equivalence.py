@@ -1,4 +1,4 @@
-"""Tests that the three-axis filter of a body on a thread gives the estimates of the single-axis filter."""
+"""Tests that the three-axis filter of a suspended body gives the estimates of the single-axis filter."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.knightcube.gnc.estimation.single_axis_flights import PERIOD, PLANT, S
 from tests.support.consistency_worlds import KNOWN_PLANT
 
 ODD: FloatArray = np.array([3e-3, 0.0, -1e-2])
-"""Rate (rad/s) about the other two axes, which does not affect the rotation about the thread."""
+"""Rate (rad/s) about the other two axes, which does not affect the rotation about the suspension thread."""
 
 
 def on_three_axes(measurement: single_axis.Measurement) -> Measurement:

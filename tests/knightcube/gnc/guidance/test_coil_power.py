@@ -43,7 +43,7 @@ def test_each_coil_has_its_own_resistance() -> None:
 def test_it_is_the_charge_that_the_simulated_bridges_take_from_their_supply(
     current: tuple[float, float, float],
 ) -> None:
-    """The power agrees with that of the simulated circuit.
+    """The power agrees with the power of the simulated circuit.
 
     The circuit integrates the chopped current over three whole periods.
     """

@@ -18,7 +18,7 @@ def test_the_oracle_reproduces_the_published_optima_to_1e_4() -> None:
 
 
 def test_the_oracle_reproduces_the_closed_form_of_a_small_slew() -> None:
-    """For a small slew, int I^2 dt is that of the closed form, 12 a^2 / T^3.
+    """For a small slew, int I^2 dt equals the closed form, 12 a^2 / T^3.
 
     With cos(theta) = 1 and without a limit, theta'' is linear in time.
     """

@@ -27,7 +27,7 @@ from knightcube.gnc.guidance.plant import CubicPrey, lgl_rule
 def test_nodes_and_weights_are_the_published_ones(
     count: int, nodes: list[float], weights: list[float]
 ) -> None:
-    """Nodes and weights are those of Abramowitz & Stegun, table 25.6."""
+    """Abramowitz & Stegun list the nodes and weights in table 25.6."""
     rule = lgl_rule(count)
     np.testing.assert_allclose(rule.nodes, nodes, atol=1e-14)
     np.testing.assert_allclose(rule.weights, weights, atol=1e-14)

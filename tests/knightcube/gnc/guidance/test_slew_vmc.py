@@ -73,7 +73,7 @@ def test_the_gradients_of_heat_and_constraints_equal_finite_differences() -> Non
 
 
 def test_the_motion_is_that_of_the_path_to_which_the_parameters_belong() -> None:
-    """A motion is that of the polynomial through the nodes, plus the basis times the parameters y."""
+    """A motion is the polynomial through the nodes, plus the basis times the parameters y."""
     case = problem("E-knightcube-1u-iss-B90-300")
     task = task_of(case, case["T"])
     rule = discretisation(10).rule

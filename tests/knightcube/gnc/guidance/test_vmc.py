@@ -92,7 +92,7 @@ def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
 
 
 def bang_bang_time(problem: Problem) -> float:
-    """Return the shortest time (s) without a thread, by full torque in one direction and then in the other.
+    """Return the shortest time (s) of a free body, by full torque in one direction and then in the other.
 
     The energy determines the angle at which the torque is reversed, because J w^2/2 changes by the torque
     constant times I times the change of sin(theta). The time is the integral of d(theta)/w. The substitution
@@ -344,8 +344,8 @@ def test_the_shortest_times_are_the_published_ones() -> None:
 def test_from_a_tenth_above_the_shortest_horizon_on_paths_are_optimal_and_within_the_limits() -> None:
     """Paths of at least 1.1 times the shortest duration are optimal and within the limits.
 
-    The problems are a part of the benchmark `plan`, with a thread, a disturbance and non-zero rates at both
-    ends.
+    The problems are a part of the benchmark `plan`, with a suspension thread, a disturbance and non-zero
+    rates at both ends.
     """
     costs = []
     for problem, shortest in feasible_problems(40, seed=11):
@@ -452,7 +452,7 @@ def test_a_last_path_that_does_not_fit_does_no_harm() -> None:
 def test_the_planned_current_flies_the_body_under_thread_and_disturbance_to_its_moving_end() -> None:
     """Without feedback, the planned current leads the body to the end point of the plan.
 
-    The body has a thread and a disturbance, and the end point moves.
+    A suspension thread and a disturbance act on the body, and the end point moves.
     """
     found = plan(CARRIED, 0.1, 0.01, -0.2, 0.015, 11.0)
     count = 2200

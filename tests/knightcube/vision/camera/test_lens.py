@@ -90,7 +90,7 @@ def test_pixels_and_directions_agree_with_aspect_shear_and_tangential_terms(
 ) -> None:
     """With stretched and sheared axes and tangential terms, pixels and directions agree.
 
-    The positions are those of Brown (1966), which are then stretched and sheared about the axis.
+    The model of Brown (1966) gives the positions, which are then stretched and sheared about the axis.
     """
     aspect, shear, p1, p2 = shape
     lens = Lens(1000, 800, 1000.0, (490.0, 410.0), -0.1, 0.02, *shape)
@@ -146,8 +146,7 @@ def test_the_boresight_falls_between_the_middle_pixels() -> None:
 def test_the_field_of_view_ends_at_the_outer_edge_of_the_outermost_pixel() -> None:
     """The field of view ends at the outer edge of the outermost pixel, half the columns from the centre.
 
-    The definition is that of Sease, section 2.4. Coordinate 0 is the centre of a pixel, whose edge is at
-    -0.5.
+    Sease defines the angle in section 2.4. Coordinate 0 is the centre of a pixel, whose edge is at -0.5.
     """
     edge = np.radians(10.0)
     points = CAMERA.project(np.array([[np.sin(edge), 0.0, np.cos(edge)], [-np.sin(edge), 0.0, np.cos(edge)]]))

@@ -160,7 +160,7 @@ def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, 
 
 
 def test_of_too_many_edges_those_with_the_darkest_side_are_kept() -> None:
-    """If there are too many edges, those with the darkest side are kept.
+    """If there are too many edges, the edges with the darkest side are kept.
 
     Eight bars on a rising background give 4 rising edges in each of 8 rows, of which two are kept.
     """

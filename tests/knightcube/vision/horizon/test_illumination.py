@@ -205,7 +205,7 @@ def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_ar
 
 
 def test_a_bright_band_in_the_sky_is_stray_light_although_it_is_as_small_as_a_glare() -> None:
-    """A bright band in the sky is stray light, although its area is not larger than that of a glare.
+    """A bright band in the sky is stray light, although its area is not larger than the area of a glare.
 
     The band is 4 deg wide and 20 deg long, and the samples are 1 deg apart.
     """

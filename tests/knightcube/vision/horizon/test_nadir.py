@@ -191,7 +191,7 @@ def test_a_horizon_that_contradicts_the_coarse_sun_is_refused(day: tuple[EarthSc
 def test_a_horizon_with_bright_sky_is_refused(day: tuple[EarthScene, Image]) -> None:
     """A horizon with bright sky is refused.
 
-    The image is rotated by 180 deg, but the known attitude is that of the original image.
+    The image is rotated by 180 deg, but the known attitude belongs to the original image.
     """
     scene, frame = day
     found = find_nadir(

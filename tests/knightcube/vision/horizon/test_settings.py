@@ -18,7 +18,7 @@ from knightcube.vision.horizon.settings import (
 def test_a_logarithmic_detector_adds_equal_counts_for_each_decade_of_light() -> None:
     """A logarithmic detector gives the same number of counts for each decade of light.
 
-    With 50 counts per decade above 20, the tested counts are those of 0, 9 and 99 times the dark current.
+    With 50 counts per decade above 20, the tested counts correspond to 0, 9 and 99 times the dark current.
     """
     response = LogarithmicResponse(20.0, 50.0)
     counts = np.array([[20, 70, 120]], dtype=np.uint8)

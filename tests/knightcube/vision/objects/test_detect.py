@@ -1,4 +1,4 @@
-"""Tests of the detection of objects by the deviation of their streaks from those of stars.
+"""Tests of the detection of objects by the difference between their streaks and the streaks of stars.
 
 The indicators of a deviation are compared with values computed by hand, for stars at every angle, and for
 objects. Simulated frames test detections, false alarms, overlaps with stars, objects that cross, and the
@@ -240,8 +240,8 @@ def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: floa
     report, path = _see(motion, 4.0, exposure=exposure)
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.5)
-    # The image does not show which end is first. The reported order gives the smaller rate, and the rate for
-    # the other order is reported too.
+    # The image does not show which end of a streak was exposed first. The reported order gives the smaller
+    # rate, and the rate for the other order is reported too.
     assert found.relative_rate == pytest.approx(px / _FOCAL / exposure, rel=0.02)
     assert found.other_relative_rate > found.relative_rate
     np.testing.assert_allclose(found.direction, [np.cos(towards), np.sin(towards)], atol=0.03)
@@ -340,7 +340,7 @@ def test_an_object_that_crosses_a_star_is_found() -> None:
 def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: float) -> None:
     """A tracked object on the streak of a star is found.
 
-    The region of both is long, and saturated at magnitude 4.
+    The common region of the two objects is long, and saturated at magnitude 4.
     """
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
     directions = np.concatenate([directions, _PLACE[None]])
@@ -482,7 +482,7 @@ def test_two_equally_bright_objects_that_cross_keep_their_tracks() -> None:
 def test_a_crowded_sky_at_rest_or_nearly_so_has_an_attitude(right: float, up: float, rate_deg: float) -> None:
     """A crowded sky at rest, or with streaks of up to 1.5 px, gives an attitude.
 
-    Faint regions merge and look long.
+    In such frames, faint regions merge into long regions.
     """
     held = _looking_at(right, up)
     turn = np.array([0.0, np.radians(rate_deg), 0.0])

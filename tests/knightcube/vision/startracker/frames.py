@@ -84,7 +84,7 @@ def _slope(camera: Pinhole, star: FloatArray) -> FloatArray:
 
 
 def sky() -> SkyIndex:
-    """Return the default sky index, whose epoch is that of the frames."""
+    """Return the default sky index, whose epoch is the epoch of the frames."""
     return default_index()
 
 

@@ -200,7 +200,10 @@ def test_a_match_grows_from_the_axis_as_the_distortion_is_determined(distortion:
 
 
 def test_the_distorted_fits_covariance_is_that_of_many_fits() -> None:
-    """For 100 lenses with 5 % of distortion, attitude and scale have a chi-square with 4 degrees."""
+    """For lenses with distortion, the errors of attitude and scale have a chi-square.
+
+    The chi-square has 4 degrees of freedom. The test draws 100 lenses with 5 % of distortion.
+    """
     draw = np.random.default_rng(4)
     errors, shares = [], []
     for _ in range(100):

@@ -103,8 +103,8 @@ def test_excess_scatter_of_the_stars_increases_the_covariance() -> None:
     ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
     assert sound.excess == 1.0
     assert wider.excess == pytest.approx(25.0, rel=0.5)
-    # In the covariance, which is that of the attitude, the residuals have 24 - 3 degrees of freedom. In
-    # `excess`, which also accounts for the scale, the residuals have 24 - 4 degrees of freedom.
+    # In the covariance of the attitude, the residuals have 24 - 3 degrees of freedom. In `excess`, which also
+    # accounts for the scale, the residuals have 24 - 4 degrees of freedom.
     assert ratio == pytest.approx(wider.excess * (24 - 4) / (24 - 3) / 25.0, rel=1e-3)
 
 

@@ -46,7 +46,7 @@ def _right(found: StarMatch, drawn: StarList) -> bool:
 def test_every_configuration_of_the_issue_is_named(kind: ListKind) -> None:
     """The stars of each tested configuration are identified.
 
-    The lists are a small part of those of `python -m tests.studies.bench starid`.
+    The lists are a small part of the lists of `python -m tests.studies.bench starid`.
     """
     for seed in range(10):
         drawn = _drawn(kind, seed)
@@ -99,7 +99,7 @@ def test_other_cameras_and_worse_detectors_are_supported(kind: ListKind) -> None
 def test_false_stars_brighter_than_all_true_ones_do_not_hide_the_sky(false_stars: int, least: int) -> None:
     """False stars that are brighter than all true stars do not prevent the identification.
 
-    The lists are a small part of those of `python -m tests.studies.bench starid --hard`, with an unknown
+    The lists are a small part of the lists of `python -m tests.studies.bench starid --hard`, with an unknown
     field.
     """
     right = 0

@@ -72,7 +72,7 @@ def test_an_impossible_velocity_is_refused() -> None:
 
 
 def test_the_earths_velocity_is_the_published_one() -> None:
-    """The Earth's velocity (barycentric, au per day) is that of ERFA's test of epv00.
+    """The Earth's velocity (barycentric, au per day) comes from ERFA's test of epv00.
 
     The date is MJD 53411.52501161.
     """

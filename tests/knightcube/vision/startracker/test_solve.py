@@ -225,7 +225,7 @@ def test_noise_alone_shows_no_star() -> None:
 
 
 def test_points_that_are_not_stars_are_refused_with_the_reason() -> None:
-    """Points that are not stars are refused with a reason.
+    """Points that are not stars give no attitude, and the reason is reported.
 
     The points of a real frame are moved at random. The moved points keep their flux, but match no part of the
     sky.
@@ -260,7 +260,7 @@ def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
 def test_a_mirrored_photograph_is_solved_and_reported_as_mirrored() -> None:
     """A mirrored photograph is solved and reported as mirrored.
 
-    The attitude is that of the unmirrored image, and the positions are those of the given image.
+    The attitude refers to the unmirrored image, and the positions refer to the given image.
     """
     upright = read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")
     camera = type(NARROW.pinhole)(upright.shape[1], upright.shape[0], 5110.0)

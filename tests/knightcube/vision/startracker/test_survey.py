@@ -57,7 +57,7 @@ def test_the_light_is_the_integral_over_each_pixel() -> None:
 
 
 def test_the_window_s_centre_is_that_of_the_printed_sums() -> None:
-    """The centre of a window equals that of equations 16 to 20, evaluated by loops over a x a pixels."""
+    """The centre of a window agrees with equations 16 to 20, evaluated by loops over a x a pixels."""
     a = 7
     window = np.random.default_rng(1).uniform(0.0, 50.0, (a, a))
     window[3, 3] += 500.0

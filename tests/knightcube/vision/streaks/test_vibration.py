@@ -105,8 +105,8 @@ def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitu
 def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() -> None:
     """A vibration that no streak resolves is refused, or the rate error is within its uncertainty.
 
-    The streaks look like those of a slightly wider point spread, but their ends are displaced. A tolerance of
-    5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
+    The streaks look like streaks with a slightly wider point spread, but their ends are displaced. A
+    tolerance of 5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
     """
     for seed in (2, 5, 6):
         frame = _frame(41.0, 0.45, seed)
