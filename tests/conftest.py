@@ -3,10 +3,10 @@
 `make slow-list` measures and writes both lists. A test is slow if all its cases together take more than
 `LIMIT_S` of processor time. The processor time of a test includes fixtures, and excludes the compilation of
 functions, because only runs with slow tests compile functions (`tests.support.compiled_forms`). `make quick`
-omits slow tests. A test that was renamed is not marked as slow until the list is measured again. Test files
-that last longer than `LONG_S` run first, in the order of decreasing duration, so that the workers of `make
-test` finish at nearly the same time. The duration of a file that waits for processes or sockets exceeds its
-processor time.
+omits slow tests. A renamed test is not marked as slow until the list is measured again. Test files that last
+longer than `LONG_S` run first, in the order of decreasing duration, so that the workers of `make test` finish
+at nearly the same time. The duration of a file that waits for processes or sockets exceeds its processor
+time.
 """
 
 from __future__ import annotations

@@ -35,7 +35,8 @@ _OPENED = f"""[Service]
 ProtectHome=no
 ReadWritePaths={_SHARE}/result.txt
 Environment=PATH={_SHARE}/bin:/usr/bin PYTHONPATH={ROOT}"""
-"""Paths that the sandbox must permit here: an interpreter in a home folder, and the test double of i2cset."""
+"""Paths that the sandbox must permit in the container: an interpreter in a home folder, and the test double
+of i2cset."""
 
 _HIDDEN = tuple(map(Path, ("/tmp", "/run", "/mnt", "/dev", "/proc", "/sys")))
 """Folders where the container has its own mounts, which hide the machine's files."""

@@ -64,7 +64,7 @@ class RenewedEnds(FiledEnds):
         return self.up[LINK] and self.command(Listing()) == "completed"
 
     def services(self) -> None:
-        """Start flight and link as systemd does, if a restart of them is requested."""
+        """Start flight and link as systemd does, if their restart is requested."""
         if not self.board.restarted():
             return
         name = self._flown()

@@ -148,7 +148,7 @@ def test_the_watchdog_leaves_room_for_four_meals() -> None:
 def test_the_link_is_watched_restarted_and_does_not_wait_for_the_flight() -> None:
     """A flight that waits at its start is not active.
 
-    A link that systemd orders after the flight would not start.
+    If systemd ordered the link after the flight, the link would not start during this wait.
     """
     text = (DEPLOY / "knightcube-link.service").read_text(encoding="utf-8")
     for line in ("Type=notify", "NotifyAccess=main", "Restart=always"):

@@ -204,5 +204,5 @@ def test_the_duration_of_a_job_does_not_lower_its_rate() -> None:
     ticker = clock.ticker("slow", 20_000_000, job)
     clock.sleep_until_ns(clock.now_ns() + 400_000_000)
     ticker.stop()
-    # On a busy machine a run may be late. The next run then follows after less than period plus job (30 ms).
+    # If a run is late on a busy machine, the next run follows after less than period plus job (30 ms).
     assert np.diff(begun).min() < 26_000_000

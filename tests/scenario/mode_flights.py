@@ -42,7 +42,7 @@ def modes_of(run: Run) -> list[Mode]:
 
 
 def entered(run: Run, mode: Mode, occurrence: int = -1) -> float:
-    """Return the mission time (s) at which a run entered a mode, by default the last such time."""
+    """Return the mission time (s) at which a run entered a mode, by default the time of the last entry."""
     return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][occurrence]) * 1e-9
 
 

@@ -52,7 +52,7 @@ _BRIGHTNESS = (3.0, 4.5)
 
 
 def two_objects() -> tuple[SkyObject, ...]:
-    """Return two objects, one on either side of the boresight."""
+    """Return two objects on opposite sides of the boresight."""
     pairs = zip(_BRIGHTNESS, _LINES, strict=True)
     return tuple(SkyObject(magnitude=m, line_of_sight=line) for m, line in pairs)
 

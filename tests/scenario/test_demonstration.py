@@ -69,7 +69,8 @@ def summary(demonstration: Run) -> dict[str, Any]:
 def power(demonstration: Run) -> dict[str, float]:
     """Return the mean powers (W) over 700 s.
 
-    In the 700 s, each step lasts 70 s longer than in the tests, at the power of its rest.
+    In a run of 700 s, each step lasts 70 s longer than in the tests. The power at rest is used for these 70
+    s.
     """
     coils = coil_power(demonstration)
     assert coils is not None

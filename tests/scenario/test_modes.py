@@ -247,7 +247,7 @@ def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
 def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
     tmp_path: Path, crashes: int, mode: Mode
 ) -> None:
-    """Too many recent crashes lead to SAFE, and one crash fewer does not.
+    """Too many recent crashes lead to SAFE, but one crash fewer does not lead to SAFE.
 
     A killed boot is recognised because its stored state still says that the boot is running.
     """

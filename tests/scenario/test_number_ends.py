@@ -65,7 +65,7 @@ def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
 
 
 def assert_survived(run: Run, driven: Driven, written: set[str]) -> None:
-    """Assert that no value out of range ended a task, and that all such values were counted and reported."""
+    """Assert that values out of range ended no task, and that all of them were counted and reported."""
     due = {(p.name, f.name): f.wraps for p in PACKETS if p.name in written for f in whole(p)}
     assert {key: kept for key, kept in driven.items() if key[0] in written} == due
     assert "task-failed" not in event_names(run)

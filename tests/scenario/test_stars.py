@@ -50,7 +50,7 @@ def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_trac
     The next frame is solved by tracking. The filter's model cannot predict the attitude of the camera. The
     body has swung freely, and the full torque of the coil then rotates the body back. The IMU resumes early
     enough that the rate changes by less than half in the next exposure of one second. The motion fit does not
-    permit a larger change.
+    permit a larger change of the rate within an exposure.
     """
 
     def prepare(rigged: Rigged) -> None:

@@ -108,7 +108,7 @@ def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: i
 
 
 def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the indices (k,) of the true stars that were detected, and those (k,) of their detections."""
+    """Return the indices (k,) of the detected true stars, and the indices (k,) of their detections."""
     if not len(found):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     apart = np.linalg.norm(places[:, None] - found.points, axis=-1)

@@ -18,7 +18,7 @@ from knightcube.vision.camera.lens import Pinhole
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:
-    """Return the boresights (m, 3), ICRS, of body `attitudes` (m, 4); `mounting` (4,) is body to camera."""
+    """Return boresights (m, 3), ICRS, for body `attitudes` (m, 4) and `mounting` (4,) from body to camera."""
     return np.asarray(quaternion.attitude_matrix(quaternion.multiply(mounting, attitudes))[..., 2, :])
 
 

@@ -55,9 +55,9 @@ def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
 def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
     """Return the slots that are late because the virtual machine's host took the processor (stolen time).
 
-    The stolen time of such a slot is at least half the period and at least half the lateness. A slot lasts
-    from the due time of its predecessor to the first sample after the slot was served. `stolen_ns` is the
-    stolen time of all cores since boot, sampled at `noted_ns`.
+    The stolen time of a returned slot is at least half the period and at least half the lateness. A slot
+    lasts from the due time of its predecessor to the first sample after the slot was served. `stolen_ns` is
+    the stolen time of all cores since boot, sampled at `noted_ns`.
     """
     due_ns = (loop.first + np.arange(len(loop.lateness))) * loop.period_ns
     late_ns = 1e9 * np.minimum(loop.lateness, 60.0)
@@ -74,9 +74,9 @@ def slope_per_hour(
     """Return the slope per hour of a noisy level and its 95 % interval (low, high), or NaN.
 
     The slope is NaN if the samples cover too short a time. The level is noisy, because a process allocates
-    and frees memory as it works. The level of each block of time is therefore its 10 % quantile, which a leak
-    increases too. The slope is the median of all pairwise slopes of the blocks, and its interval follows from
-    Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
+    and frees memory as it works. The level of each block of time is its 10 % quantile, which a leak increases
+    too. The slope is the median of all pairwise slopes of the blocks, and its interval follows from Kendall's
+    tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
     """
     from scipy import stats  # noqa: PLC0415 - the bench is not to share the flight's libraries while it flies
 

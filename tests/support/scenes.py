@@ -20,7 +20,7 @@ EXPOSURES = (0.2, 1.0)
 MOST_TURN = 0.5
 """Largest rotation of a random slew, as a fraction of the field."""
 BRIGHTEST = 7000
-"""Number of brightest stars that reproduces the tables of the thesis, which does not state its number."""
+"""Number of brightest stars that reproduces the tables of the thesis, which does not state the number."""
 LEAST_USABLE = 5
 """Smallest number of usable stars in a random slew."""
 _MOST_SKIES = 1000

@@ -301,7 +301,7 @@ def test_the_stuck_axis_is_the_one_whose_release_lets_the_current_flow_again(axi
     assert leg.is_searching
     assert leg.brake == {0, 1, 2}
     assert leg.suspicion == "supply current 150 mA, expected 0 to 0 mA"
-    # Two normal samples are needed with all bridges braked, and two more for each released bridge.
+    # The monitor needs two normal samples with all bridges braked, and two more for each released bridge.
     assert _looks(leg, {axis}) == [None] * (2 + 2 * axis + 1) + [axis]
     assert (leg.is_searching, leg.brake, leg.rest, leg.suspicion) == (False, frozenset(), False, "")
 

@@ -3,7 +3,7 @@
 A fact becomes true after N consecutive updates, and is reported once. A fact is reset in modes in which it is
 not monitored. Some facts latch.
 
-Age, rate and validity of a stream are checked separately. A stale stream is never good.
+Age, rate and validity of a stream are checked separately. A stream whose data are too old is never good.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Tests of the power system: battery, panels, current monitors and the power task.
 
 Battery, panels, emulated monitors and the power task run on a simulated clock, without a flight. The true
-battery has 10 % less capacity, 30 % more resistance and a slightly different curve than the configured one.
+battery has 10 % less capacity, 30 % more resistance and a slightly different curve than the configured
+battery.
 """
 
 from __future__ import annotations

@@ -228,7 +228,7 @@ def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
 def test_another_user_finds_no_token(ground: Ground) -> None:
     """Another user cannot read a token, even if all users may enter the key folders.
 
-    No command creates such folders.
+    No command creates a folder that all users may enter.
     """
     places = [token_path(ground.keys, ground.gateway), *sorted(ground.keys.glob("spi-*"))]
     places += [Path(f"/proc/{pid}/{name}") for pid in ground.processes for name in ("environ", "mem")]

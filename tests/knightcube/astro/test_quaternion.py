@@ -65,7 +65,7 @@ def test_attitude_matrix_is_eulers_formula(axis: FloatArray, angle: float) -> No
 def test_a_turn_about_z_carries_the_frame_with_it() -> None:
     """A rotation of +90 deg about z moves the body's x axis to the reference's y axis.
 
-    In body axes, the reference's y axis is then (1, 0, 0).
+    After the rotation, the reference's y axis is (1, 0, 0) in body axes.
     """
     q = quaternion.from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi]))
     assert _close(quaternion.attitude_matrix(q) @ [0.0, 1.0, 0.0], np.array([1.0, 0.0, 0.0]))
@@ -174,7 +174,7 @@ def test_angle_between_is_the_angle_turned(q: FloatArray, axis: FloatArray, angl
 
 @given(st.floats(1e-12, 1e-6))
 def test_angle_between_is_accurate_near_zero(angle: float) -> None:
-    """Angles below 1e-8 are accurate. The arc cosine of a dot product would not resolve such angles."""
+    """Angles below 1e-8 are accurate. The arc cosine of a dot product would not resolve angles below 1e-8."""
     q = quaternion.about_axis_y(angle)
     assert quaternion.angle_between(q, quaternion.IDENTITY) == pytest.approx(angle, rel=1e-9)
 

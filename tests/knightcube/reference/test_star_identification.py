@@ -161,7 +161,7 @@ def test_points_strewn_at_random_are_refused(name: str) -> None:
 def test_a_mirrored_sky_is_refused(name: str) -> None:
     """A mirrored sky is refused, although it has the same angles, areas and moments.
 
-    Only the orientation of the patterns differs.
+    The mirrored sky and the true sky differ only in the orientation of the patterns.
     """
     drawn = _drawn(_kind(), 4)[0]
     field = drawn.field()

@@ -228,7 +228,7 @@ def test_the_terms_that_the_stars_show_are_fitted_and_others_stay_zero(shape: di
 def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None:
     """The lens of mirrored images describes the images as given.
 
-    Image and sky have left and right swapped.
+    In a mirrored image and in its sky, left and right are exchanged.
     """
     lens = Lens(1000, 800, 1500.0, (490.0, 410.0), -0.1, 0.02, 0.01, 0.02, 0.05, -0.04)
     unused = (np.ones(9, dtype=bool),)

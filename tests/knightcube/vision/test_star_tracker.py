@@ -61,8 +61,8 @@ print(*found.quaternion, *found.covariance.ravel(), len(found.stars))
 def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_path: Path) -> None:
     """The compiled implementations alone give the same attitude.
 
-    The test program ends if a slow numpy implementation silently replaces a compiled one. In a new clone the
-    program first compiles for up to a minute of processor time.
+    The test program ends if a slow numpy implementation silently replaces a compiled implementation. In a new
+    clone the program first compiles for up to a minute of processor time.
     """
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     np.save(tmp_path / "image.npy", resting.pixels)

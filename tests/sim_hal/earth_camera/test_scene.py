@@ -249,7 +249,7 @@ def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
     towards = (places - scene.position) @ scene.camera_matrix.T
     crossed = np.cross(towards, rays) / np.linalg.norm(towards, axis=1, keepdims=True)
     assert np.abs(crossed).max() < 1e-9
-    # Of the two intersections, the first one is on the side of the camera.
+    # The first of the two intersections is on the side of the camera.
     assert np.all(places @ scene.position > 0.0)
 
 

@@ -112,7 +112,7 @@ def test_a_fault_that_is_lifted_leaves_nothing_broken(lock: LockStep, kind: Faul
     put([parse(f"{kind.name} @ 1 for 1.3")], bench_of(lock), 0)
     assert is_sound(lock)
     lock.clock.sleep_until_ns(round(1.1 * SECOND_NS))
-    # The fault `imu: off` switches the whole IMU off. Momentary faults have ended by now.
+    # The fault `imu: off` switches the whole IMU off. Momentary faults have ended before 1.1 s.
     assert kind.momentary or kind.name == "imu: off" or not is_sound(lock)
     lock.clock.sleep_until_ns(4 * SECOND_NS)
     assert is_sound(lock)

@@ -351,8 +351,8 @@ def test_the_thesis_placement_and_kernel_together() -> None:
 def test_a_star_behind_the_camera_gives_no_light() -> None:
     """A star behind the camera gives no light.
 
-    By the collinearity equations alone, such a star would appear at the same pixel as its opposite (errata to
-    2.1).
+    By the collinearity equations alone, a star behind the camera would appear at the same pixel as a star in
+    the opposite direction (errata to 2.1).
     """
     star = at_pixels(SMALL, [30.2, 20.7])
     assert expected_electrons(SMALL, -star, [0.0], *still()).max() == 0.0

@@ -320,8 +320,8 @@ def test_the_thesis_scenario_has_the_orbits_of_table_4_3() -> None:
 def test_at_a_frame_a_second_the_thesis_scenario_has_about_as_many_opportunities() -> None:
     """With a frame a second, the scenario of the thesis has about as many passes as in the thesis.
 
-    The thesis states 14 passes, without date and frame interval. With a frame a second there are 9 to 19
-    passes in a year.
+    The thesis states 14 passes, without date and frame interval. With a frame a second, the number of passes
+    in a year is 9 to 19.
     """
     counts = [
         len(opportunities(replace(_table_4_3(), epoch=EPOCH + day), cadence=1.0, exposure=0.5))

@@ -72,7 +72,7 @@ class Faults:
         self._fail(event, str(arguments[-1] if event == "socket.bind" else arguments[0]))
 
     def failing(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that fails if the call is selected, and calls `called` if it is not."""
+        """Return a function that fails if the call is selected, and otherwise calls `called`."""
 
         def call(*arguments: Any, **named: Any) -> Any:
             if self._error_of is not None:

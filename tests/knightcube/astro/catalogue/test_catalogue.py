@@ -57,7 +57,7 @@ def _index(hip: int) -> int:
 def test_counts_are_the_published_ones_less_the_entries_without_a_position(
     limit: float, published: int, unplaced: int
 ) -> None:
-    """The numbers of stars are the published ones, without the entries that have no position.
+    """The numbers of stars equal the published numbers, without the entries that have no position.
 
     The table contains three stars without a position. HIP 115125 has V = 6.97, so it counts only for the
     limit 7.

@@ -207,7 +207,7 @@ def test_of_a_torque_along_the_field_nothing_is_made() -> None:
     found = allocate(1e-2 * FIELD, FIELD, COILS, AMPLE)
     assert found.torque == pytest.approx(np.zeros(3), abs=1e-18)
     assert found.share == pytest.approx(0.0, abs=1e-9)
-    # The component normal to the field of a torque at 45 deg to the field has half of the squared magnitude.
+    # A torque at 45 deg to the field has half of its squared magnitude normal to the field.
     across = np.cross(FIELD, [0.0, 0.0, 1.0])
     mixed = FIELD / np.linalg.norm(FIELD) + across / np.linalg.norm(across)
     assert allocate(1e-6 * mixed, FIELD, COILS, AMPLE).share == pytest.approx(0.5)

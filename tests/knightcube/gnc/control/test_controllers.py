@@ -52,7 +52,7 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
 def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: AngleController) -> None:
     """After a step of 0.1 rad, which is within the coil's limit, the error is below 0.15 deg.
 
-    The adaptive controller has adapted its gains by then.
+    Before the error is checked, the adaptive controller has adapted its gains.
     """
     rows = fly(controller, replace(THREAD, stiffness=1e-5), held(0.1), 60.0)
     assert largest_error(rows, 0.1, 10.0) < 0.15

@@ -398,7 +398,7 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
 def test_a_field_along_the_orbit_is_known_from_its_direction_and_its_change() -> None:
     """The field along the orbit is predicted from its present direction and its change.
 
-    Near the equator the direction oscillates. The prediction is given in other axes.
+    Near the equator, the direction of the field oscillates. The prediction is given in other axes.
     """
     times = braking(LIMIT).instants
     angle = 0.3 * np.sin(1.1e-3 * times)

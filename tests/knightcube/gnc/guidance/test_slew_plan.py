@@ -111,7 +111,7 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
     """Slews are planned although all initial guesses by rotations about the field pass through cones.
 
-    In the first two of the three slews, all such guesses pass through cones.
+    In the first two of the three slews, all rotations about the field pass through cones.
     """
     *_, (_, task) = slews(case + 1, seed, True)
     plan = plan_task(task)

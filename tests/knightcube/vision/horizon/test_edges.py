@@ -52,7 +52,7 @@ def test_an_edge_is_placed_at_its_steepest_point_at_the_scale_that_covers_it(
     """An edge is located at its steepest point, at the smallest sufficient scale.
 
     The slope of a Gaussian edge of w px at the scale s is (1 + (w/s)^2)^-1/2. The next scale is used if it
-    increases the slope by a factor of 1.4, which holds from w = 1.37 s on.
+    increases the slope by a factor of 1.4. This condition holds if w is at least 1.37 s.
     """
     edges, lines = find_edges(step(130.3, width), FEW)
     assert len(edges) == 8

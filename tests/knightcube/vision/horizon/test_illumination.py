@@ -188,9 +188,9 @@ def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: i
 def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_are(
     spread_deg: float, stray: bool
 ) -> None:
-    """Bright samples close together may be the glare of an unknown Sun. Scattered ones are stray light.
+    """Bright samples close together may be the glare of an unknown Sun.
 
-    Twelve of 400 samples of a dark sky are bright.
+    Scattered bright samples are stray light. Twelve of 400 samples of a dark sky are bright.
     """
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     draw = np.random.default_rng(4)

@@ -133,7 +133,7 @@ def test_without_the_flattenings_direction_the_allowance_covers_the_error(
 def test_the_fitted_altitude_stays_within_the_given_range(day: tuple[EarthScene, Image]) -> None:
     """A permitted range of altitudes that begins two sigmas above the best fit limits the fitted altitude.
 
-    The nadir changes in the direction in which a known higher altitude changes it.
+    The limit changes the nadir in the same direction as a known higher altitude.
     """
     frame = day[1]
     free = find_nadir(frame, MODEL.lens, HorizonKnowledge(), SETTINGS).nadir
@@ -360,7 +360,8 @@ def test_an_exactly_known_sun_does_not_reject_a_true_limb(level: Instant) -> Non
 def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three(level: Instant) -> None:
     """If the atmosphere is higher than assumed, three opposite cameras give a better nadir than one camera.
 
-    All limbs are 6 km higher than assumed. A fit of a single limb then has a nadir error of 0.13 deg.
+    All limbs are 6 km higher than assumed. Under this error, the fit of a single limb has a nadir error of
+    0.13 deg.
     """
     joint = nadir_of_cameras(level.frames, UW, level.knowledge(), JOINT_SETTINGS)
     with pytest.MonkeyPatch.context() as patch:

@@ -121,7 +121,7 @@ def test_exact_stars_have_no_deviations_for_any_axis(theta_deg: float) -> None:
 def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg: float) -> None:
     """Deviations of the ends along and across a streak have unit variance, in units of the ends' errors.
 
-    The residual includes both deviations.
+    The residual includes the deviation along the streak and the deviation across the streak.
     """
     rng = np.random.default_rng(3)
     ends, turn = _stars(theta_deg, n=14)

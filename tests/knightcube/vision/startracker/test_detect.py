@@ -1,6 +1,6 @@
 """Tests of star detection: stars are found, measured to the bound, and distinguished from other points.
 
-Further tests are of detection near predicted positions, and of the brightest detections in photographs.
+Further tests check the detection near predicted positions, and the brightest detections in photographs.
 """
 
 from __future__ import annotations

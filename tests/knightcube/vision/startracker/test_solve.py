@@ -303,8 +303,8 @@ def test_the_attitude_error_by_a_steady_acceleration_is_its_integral(
 ) -> None:
     """The attitude error of a steady acceleration is the weighted mean of the rotation angle.
 
-    A rotation angle a t^2 / 2, with t from -T/2 to T/2, has the mean a T^2 / 24. The mean of its values at
-    both ends is a T^2 / 8, and the middle of a fitted parabola is zero.
+    A rotation angle a t^2 / 2, with t from -T/2 to T/2, has the mean a T^2 / 24. The mean of the rotation
+    angles at both ends is a T^2 / 8, and the middle of a fitted parabola is zero.
     """
     acceleration = 0.3
     off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), np.zeros((3, 3)), _EXPOSURE)

@@ -55,7 +55,8 @@ def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
 
     A shift by dx is, to first order, a rotation by dx / f about y. Only half of the rotation by dx / f
     appears in the rate. The shift also changes the motion field in the image to second order, which cancels
-    the effect on one of the two components of the motion. The factor of one half holds for stars on a square.
+    the effect on one of the two components of the motion. The fraction of one half holds for stars on a
+    square.
     """
     focal = CAMERA.pinhole.focal_length
     found = _together(*_seeming(replace(EXACT, centre=5.0)))
