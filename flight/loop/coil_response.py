@@ -449,18 +449,16 @@ class CoilResponse:
         rest = right[coils:]
         others = np.linalg.inv(normal[coils:, coils:])
         coupling = others @ normal[coils:, :coils]
-        gains = GainEquations(
-            normal[:coils, :coils] - self._prior_matrix[:coils, :coils] - normal[:coils, coils:] @ coupling,
-            right[:coils] - rest @ coupling,
-            float(outputs @ outputs - rest @ others @ rest),
-        )
-        fits = gains.solve(self._prior_weights, self._expected)
-        free_cost = float(fits.costs[0])
+        reduced = normal[:coils, :coils] - self._prior_matrix[:coils, :coils]
+        reduced = reduced - normal[:coils, coils:] @ coupling
+        equations = reduced, right[:coils] - rest @ coupling, float(outputs @ outputs - rest @ others @ rest)
+        gains, variances, gain_costs = _solved_gains(*equations, self._prior_weights, self._expected)
+        free_cost = float(gain_costs[0])
         spread = max(1.0, free_cost / max(len(outputs) - count - coils, 1))
         # If a gain is impossible even within its uncertainty, the model is wrong.
-        sigmas = np.sqrt(spread * fits.variances[0])
-        possible = bool((np.abs(fits.gains[0]) - 3.0 * sigmas < self.largest).all())
-        free_cost, *costs = (fits.costs / spread).tolist()
+        sigmas = np.sqrt(spread * variances[0])
+        possible = bool((np.abs(gains[0]) - 3.0 * sigmas < self.largest).all())
+        free_cost, *costs = (gain_costs / spread).tolist()
         sound_cost, reversed_costs = costs[coils], costs[coils + 1 :]
         alone, is_reversed = [], []
         for axis in range(coils):
@@ -471,9 +469,9 @@ class CoilResponse:
             is_reversed.append(reversed_costs[axis] < min(limit, sound_cost - _CERTAINLY))
         one_free = slice(1, coils + 1)
         return MotionFit(
-            fits.gains[one_free].diagonal().copy(),
-            np.sqrt(spread * fits.variances[one_free].diagonal()),
-            (others @ rest - coupling @ fits.gains[0])[2 * count :],
+            gains[one_free].diagonal().copy(),
+            np.sqrt(spread * variances[one_free].diagonal()),
+            (others @ rest - coupling @ gains[0])[2 * count :],
             possible,
             tuple(alone),
             tuple(is_reversed),
@@ -597,39 +595,24 @@ class MotionFit(NamedTuple):
     is_reversed: tuple[bool, ...]
 
 
-class GainFits(NamedTuple):
-    """Fits of the n gains under k hypotheses: gains (k, n), their variances (k, n), and the costs (k,).
+def _solved_gains(
+    matrix: FloatArray, right: FloatArray, constant: float, weights: FloatArray, expected: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit n gains under k hypotheses with the prior weights (k, n) of the expected gains (k, n), 1 or -1.
 
-    A cost is the weighted sum of squares of all residuals, including the deviations of the parameters from
-    their expected values.
+    The weighted sum of squares at gains g is g S g - 2 t g + c; S is `matrix` (n, n), the vector t is `right`
+    (n,), and c is `constant`. The result is gains (k, n), their variances (k, n), and costs (k,), which are
+    the sums of squares of all residuals, including the deviations from the expected values.
     """
-
-    gains: FloatArray
-    variances: FloatArray
-    costs: FloatArray
-
-
-class GainEquations(NamedTuple):
-    """Normal equations of the n gains; the sum of squares at gains g is g S g - 2 t g + c.
-
-    The matrix S is `matrix` (n, n), the vector t is `right` (n,), and c is `constant`.
-    """
-
-    matrix: FloatArray
-    right: FloatArray
-    constant: float
-
-    def solve(self, weights: FloatArray, expected: FloatArray) -> GainFits:
-        """Fit gains with the prior weights (k, n) of the expected gains (k, n), which are 1 or -1."""
-        normal = np.repeat(self.matrix[None], len(weights), axis=0)
-        normal.reshape(len(weights), -1)[:, :: weights.shape[1] + 1] += weights
-        covariance = np.linalg.inv(normal)
-        right = self.right + weights * expected
-        gains = (covariance @ right[:, :, None])[:, :, 0]
-        # The prior adds weight * (gain - expected)^2 to the cost for each gain. The term weight * expected^2
-        # of this square equals the weight, because expected gains are 1 or -1.
-        costs = self.constant + weights.sum(axis=1) - (right * gains).sum(axis=1)
-        return GainFits(gains, np.asarray(covariance.diagonal(axis1=1, axis2=2), dtype=np.float64), costs)
+    normal = np.repeat(matrix[None], len(weights), axis=0)
+    normal.reshape(len(weights), -1)[:, :: weights.shape[1] + 1] += weights
+    covariance = np.linalg.inv(normal)
+    rights = right + weights * expected
+    gains = (covariance @ rights[:, :, None])[:, :, 0]
+    # The prior adds weight * (gain - expected)^2 to the cost for each gain. The term weight * expected^2 of
+    # this square equals the weight, because expected gains are 1 or -1.
+    costs = constant + weights.sum(axis=1) - (rights * gains).sum(axis=1)
+    return gains, np.asarray(covariance.diagonal(axis1=1, axis2=2), dtype=np.float64), costs
 
 
 LONGEST_REST_NS = 600_000_000_000

@@ -34,7 +34,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -84,11 +83,8 @@ class ResourceSample:
     temperature: float
 
 
-class ResourceReader(Protocol):
-    """Samples the board's resources."""
-
-    def __call__(self, now_ns: int) -> ResourceSample:
-        """Return a sample. Must not raise."""
+ResourceReader = Callable[[int], ResourceSample]
+"""Function that samples the board's resources at a time (ns), and does not raise."""
 
 
 @dataclass(frozen=True, slots=True)

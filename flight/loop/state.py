@@ -527,17 +527,15 @@ class StateKeeper:
         notices: Notices,
         clock: Clock,
         *,
-        window: float,
         devices: str = "",
         period_ns: int,
         boots: int = 0,
     ) -> None:
         """Load the state, increase its boot count, and store it as running.
 
-        The time `window` is the operating time (s) within which an unclean shutdown counts as recent. The
-        digest `devices` identifies the present devices; parameters learned for other devices are discarded.
-        The argument `boots` is the highest boot number that `note_boot` has written. If the state has a
-        smaller boot count, the state is outdated or lost, and the last boot counts as unclean.
+        The digest `devices` identifies the present devices; parameters learned for other devices are
+        discarded. The argument `boots` is the highest boot number that `note_boot` has written. If the state
+        has a smaller boot count, the state is outdated or lost, and the last boot counts as unclean.
         """
         self._store, self._notices, self._clock = store, notices, clock
         self._begun_ns = clock.now_ns()
@@ -549,7 +547,7 @@ class StateKeeper:
             )
             loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
         self._begun = begin_boot(loaded, self._label(), devices)
-        self.record: BootRecord = boot_record(self._begun, window)
+        self.record: BootRecord = boot_record(self._begun, CRASH_WINDOW)
         self.learned: Mapping[str, Learned] = self._begun.learned
         self.table = self._begun.table
         self._noted = Noted(self._begun.mode, {}, self.table)
@@ -662,7 +660,6 @@ def open_state(
         StateStore(folder, notices.report),
         notices,
         clock,
-        window=CRASH_WINDOW,
         devices=digest_of(config),
         period_ns=round(config.state.period * 1e9),
         boots=newest_boot([folder, *runs]),

@@ -267,9 +267,7 @@ def keeper_of(folder: Path) -> StateKeeper:
     """Return a new state keeper with the folder `folder`, as a flight creates it at its start."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
-    return StateKeeper(
-        StateStore(folder, notices.report), notices, SimClock(), window=600.0, period_ns=10_000_000_000
-    )
+    return StateKeeper(StateStore(folder, notices.report), notices, SimClock(), period_ns=10_000_000_000)
 
 
 def test_every_mode_is_reached_by_command_and_the_demonstration_goes_on_where_it_is_due(

@@ -216,7 +216,7 @@ def test_an_age_that_is_known_for_sure_is_not_learned() -> None:
 def keeper_on(disk: Disk, devices: str) -> StateKeeper:
     notices = Notices()
     store = StateStore(Path("/state"), notices.report, disk)
-    return StateKeeper(store, notices, ManualClock(), window=600.0, period_ns=10_000_000_000, devices=devices)
+    return StateKeeper(store, notices, ManualClock(), period_ns=10_000_000_000, devices=devices)
 
 
 def test_what_was_learned_of_other_devices_is_forgotten_and_reported() -> None:

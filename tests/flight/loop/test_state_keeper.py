@@ -44,9 +44,7 @@ FOLDER = Path("/state")
 def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKeeper:
     """Return a new state keeper, as a flight creates it at its start."""
     notices = Notices()
-    return StateKeeper(
-        StateStore(folder, notices.report, disk), notices, clock, window=600.0, period_ns=10 * SECOND
-    )
+    return StateKeeper(StateStore(folder, notices.report, disk), notices, clock, period_ns=10 * SECOND)
 
 
 def test_a_table_outlives_a_clean_end_and_a_new_one_no_crash() -> None:
@@ -176,7 +174,7 @@ def test_a_hung_disk_delays_neither_note_nor_close(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("flight.loop.state._HUNG_DISK_S", 0.1)
     disk, notices = HungDisk(), Notices()
     store = StateStore(FOLDER, notices.report, disk)
-    keeper = StateKeeper(store, notices, SystemClock(), window=600.0, period_ns=1_000_000)
+    keeper = StateKeeper(store, notices, SystemClock(), period_ns=1_000_000)
     disk.hangs.set()
     assert disk.hung.wait(5.0)
     start = time.monotonic()
