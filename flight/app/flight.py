@@ -65,7 +65,7 @@ from flight.loop.health import (
     WorkerWatch,
 )
 from flight.loop.imaging import Imaging, ImagingSettings, ObjectTracks
-from flight.loop.modes import ModeControl, ModeSettings
+from flight.loop.modes import ModeControl
 from flight.loop.navigation import (
     HORIZON_WORKER,
     HorizonCameraSettings,
@@ -518,8 +518,7 @@ def _tasks(
     coils = CoilDriveSettings(body.control.dipoles, limits, body.control.free_axis, resistance)
     drive = CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, coils, services)
     steering = Steering(body, drive, services)
-    low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
-    modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
+    modes = ModeControl(config.modes, config.detumble, stop, body, steering, services)
     # A worker is considered stalled after twice the time limit at which the job runner kills it.
     busy = [(PLANNER, planner.busy_since_ns, config.executive.planner_timeout)]
     if imaging is not None:

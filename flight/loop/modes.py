@@ -25,7 +25,7 @@ from flight.loop.facts import Facts, Services
 from flight.loop.state import CRASH_WINDOW
 from flight.loop.steering import Steering
 from flight.schema.document import ConfigError
-from flight.schema.sections import Modes
+from flight.schema.sections import Detumble, Modes
 from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.guidance.pointing_target import SUN, PointingTarget
@@ -240,15 +240,14 @@ class AttitudeWatch:
     `acquires_sun` state whether the body is being detumbled or turned to the Sun.
     """
 
-    def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
-        """Detumbling ends when the rate has been below `low_rate` (rad/s) for `low_for` (s)."""
+    def __init__(self, settings: Modes, detumble: Detumble) -> None:
         self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
         self.detumbles = self.acquires_sun = False
-        self._fast, self._low = settings.tumble_rate, low_rate
+        self._fast, self._low = settings.tumble_rate, detumble.low_rate
         self._known = HoldTimer(settings.known_for)
         self._lost = HoldTimer(settings.lost_for)
         self._spins = HoldTimer(settings.known_for)
-        self._slow = HoldTimer(low_for)
+        self._slow = HoldTimer(detumble.low_for)
 
     def adopt(self, settings: Modes) -> None:
         """Replace the limits by those of a new table of onboard parameters."""
@@ -344,20 +343,6 @@ def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
     return frozenset(mode for mode, row in TRANSITIONS.items() if isinstance(row[trigger], Mode))
 
 
-@dataclass(frozen=True, slots=True)
-class ModeSettings:
-    """Bounds of the modes.
-
-    Detumbling ends when the rate has been below `low_rate` (rad/s) for `low_for` (s). The function `stop`
-    ends the flight after the current cycle for a reason.
-    """
-
-    modes: Modes
-    low_rate: float
-    low_for: float
-    stop: Callable[[str], None]
-
-
 class ModeControl:
     """Holds the mode state machine, and the targets that commands set.
 
@@ -366,29 +351,37 @@ class ModeControl:
     """
 
     def __init__(
-        self, settings: ModeSettings, body: FlightBody, steering: Steering, services: Services
+        self,
+        modes: Modes,
+        detumble: Detumble,
+        stop: Callable[[str], None],
+        body: FlightBody,
+        steering: Steering,
+        services: Services,
     ) -> None:
-        """Connect the machine with body, steering and events. Raises FlightError and ConfigError."""
+        """Connect the machine with body and steering; `stop` ends the flight after the cycle for a reason.
+
+        Raises FlightError and ConfigError.
+        """
         facts.check(facts.FACTS, modes_moved_by)
-        self._settings = settings.modes
-        self._stop = settings.stop
+        self._settings, self._stop = modes, stop
         self._machine = ModeMachine()
         self._targets = body.control.targets
         self._paths = body.control.paths
         self._view = body.view
         self._steering, self._facts, self._recorder = steering, services.facts, services.recorder
-        self._events, self._low_rate = services.events, settings.low_rate
+        self._events, self._low_rate = services.events, detumble.low_rate
         self._modes = body.control.modes
-        self._initial = Mode.named(settings.modes.initial)
+        self._initial = Mode.named(modes.initial)
         if self._initial not in body.control.modes:
             starts = ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))
             raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {starts}")
         self._crashed, self._too_many_crashes = 0, False
         self._commands = self._measured_ns = 0
-        self._slow = HoldTimer(settings.low_for)
-        self._arrived = HoldTimer(settings.modes.arrived_for)
-        self._pointing = PointingWatch(settings.modes, body.control.targets, services.facts)
-        self._attitude = AttitudeWatch(settings.modes, settings.low_rate, settings.low_for)
+        self._slow = HoldTimer(detumble.low_for)
+        self._arrived = HoldTimer(modes.arrived_for)
+        self._pointing = PointingWatch(modes, body.control.targets, services.facts)
+        self._attitude = AttitudeWatch(modes, detumble)
         self.restart = ""
         self.wanted: Target | None = None
         self._pointed: Target | None = None

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 from flight.link.events import Mode
 from flight.loop.facts import EventLog, Facts
-from flight.loop.modes import ModeControl, ModeSettings
-from flight.schema.sections import Modes
+from flight.loop.modes import ModeControl
+from flight.schema.sections import Detumble, Modes
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
 
@@ -88,7 +88,9 @@ class ModeBench:
         recorder = SimpleNamespace(record=lambda packet, now_ns, **values: self.records.append(values))
         services = SimpleNamespace(facts=self.facts, events=log, recorder=recorder)
         self.control = ModeControl(
-            ModeSettings(self.settings, 0.01, 2.0, self._note("stop")),
+            self.settings,
+            Detumble(low_rate=0.01, low_for=2.0),
+            self._note("stop"),
             cast(Any, SimpleNamespace(control=control, view=view)),
             cast(Any, steering),
             cast(Any, services),

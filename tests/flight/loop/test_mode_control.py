@@ -11,7 +11,7 @@ from flight.link.events import Mode
 from flight.loop import facts
 from flight.loop.modes import AttitudeWatch, Trigger
 from flight.schema.document import ConfigError
-from flight.schema.sections import Modes
+from flight.schema.sections import Detumble, Modes
 from hal.interfaces.wires import SECOND_NS
 from tests.flight.loop.mode_bench import SATELLITE, TESTBED, ModeBench
 
@@ -22,9 +22,8 @@ class Watched:
     """The mode control, run once a second, with records of its actions."""
 
     def __init__(self) -> None:
-        self.watch = AttitudeWatch(
-            Modes(tumble_rate=FAST, known_for=2.0, lost_for=4.0, acquired="point"), LOW, LOW_FOR
-        )
+        modes = Modes(tumble_rate=FAST, known_for=2.0, lost_for=4.0, acquired="point")
+        self.watch = AttitudeWatch(modes, Detumble(low_rate=LOW, low_for=LOW_FOR))
         self.began: list[str] = []
         self.now_ns = 0
 

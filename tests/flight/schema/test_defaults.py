@@ -37,7 +37,6 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "FilterSettings": (bodies.ThreadEstimation,),
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
-    "ModeSettings": (sections.Modes, sections.Detumble),
     "NavigationSettings": (devices.InertialUnitSection, sections.Estimation),
     "OrbitFilterSettings": (bodies.OrbitEstimation, bodies.Craft),
     "PidSettings": (bodies.PidGains,),
