@@ -31,6 +31,7 @@ from flight.schema.devices import (
     Sensor,
     SensorsSection,
     SolarStringsSection,
+    UnitSection,
     V4l2Device,
     WideCamera,
     axis_matrix,
@@ -145,15 +146,8 @@ def emulated_bench(config_path: Path, text: str, config: Config) -> EmulatedBenc
 def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
     from sim_hal.rig import SimulationRequest  # noqa: PLC0415
 
-    return SimulationRequest(
-        request.config_path,
-        text,
-        request.out,
-        request.realtime,
-        request.seed,
-        request.devices,
-        request.faults,
-    )
+    options = request.out, request.realtime, request.seed, request.devices, request.faults
+    return SimulationRequest(request.config_path, text, *options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,17 +303,21 @@ _LOOK_NS = 20_000_000
 
 def unit_settings(unit: InertialUnitSection) -> Vn100Settings:
     """Return the settings of the VN-100's driver, whose readings are in the testbed frame."""
-    mounting, known = np.array(unit.mounting), unit.calibration
-    return Vn100Settings(
-        attitude_map=attitude_map(mounting, NED_TO_TESTBED),
-        mounting=attitude_matrix(mounting),
-        gyro_matrix=np.array(known.gyro_matrix),
-        field_matrix=np.array(known.field_matrix),
-        field_bias=np.array(known.field_bias),
-        rate_hz=unit.rate_hz,
-        output=unit.output,
-        field_range=unit.field_range,
-    )
+    mapped = attitude_map(np.array(unit.mounting), NED_TO_TESTBED)
+    return Vn100Settings(attitude_map=mapped, output=unit.output, **_common_settings(unit))
+
+
+def _common_settings(unit: UnitSection) -> dict[str, Any]:
+    """Return the settings that the drivers of all inertial units share, by name."""
+    known = unit.calibration
+    return {
+        "mounting": attitude_matrix(np.array(unit.mounting)),
+        "gyro_matrix": np.array(known.gyro_matrix),
+        "field_matrix": np.array(known.field_matrix),
+        "field_bias": np.array(known.field_bias),
+        "rate_hz": unit.rate_hz,
+        "field_range": unit.field_range,
+    }
 
 
 check_vn100 = unit_settings
@@ -356,16 +354,7 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
         raise ConfigError(
             f"{kind}.sensors", "do not measure the magnetic field: add a sensor that measures `magnetic`"
         )
-    known = unit.calibration
-    settings = UnitSettings(
-        mounting=attitude_matrix(np.array(unit.mounting)),
-        gyro_matrix=np.array(known.gyro_matrix),
-        field_matrix=np.array(known.field_matrix),
-        field_bias=np.array(known.field_bias),
-        rate_hz=unit.rate_hz,
-        field_range=unit.field_range,
-    )
-    return SensorUnit(rig.clock, parts, settings)
+    return SensorUnit(rig.clock, parts, UnitSettings(**_common_settings(unit)))
 
 
 def _started(part: Callable[..., Any], rig: Rig, sensor: Sensor) -> Any:
