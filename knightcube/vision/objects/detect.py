@@ -212,13 +212,10 @@ def short_regions(
     of the uniform line with the same moments as the region's bright part. For a point, both ends are equal.
     """
     regions = segmented.regions
-    noise = segmented.background.typical_noise
-    chosen = (
-        ~np.isin(regions.label, segmented.candidates.label)
-        & (regions.length < settings.least_length)
-        & (regions.flux >= objects.point_significance * noise * np.sqrt(regions.area))
-        & ~near_border(regions, segmented.signal.shape, settings.border)
-    )
+    bright = regions.is_significant(objects.point_significance, segmented.background)
+    outside = near_border(regions, segmented.signal.shape, settings.border)
+    other = ~np.isin(regions.label, segmented.candidates.label) & (regions.length < settings.least_length)
+    chosen = other & bright & ~outside
     brightest = np.flatnonzero(chosen)[np.argsort(-regions.flux[chosen], kind="stable")]
     short = regions.select(brightest[: objects.most_points])
     lines = []
@@ -488,12 +485,9 @@ class Judge:
         as examined.
         """
         regions = self.segmented.regions
-        noise = self.segmented.background.typical_noise
-        chosen = (
-            ~np.isin(regions.label, settled)
-            & (regions.flux >= self.objects.point_significance * noise * np.sqrt(regions.area))
-            & ~near_border(regions, self.segmented.signal.shape, _BORDER_PX)
-        )
+        bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
+        outside = near_border(regions, self.segmented.signal.shape, _BORDER_PX)
+        chosen = ~np.isin(regions.label, settled) & bright & ~outside
         indices = np.flatnonzero(chosen)
         order = np.lexsort((-regions.flux[indices], ~np.isin(regions.label[indices], strange)))
         objects = []

@@ -62,16 +62,11 @@ class Trails:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPatch:
-    """A rectangle of the image around a possible object.
+    """A rectangle of the image around a possible object, whose first pixel is at `corner` (x, y), px.
 
-    Attributes:
-        light: counts above the sky level (rows, columns).
-        corner: position (x, y) in the image of the first pixel (2,), px.
-        noise: standard deviation of a background pixel, counts.
-        gain: electrons per count.
-        usable: mask of the pixels that are not saturated (rows, columns).
-        psf: standard deviation of the PSF, px.
-        ceiling: counts above the sky level at which pixels saturate.
+    The pixels (rows, columns) are in counts above the sky level, and saturate at the `ceiling`. The `noise`
+    is the standard deviation of a background pixel, counts, and `psf` that of the PSF, px. The gain is in
+    electrons per count. The mask `usable` selects the pixels that are not saturated.
     """
 
     light: FloatArray

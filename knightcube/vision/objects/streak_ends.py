@@ -66,6 +66,10 @@ class Regions:
         """Return the regions `chosen` by a mask (n,) or by indices."""
         return select(self, chosen, "labels")
 
+    def is_significant(self, sigmas: float, background: Background) -> BoolArray:
+        """Return which regions (n,) have a flux of at least `sigmas` standard deviations."""
+        return np.asarray(self.flux >= sigmas * background.typical_noise * np.sqrt(self.area))
+
     def __len__(self) -> int:
         return self.label.size
 

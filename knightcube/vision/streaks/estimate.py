@@ -558,14 +558,10 @@ def with_rate(
         return replace(result, status=StreakStatus.TOO_SHORT, reason=why)
     if reason:
         return replace(result, status=StreakStatus.FAILED, reason=reason)
-    exposure, acceleration = result.exposure, last.scene.motion.acceleration
-    return replace(
-        result,
-        status=StreakStatus.AMBIGUOUS,
-        rate=known.rotation / exposure,
-        covariance=known.covariance / exposure**2,
-        acceleration=acceleration / exposure**2 if last.free[3] else None,
-    )
+    exposure = result.exposure
+    acceleration = last.scene.motion.acceleration / exposure**2 if last.free[3] else None
+    result = replace(result, rate=known.rotation / exposure, covariance=known.covariance / exposure**2)
+    return replace(result, status=StreakStatus.AMBIGUOUS, acceleration=acceleration)
 
 
 def _rejection(
@@ -693,13 +689,8 @@ def estimate_motion(
     camera = FitProblem(frame, pinhole, shutter, settings, sigma, growing)
     if prior_course is not None and settings.rate_model != "constant":
         camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
-    seen = MotionResult(
-        StreakStatus.FAILED,
-        checksum,
-        exposure,
-        hot_pixels=frame.hot_pixels,
-        line_time_sigma=line_time_sigma,
-    )
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
+    seen = replace(seen, line_time_sigma=line_time_sigma)
     if len(regions) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     spots = float(np.median(regions.length[:_BRIGHTEST])) < _SPOT
@@ -829,13 +820,9 @@ def _candidate(
     verdict = check_streaks(camera, scene, faint)
     bounds = exposure_bounds(camera.pinhole, motion, camera.shutter, faint.stars)
     ends = [positions(camera.pinhole, motion, faint.stars, time) for time in bounds.T]
-    result = replace(
-        with_stars(seen, camera, last),
-        faint_endpoints=np.stack(ends, axis=1),
-        faint_flux=faint.light,
-        faint_significance=faint.significance,
-    )
-    result = with_rate(result, camera, last, verdict)
+    found = replace(with_stars(seen, camera, last), faint_endpoints=np.stack(ends, axis=1))
+    found = replace(found, faint_flux=faint.light, faint_significance=faint.significance)
+    result = with_rate(found, camera, last, verdict)
     if result.status is StreakStatus.FAILED:
         verdict = StreakVerdict.REJECTED
     if camera.shutter.delay_per_row:

@@ -140,13 +140,10 @@ def model_images(
 
     The last image of each long streak is not initialised. It is a buffer for the residuals.
     """
-    camera, long, spot = (
-        (pinhole, scene.motion, shutter),
-        scene.stars[windows.long],
-        scene.stars[windows.spot],
-    )
-    images = streak_model.images(*camera, long, scene.width, windows.strips)
-    return images, *streak_model.spot_derivatives(*camera, spot, scene.sigma, windows.patches)
+    camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
+    images = streak_model.images(*camera, scene.stars[long], scene.width, windows.strips)
+    spots = streak_model.spot_derivatives(*camera, scene.stars[spot], scene.sigma, windows.patches)
+    return images, *spots
 
 
 def _add(
