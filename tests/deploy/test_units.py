@@ -37,7 +37,7 @@ needs_systemd = pytest.mark.skipif(
 
 
 def put_units(folder: Path, config: Path) -> Path:
-    """Copy the units into a folder with the drop-ins, and change the paths of commands to this machine's."""
+    """Copy the units with their drop-ins into a folder, and adapt the paths of commands to this machine."""
     for name, added in zip(UNITS, (dropin(config), safe_dropin(config), link_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
         (folder / name).write_text(text + "\n" + added, encoding="utf-8")

@@ -31,7 +31,7 @@ ROOT = CONFIG.parents[1]
 STARTS = tuple(step.at for step in demo_config(700.0).steps)
 """Start times (s) of the demonstration's steps."""
 HELD = 30.0
-"""Duration (s) of each step in these tests. The last `RESTING` s of a step are rest."""
+"""Duration (s) of each step in these tests. In the last `RESTING` s of a step, the body is at rest."""
 RESTING = 15.0
 PIXELS_PER_RAD = 2904.0
 LEAST_STREAK = 4.0

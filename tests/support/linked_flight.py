@@ -36,7 +36,7 @@ class LinkedFlight:
         _wait((self.run / "flight-0001.ccsds").exists, "the flight", self._log)
 
     def end(self) -> None:
-        """End the flight. Link and gateway transmit the rest of its log meanwhile."""
+        """End the flight. Link and gateway keep running and transmit the rest of its log."""
         end(self.processes["flight"])
 
     def stop(self) -> None:

@@ -66,7 +66,7 @@ def test_the_bound_of_the_rate_shrinks_with_stars_and_with_light() -> None:
 def test_the_boresight_component_is_the_weak_one_across_the_boresight() -> None:
     """For a rate normal to the boresight, the component along the boresight is the least accurate.
 
-    The error of the vector is several times the error of the magnitude.
+    The error of the rate vector is several times the error of its magnitude.
     """
     pinhole = Pinhole.from_field_of_view(1024, 1024, np.radians(20.0))
     stars = np.random.default_rng(6).uniform(150.0, 870.0, (10, 2))

@@ -118,7 +118,7 @@ def test_cleared_evidence_contains_no_earlier_readings() -> None:
 
 
 def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
-    """Readings of a probe of coil x do not end the suspicion of coil y, which is not driven meanwhile."""
+    """Readings of a probe of coil x do not end the suspicion of the undriven coil y."""
     evidence = Evidence(BOUNDS)
     evidence.add([predict(2 * FULL, np.full((12, 3), FULL), BOUNDS, NEWEST)] * 4)
     evidence.begin_segment()

@@ -16,7 +16,7 @@ from tests.manual_clock import ManualClock
 def kernel(monkeypatch: pytest.MonkeyPatch) -> IoctlWire:
     """Replace the kernel's I2C interface by an emulated bus.
 
-    Every file that can be opened then acts as an I2C adapter.
+    With this replacement, every file that can be opened acts as an I2C adapter.
     """
     wire = Wire(ManualClock(), THESIS, uncertainty=0.0)
     return _replace_ioctl(monkeypatch, wire)

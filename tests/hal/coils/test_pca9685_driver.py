@@ -140,9 +140,9 @@ def test_another_part_at_the_address_is_refused_with_the_cure(rig: Rig) -> None:
 
 
 def test_an_outer_clock_that_an_upset_has_chosen_is_cleared_by_a_software_reset(rig: Rig) -> None:
-    """EXTCLK of MODE1, set by an upset, is cleared by a software reset. No channel is driven meanwhile.
+    """EXTCLK of MODE1, set by an upset, is cleared by a software reset.
 
-    The bit is sticky: no write of the register clears it.
+    No channel is driven during the reset. The bit is sticky: no write of the register clears it.
     """
     rig.pca.configure()
     rig.wire.chip.flip(0x00, 6)

@@ -118,7 +118,7 @@ def test_rotation_vector_round_trip(axis: FloatArray, angle: float) -> None:
 def test_rotation_vector_agrees_with_scipy(q: FloatArray) -> None:
     """The rotation vector agrees with scipy, although the attitude matrix is the transpose of scipy's.
 
-    At a rotation by pi, both signs of the vector are correct.
+    At a rotation by pi, both signs of the rotation vector are correct.
     """
     vector = quaternion.to_rotation_vector(q)
     assume(np.linalg.norm(vector) < np.pi - 1e-6)

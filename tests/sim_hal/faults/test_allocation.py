@@ -68,7 +68,7 @@ def test_beyond_the_limits_the_whole_vector_is_shortened(field: FloatArray, wish
 
 
 def test_on_the_thread_the_coil_on_z_takes_over_for_the_one_on_x() -> None:
-    """On the suspension thread, coil z replaces coil x.
+    """For a body on its suspension thread, coil z replaces coil x.
 
     The torque of coil z about y is n A B I sin(theta) (Sease 5.4).
     """

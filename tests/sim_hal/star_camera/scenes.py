@@ -42,7 +42,8 @@ def integrated_by_brute_force(
 ) -> FloatArray:
     """Return the pixel-integrated image of a point that is for equal times at each point of `path` (k, 2).
 
-    The definition of the image is summed in double precision, with scipy's erf. `k` should be some thousands.
+    The function sums the definition of the image in double precision, with scipy's erf. `k` should be some
+    thousands.
     """
     scale = sigma * np.sqrt(2.0)
     across = np.arange(shape[1] + 1) - 0.5 - path[:, :1]

@@ -25,7 +25,7 @@ DOUBLED = tuple(
         ((0.0, 0.0, -1.0), 30.0, 0.1),
     )
 )
-"""Three axes; the axis z has two unequal coils in opposite directions."""
+"""Coils on three axes, with two unequal coils in opposite directions on the axis z."""
 SECONDS, BROKEN, FIELD = 20.0, 36.0, 3.0e-5
 """Durations (s) of a flight with healthy coils and of a flight whose coil fails after 10 s, and field (T)."""
 

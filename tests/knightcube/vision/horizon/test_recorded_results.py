@@ -1,4 +1,4 @@
-"""Tests that nadir directions from small rendered frames equal the recorded ones to five digits."""
+"""Tests that nadir directions from small rendered frames equal the recorded directions to five digits."""
 
 from __future__ import annotations
 

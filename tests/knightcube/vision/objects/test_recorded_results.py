@@ -1,4 +1,4 @@
-"""Tests that objects found in small simulated frames equal the recorded ones to five digits."""
+"""Tests that objects found in small simulated frames equal the recorded objects to five digits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that attitudes and detections of small simulated frames equal the recorded ones to five digits."""
+"""Tests that attitudes and detections of small simulated frames equal the record to five digits."""
 
 from __future__ import annotations
 

@@ -269,9 +269,9 @@ def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
 
 
 def test_a_rolling_shutter_distinguishes_a_rotation_from_its_reverse() -> None:
-    """A rolling shutter distinguishes a rotation from its reverse, because both rates differ by 5 %.
+    """A rolling shutter distinguishes a rotation from its reverse, because their rates differ by 5 %.
 
-    Without a prior rate, the covariance includes both rates.
+    Without a prior rate, the covariance includes the rates of both rotations.
     """
     camera = replace(CAMERA, line_time=5e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
