@@ -95,10 +95,8 @@ class TimedWorld(Protocol):
 class SimClock:
     """A Clock of simulated time, which jumps to each deadline without waiting.
 
-    The clock begins at the time `start_ns`, and `utc_start_ns` is the UTC at the time 0.
-
-    Attributes:
-        tickers: running tickers, in the order in which they were created.
+    The clock begins at the time `start_ns`, and `utc_start_ns` is the UTC at the time 0. The list `tickers`
+    is in the order of creation.
     """
 
     def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:

@@ -56,13 +56,7 @@ _LINE_KEYS = {"inertial_unit": (), "gps": (1,)}
 
 
 class EmulatedWires:
-    """Emulated connections by the names in the configuration (`hal.interfaces.wires.Wires`).
-
-    Attributes:
-        buses: I2C buses by device file.
-        lines: serial lines by device file, in memory or as pseudo-terminals.
-        spi_devices: devices on SPI buses by device file.
-    """
+    """Emulated buses, serial lines and SPI devices by device file (`hal.interfaces.wires.Wires`)."""
 
     def __init__(
         self, now_ns: Callable[[], int], seed: int, coil_bus: int | str, *, pty: bool = False

@@ -30,13 +30,7 @@ if TYPE_CHECKING:  # hal.interfaces.wires imports numpy, which the guardian must
 
 
 class ContainedJob:
-    """Job whose exceptions are stored as text instead of being raised.
-
-    Attributes:
-        name: name of the job.
-        error: exception of the last run as text, or an empty text if the run completed.
-        served_ns: time (ns) at which a run last succeeded, initially the time of creation.
-    """
+    """Job whose exceptions are stored as text, with the attributes of `hal.interfaces.wires.Ticker`."""
 
     def __init__(self, name: str, job: Callable[[], None], now_ns: Callable[[], int]) -> None:
         self.name = name
@@ -56,11 +50,7 @@ class ContainedJob:
 
 
 class SystemClock:
-    """Clock based on CLOCK_MONOTONIC of the operating system.
-
-    Attributes:
-        tickers: running tickers in the order of their creation.
-    """
+    """Clock based on CLOCK_MONOTONIC of the operating system, with the list `tickers` of running jobs."""
 
     def __init__(self) -> None:
         self.tickers: list[Ticker] = []

@@ -91,11 +91,7 @@ class CameraDevice(Protocol):
 class ServedCamera:
     """Camera operated by a periodic job, which also reopens a lost camera.
 
-    The class implements `hal.interfaces.devices.FrameSource`.
-
-    Attributes:
-        name: name of the camera device.
-        counts: counts of the camera's frames by outcome.
+    The class implements `hal.interfaces.devices.FrameSource`, and counts the frames by outcome.
     """
 
     def __init__(self, device: CameraDevice, clock: Clock, patient: bool = False) -> None:

@@ -236,13 +236,7 @@ def conversion_of(channel: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class StringWiring:
-    """Connection of a solar cell string to an A/D converter.
-
-    Attributes:
-        address: I2C address of the converter.
-        channel: input channel of the converter, 0 to 3.
-        volt_per_ampere: output voltage of the current amplifier per current, V/A.
-    """
+    """A/D converter (I2C address) and input (0 to 3) of a string, and amplifier voltage per current, V/A."""
 
     address: int
     channel: int

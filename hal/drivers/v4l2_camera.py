@@ -204,14 +204,7 @@ _MOST_FORMATS = 64
 
 @dataclass(frozen=True, slots=True)
 class PixelLayout:
-    """Layout of the pixels in a frame buffer.
-
-    Attributes:
-        columns: number of image columns.
-        rows: number of image rows.
-        fourcc: four-character code of the pixel format.
-        stride: distance between the starts of two rows, bytes.
-    """
+    """Image size (pixels), four-character pixel format, and bytes between the starts of two rows."""
 
     columns: int
     rows: int

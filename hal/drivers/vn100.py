@@ -201,12 +201,7 @@ _REFUSED_WAIT_NS = 1_000_000_000
 
 
 class Recovery:
-    """Recovery of a lost unit: search for the baud rate and configuration.
-
-    Attributes:
-        completed: number of times the unit was configured again.
-        refusal: text of the unit's last refusal, or an empty text.
-    """
+    """Recovery of a lost unit, which counts the completed recoveries and keeps the unit's last refusal."""
 
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
         self.completed = 0

@@ -95,13 +95,7 @@ class OutputLayout:
 
 @dataclass(frozen=True, slots=True)
 class BinaryPacket:
-    """Received binary packet with a valid checksum.
-
-    Attributes:
-        arrival_ns: host time at which the last byte was received, ns.
-        layout: layout of the packet.
-        values: all values of the payload, in the order of the fields.
-    """
+    """Received binary packet with a valid checksum, and the host time of its last byte."""
 
     arrival_ns: int
     layout: OutputLayout
@@ -178,13 +172,7 @@ ERRORS = {
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """ASCII sentence of the VN-100.
-
-    Attributes:
-        command: command name after `$VN`, such as "QMR".
-        fields: fields of the sentence as text.
-        checksum: type of the checksum.
-    """
+    """ASCII sentence: command name after `$VN`, such as "QMR", text fields, and type of the checksum."""
 
     command: str
     fields: tuple[str, ...]
@@ -193,13 +181,7 @@ class Sentence:
 
 @dataclass(frozen=True, slots=True)
 class AsciiLine:
-    """Received ASCII sentence with a valid checksum.
-
-    Attributes:
-        arrival_ns: host time at which the last byte was received, ns.
-        length: length of the line, bytes.
-        sentence: decoded sentence.
-    """
+    """Received ASCII sentence with a valid checksum, with the host time of its last byte and its length."""
 
     arrival_ns: int
     length: int

@@ -151,11 +151,7 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
 
 
 class CoilCircuit:
-    """The coils on one PWM chip, updated at every I2C STOP that may have changed an output.
-
-    Attributes:
-        chip: the PWM chip.
-    """
+    """The coils on one PWM chip, updated at every I2C STOP that may have changed an output."""
 
     def __init__(
         self,
@@ -444,14 +440,9 @@ class EmulatedDrv8830(Registers):
 
 
 class BridgeCircuit:
-    """Coils on DRV8830 bridges. At each write, random errors are added to the coil currents.
+    """Coils on DRV8830 bridges, the `parts`. At each write, random errors are added to the coil currents."""
 
-    Attributes:
-        parts: the bridges.
-        chip: always None, because the coils have no PWM chip.
-    """
-
-    chip = None
+    chip = None  # the coils have no PWM chip
 
     def __init__(
         self, address: int, truth: CoilSettings, generator: np.random.Generator, noise: float, supply: float

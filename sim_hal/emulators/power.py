@@ -265,11 +265,7 @@ _RATES = (8, 16, 32, 64, 128, 250, 475, 860)
 
 
 class EmulatedAds1115:
-    """An emulated ADS1115; the function `measure(channel)` returns the present voltage at an input.
-
-    Attributes:
-        address: I2C address of the converter.
-    """
+    """An emulated ADS1115; the function `measure(channel)` returns the present voltage at an input."""
 
     def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:
         self.address = address

@@ -72,12 +72,7 @@ class _Message:
 
 
 class Wire:
-    """One direction of a serial line.
-
-    Attributes:
-        faults: faults of the wire, which may be replaced at any time.
-        lost_bytes: number of bytes lost because the buffers were full.
-    """
+    """One direction of a serial line; its faults may be replaced. If the buffers are full, bytes are lost."""
 
     def __init__(self, rng: np.random.Generator, capacity: int = 6144) -> None:
         """Create the wire with a random generator for faults.
@@ -158,12 +153,7 @@ class Wire:
 
 
 class DeviceEnd:
-    """The device's end of a line.
-
-    Attributes:
-        baud_rate: baud rate of the device.
-        to_host, to_device: the wires of the two directions, each with its own faults.
-    """
+    """The device's end of a line, with the wires of both directions, each with its own faults."""
 
     def __init__(self, baud_rate: int, rng: np.random.Generator, host_rate: Callable[[], int]) -> None:
         """Make the wires; the function `host_rate` returns the baud rate of the host's end."""
@@ -185,13 +175,7 @@ class DeviceEnd:
 
 
 class EmulatedSerialLine:
-    """A serial line in memory with its two ends.
-
-    Attributes:
-        to_host, to_device: the wires of the two directions, each with its own faults.
-        host: host's end of the line, a SerialPort.
-        device: device's end of the line.
-    """
+    """A serial line in memory with its wires and its two ends: `host`, a SerialPort, and `device`."""
 
     def __init__(self, now_ns: Callable[[], int], baud_rate: int, rng: np.random.Generator) -> None:
         """Store the host's clock, the baud rate of both ends, and the random generator of the faults."""

@@ -231,11 +231,7 @@ def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
 
 
 class RegisterFile:
-    """Registers of the unit: contents in use, and their copy in flash memory.
-
-    Attributes:
-        values: fields in use of each register.
-    """
+    """Registers of the unit: the fields in use, and their copy in flash memory."""
 
     def __init__(self) -> None:
         self._defaults = {number: register.default for number, register in REGISTERS.items()}
@@ -308,11 +304,7 @@ _VPE_CONTROL, _HEADING_MODE, _ABSOLUTE = 35, 1, 0
 
 
 class AttitudeCommands:
-    """State of the unit's attitude filter that can be changed by commands.
-
-    Attributes:
-        status: VPE status word, whose disturbance bits the commands KMD and KAD set.
-    """
+    """State of the attitude filter that commands can change; KMD and KAD set the VPE status word."""
 
     def __init__(self, registers: RegisterFile, gyro_bias: FloatArray) -> None:
         """Store the filter's estimate `gyro_bias` (3,), rad/s, sensor axes, which SGB and SFB save."""
@@ -520,12 +512,7 @@ class Vn100EmulatorSettings:
 
 
 class Vn100Emulator:
-    """An emulated VN-100, which is a `sim_hal.clock.EmulatedDevice`.
-
-    Attributes:
-        registers: configuration and data registers of the unit.
-        alter: function with which a fault alters each sample before it is sent, or None.
-    """
+    """An emulated VN-100 (`sim_hal.clock.EmulatedDevice`); a fault sets `alter`, which alters each sample."""
 
     def __init__(
         self,

@@ -70,12 +70,7 @@ DEVICES = ("planner", "vision", "clock", "disk")
 
 
 class ProcessFaults:
-    """Faults inside the flight process, which occur only after the call of `begin`.
-
-    Attributes:
-        realtime: whether jobs run in separate processes, which can hang and be killed.
-        now_ns: function that returns the time of the flight's clock, ns.
-    """
+    """Faults inside the flight process after `begin`; in real time, jobs can also hang and be killed."""
 
     def __init__(self, faults: Sequence[ScheduledFault], clock: Clock, realtime: bool) -> None:
         self._faults = [fault for fault in faults if fault.kind.device in DEVICES]

@@ -178,11 +178,7 @@ class OrbitTruth(WorldTruth):
         utc: Julian date (UTC).
         quaternion: attitude quaternion (4,), ICRS into body.
         rate: rotation rate (3,), rad/s, body axes.
-        position: geocentric position (3,), m.
-        velocity: velocity (3,), m/s.
-        field: magnetic field (3,), T.
-        sun: direction (3,) from the craft to the Sun.
-        sunlit: visible fraction of the Sun's disc.
+        position, velocity, field, sun, sunlit: as in `OrbitEnvironment`.
         residual_dipole: residual dipole (3,), A m^2, body axes.
         torques: function that returns the torque (3,), N m, body axes, of each cause in `CAUSES`, or an empty
             dict if the world does not provide separate torques.
@@ -246,11 +242,7 @@ class RecordedPower(Protocol):
 
 
 class TruthRecorder:
-    """Recorder that writes the true state to a packet log, at 40 Hz for the body and 1 Hz for the orbit.
-
-    Attributes:
-        power: power system whose state is recorded once a second, or None.
-    """
+    """Recorder of the true state in a packet log: body at 40 Hz, orbit and power system at 1 Hz."""
 
     def __init__(self, log: PacketLog) -> None:
         self._log = log
