@@ -138,7 +138,7 @@ def main(
                 flown = fly(folder, load, name == "fifo")
             flights[name] = flown.figures
             grids |= {f"flight, {name}": flown.flight, f"bare loop, {name}": flown.machine}
-    facts = {"load": asdict(load), "asked": ASKED, "flights": flights}
+    facts: dict[str, object] = {"load": asdict(load), "asked": ASKED, "flights": flights}
     if out is not None:
         _write(out, facts, grids)
     if json:

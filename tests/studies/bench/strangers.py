@@ -69,7 +69,7 @@ def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> d
     """Run one flight. Returns the executed commands, the lateness (ms), and the rates of the attackers."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     with ExitStack() as stack:
-        lines = {"udp": f"{_PEER}:{udp}", "tcp": f"{_PEER}:{tcp}", "peers": [f"{_PEER}/32"]}
+        lines: dict[str, Any] = {"udp": f"{_PEER}:{udp}", "tcp": f"{_PEER}:{tcp}", "peers": [f"{_PEER}/32"]}
         config, run = write_linked_config(place, **lines, rate=1e5), place / "run"
         flight = stack.enter_context(process("run", config, "--realtime", "--out", run))
         wait_for(run / "flight-0001.ccsds")
