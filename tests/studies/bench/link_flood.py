@@ -47,6 +47,7 @@ def main(*, seconds: Annotated[float, "of each flight"] = 60.0) -> int:
 
 def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
     """Run one flight. Returns quantiles of the lateness (ms), the number of cycles, and the link's counts."""
+    frames = attackers_frames(_KINDS) if flooded else []
     with ExitStack() as stack:
         port = free_port()
         config = write_linked_config(place, udp=f"127.0.0.1:{port}", rate=1e6)
@@ -60,7 +61,7 @@ def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
         stack.callback(ended.set)
         if flooded:
             wait_for(place / "commands")
-            own = (port, attackers_frames(_KINDS), _FRAMES_A_SECOND, ended, forged)
+            own = (port, frames, _FRAMES_A_SECOND, ended, forged)
             threading.Thread(target=flood, args=own).start()
         counts = _listen(port, place, flight, flooded)
         ended.set()

@@ -126,7 +126,7 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
 @contextmanager
 def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[str, float]]]:
     """Run all floods on one core; yield a function that returns their mean rates so far."""
-    context, begun = multiprocessing.get_context("fork"), time.monotonic()
+    context = multiprocessing.get_context("fork")
     counts = {name: context.Value("Q", 0) for name in ("datagrams", "connections", "forged")}
     attacks: list[tuple[Callable[..., None], tuple[Any, ...]]] = [
         (_send, (udp, _STRANGER, [bytes(64)], DATAGRAMS, counts["datagrams"])),
@@ -137,6 +137,7 @@ def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[st
     floods = [context.Process(target=attack, args=args, daemon=True) for attack, args in attacks]
     for one in floods:
         one.start()
+    begun = time.monotonic()
 
     def rates() -> dict[str, float]:
         seconds = time.monotonic() - begun
