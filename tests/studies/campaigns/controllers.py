@@ -2,8 +2,8 @@
 
 All controllers run on the same simulated hardware with the same noise. They are this project's loop, this
 loop with paths of minimum supply energy, the loop of the thesis, PID and adaptive control. PID and adaptive
-control receive the targets instead of a path. `python -m tests.studies.tune_controllers` tunes all their
-gains by one criterion: minimum power with every step settled in 9 s and overshoots of at most 1 %.
+control receive the targets instead of a path. `tests.studies.tune_controllers` (at commit 5e5e847b) tuned all
+their gains by one criterion: minimum power with every step settled in 9 s and overshoots of at most 1 %.
 
 `controllers` flies the 700 s step demonstration on the same seeds. The thesis states a power of 0.10 W for
 its own loop, 0.15 W for PID and 0.66 W for adaptive control on its testbed (ch. 5, Hardware Results). Two
