@@ -158,7 +158,7 @@ MINUS_X = np.diag([-1.0, 1.0, 1.0])
 HALF = np.diag([1.0, 0.5, 1.0])
 ABOUT_Z = np.array([[0.866, 0.5, 0.0], [-0.5, 0.866, 0.0], [0.0, 0.0, 1.0]])
 
-CASES = {
+COIL_WIRING = {
     "coils x and y exchanged": Case(
         windings(x={"channels": [2, 3]}, y={"channels": [0, 1]}),
         "coils",
@@ -188,12 +188,6 @@ CASES = {
         "coils",
         ["coils.windings[0] wrong resistance"],
         says="multiply `resistance` by 2.0",
-    ),
-    "bridge leg without signal": Case(
-        fault("bridge-y: b-low"), "coils", ["coils.windings[1] half bridge"], says="input B"
-    ),
-    "bridge leg stuck high": Case(
-        fault("bridge-z: a-high"), "coils", ["coils current while off", "coils.windings[2] half bridge"]
     ),
     "coil tilted by 45 deg": Case(
         coil_field([[0.7, 0.0, 0.0], [0.7, 1.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -231,22 +225,17 @@ CASES = {
         "coils",
         ["coils.windings[0] several coils", "coils.windings[1] several coils"],
     ),
+}
+COIL_SUPPLY = {
+    "bridge leg without signal": Case(
+        fault("bridge-y: b-low"), "coils", ["coils.windings[1] half bridge"], says="input B"
+    ),
+    "bridge leg stuck high": Case(
+        fault("bridge-z: a-high"), "coils", ["coils current while off", "coils.windings[2] half bridge"]
+    ),
     "loose plug of coil y": Case({}, "coils", ["coils.windings[1] intermittent"], spoil=loose_coil),
     "supply that sags under load": Case(
         {}, "coils", ["coils sagging supply"], says="falls from 5.00 to 3.5", spoil=sagging
-    ),
-    "magnetometer at its limit": Case(
-        fault("magnetometer: saturated"),
-        "rest coils",
-        ["inertial_unit.magnetometer stuck", "inertial_unit.magnetometer no response"],
-    ),
-    "magnetometer with the opposite sign": Case(
-        {}, "coils", ["inertial_unit.magnetometer reversed sign"], sensed(mag=-np.eye(3))
-    ),
-    "magnetometer stuck": Case(
-        fault("magnetometer: stuck"),
-        "rest coils",
-        ["inertial_unit.magnetometer stuck", "inertial_unit.magnetometer no response"],
     ),
     "shunt ten times as large": Case(
         {"power_monitor": {"shunt": 1.0}}, "coils", ["power_monitor wrong shunt"], says="at least"
@@ -260,8 +249,10 @@ CASES = {
     "wires at the shunt exchanged": Case(
         {}, "coils", ["power_monitor reversed"], says="swap the two wires", spoil=reverse
     ),
-    "monitor without supply": Case(fault("monitor: off"), "find", ["power_monitor no answer"]),
     "monitor stuck": Case(fault("monitor: stuck"), "coils", ["power_monitor no reading"]),
+}
+SEARCH = {
+    "monitor without supply": Case(fault("monitor: off"), "find", ["power_monitor no answer"]),
     "PWM chip without supply": Case(fault("pwm: off"), "find coils", ["coils no answer"]),
     "I2C bus without pull-ups": Case(
         fault("bus: off"), "find", ["coils no answer", "power_monitor no answer"]
@@ -290,10 +281,12 @@ CASES = {
         ["inertial_unit exchanged", "gps exchanged"],
         base="orbit",
     ),
-    "inertial unit too slow": Case(fault("imu: slow (n=2)"), "rest", ["inertial_unit wrong rate"]),
     "loose plug of the inertial unit": Case(
         fault("imu: intermittent"), "find", ["inertial_unit intermittent"], says="stops for up to 0.2"
     ),
+}
+REST = {
+    "inertial unit too slow": Case(fault("imu: slow (n=2)"), "rest", ["inertial_unit wrong rate"]),
     "short interruptions of the inertial unit": Case(
         fault("imu: intermittent (period=3, share=0.1)"), "rest", ["inertial_unit intermittent"], says="0.3"
     ),
@@ -303,9 +296,6 @@ CASES = {
     "magnetometer at half of the rate": Case(
         {}, "rest", ["inertial_unit.magnetometer wrong rate"], repeated("mag")
     ),
-    "gyro with one stuck axis": Case(
-        {}, "rest axes", ["inertial_unit.gyro stuck", "inertial_unit.gyro dead"], held("rate", 1), "on y"
-    ),
     "noise on the line": Case(
         fault("imu: cut (chance=0.1)"), "rest", ["inertial_unit corrupted packets"], says="wrong checksum"
     ),
@@ -313,6 +303,21 @@ CASES = {
         {"simulation": {"imu": {"rate_noise": 0.01}}}, "rest", ["inertial_unit.gyro noisy"], says="0.00027"
     ),
     "unit stuck": Case(fault("imu: stuck"), "rest", ["inertial_unit stuck"]),
+    "magnetometer at its limit": Case(
+        fault("magnetometer: saturated"),
+        "rest coils",
+        ["inertial_unit.magnetometer stuck", "inertial_unit.magnetometer no response"],
+    ),
+    "magnetometer stuck": Case(
+        fault("magnetometer: stuck"),
+        "rest coils",
+        ["inertial_unit.magnetometer stuck", "inertial_unit.magnetometer no response"],
+    ),
+}
+UNIT_AXES = {
+    "gyro with one stuck axis": Case(
+        {}, "rest axes", ["inertial_unit.gyro stuck", "inertial_unit.gyro dead"], held("rate", 1), "on y"
+    ),
     "gyro dead": Case(fault("imu: gyro-dead"), "rest axes", ["inertial_unit.gyro dead"] * 2),
     "unit rotated by 90 deg": Case(
         {"inertial_unit": {"mounting": [0.0, 0.0, 0.70710678, 0.70710678]}},
@@ -326,18 +331,23 @@ CASES = {
         ["inertial_unit rotated"],
         says="rotated by 40 deg about (1.00",
     ),
-    "gyro with exchanged axes": Case(
-        {}, "axes coils", ["inertial_unit.gyro mirrored"], sensed(rate=X_AND_Y), "x shows y, y shows x"
-    ),
-    "gyro in other units": Case({}, "axes", ["inertial_unit.gyro wrong scale"], sensed(rate=2.0 * np.eye(3))),
     "unit upside down": Case(
         {"inertial_unit": {"mounting": [1.0, 0.0, 0.0, 0.0]}},
         "axes coils",
         ["inertial_unit rotated"],
         says="y shows -y, z shows -z",
     ),
+    "gyro with exchanged axes": Case(
+        {}, "axes coils", ["inertial_unit.gyro mirrored"], sensed(rate=X_AND_Y), "x shows y, y shows x"
+    ),
+    "gyro in other units": Case({}, "axes", ["inertial_unit.gyro wrong scale"], sensed(rate=2.0 * np.eye(3))),
     "gyro with a scale of 1.2": Case(
         {}, "axes", ["inertial_unit.gyro wrong scale"], sensed(rate=1.2 * np.eye(3)), "x 1.20, y 1.20"
+    ),
+}
+SENSOR_AXES = {
+    "magnetometer with the opposite sign": Case(
+        {}, "coils", ["inertial_unit.magnetometer reversed sign"], sensed(mag=-np.eye(3))
     ),
     "accelerometer with a wrong scale of one axis": Case(
         {}, "axes", ["inertial_unit.accelerometer wrong scale"], sensed(accel=HALF), "x 1.00, y 0.50"
@@ -360,17 +370,23 @@ CASES = {
     "accelerometer upside down": Case(
         {}, "axes", ["inertial_unit.accelerometer mirrored"], sensed(accel=np.diag([1.0, 1.0, -1.0]))
     ),
+}
+FRAMES = {
     "lens cap on": Case(fault("camera: black"), "dark light", ["camera lens cap on"]),
     "camera frozen": Case(fault("camera: frozen"), "light", ["camera frozen"]),
     "camera without trigger": Case(fault("camera: off"), "light", ["camera no frame"]),
-    "camera out of focus": Case({"camera": {"psf_sigma": 3.5}}, "focus", ["camera out of focus"]),
-    "camera far out of focus": Case(
-        {"camera": {"psf_sigma": 10.0}}, "focus", ["camera out of focus"], says="width 9.9"
-    ),
     "camera with loose contact": Case(
         fault("camera: intermittent (period=7)"), "dark", ["camera intermittent"]
     ),
     "camera with late frames": Case(fault("camera: delayed"), "dark", ["camera late"]),
+}
+FOCUS = {
+    "camera out of focus": Case({"camera": {"psf_sigma": 3.5}}, "focus", ["camera out of focus"]),
+    "camera far out of focus": Case(
+        {"camera": {"psf_sigma": 10.0}}, "focus", ["camera out of focus"], says="width 9.9"
+    ),
+}
+PIXELS = {
     "camera with hot pixels": Case(
         {}, "dark", ["camera hot pixels"], says="1 % of the pixels", spoil=pictured(without_stars)
     ),
@@ -390,6 +406,8 @@ CASES = {
         says="multiples of 16",
         spoil=pictured(lambda pixels: pixels << 4),
     ),
+}
+GPS = {
     "GPS antenna unplugged": Case(fault("gps: no-fix"), "gps", ["gps no fix"], base="orbit"),
     "GPS receiver stuck": Case(fault("gps: stuck"), "gps", ["gps stuck"], base="orbit"),
     "GPS receiver with a loose plug": Case(
@@ -402,6 +420,8 @@ CASES = {
     "noise on the line of the GPS receiver": Case(
         fault("gps: bits"), "gps", ["gps corrupted messages"], base="orbit"
     ),
+}
+STRINGS = {
     "plugs of two solar strings exchanged": Case(
         {"solar_strings": {"strings": exchanged_strings()}},
         "strings",
@@ -442,12 +462,70 @@ def outcomes(opened: Session, steps: str) -> list[Outcome]:
     return found
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_a_wiring_fault_is_named_and_no_other(name: str, tmp_path: Path) -> None:
-    case = CASES[name]
-    findings = [one for outcome in outcomes(session(case, tmp_path), case.steps) for one in outcome.findings]
+def check(case: Case, folder: Path) -> None:
+    """Check that the steps of a case report its findings and no others."""
+    findings = [one for outcome in outcomes(session(case, folder), case.steps) for one in outcome.findings]
     assert [f"{one.part} {one.kind}" for one in findings] == list(case.expected)
     assert case.says in "\n".join(one.line() for one in findings)
+
+
+@pytest.mark.parametrize("name", COIL_WIRING)
+def test_only_the_fault_is_named_in_the_coils_wiring(name: str, tmp_path: Path) -> None:
+    check(COIL_WIRING[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", COIL_SUPPLY)
+def test_only_the_fault_is_named_in_the_coils_supply(name: str, tmp_path: Path) -> None:
+    check(COIL_SUPPLY[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", SEARCH)
+def test_only_the_fault_is_named_in_the_search_for_devices(name: str, tmp_path: Path) -> None:
+    check(SEARCH[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", REST)
+def test_only_the_fault_is_named_in_a_resting_inertial_unit(name: str, tmp_path: Path) -> None:
+    check(REST[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", UNIT_AXES)
+def test_only_the_fault_is_named_in_the_axes_of_the_inertial_unit_or_its_gyro(
+    name: str, tmp_path: Path
+) -> None:
+    check(UNIT_AXES[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", SENSOR_AXES)
+def test_only_the_fault_is_named_in_the_axes_of_accelerometer_or_magnetometer(
+    name: str, tmp_path: Path
+) -> None:
+    check(SENSOR_AXES[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_only_the_fault_is_named_in_triggers_and_frames(name: str, tmp_path: Path) -> None:
+    check(FRAMES[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", FOCUS)
+def test_only_the_fault_is_named_in_the_focus(name: str, tmp_path: Path) -> None:
+    check(FOCUS[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", PIXELS)
+def test_only_the_fault_is_named_in_pixel_values(name: str, tmp_path: Path) -> None:
+    check(PIXELS[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", GPS)
+def test_only_the_fault_is_named_in_the_gps_receiver(name: str, tmp_path: Path) -> None:
+    check(GPS[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", STRINGS)
+def test_only_the_fault_is_named_in_the_solar_strings(name: str, tmp_path: Path) -> None:
+    check(STRINGS[name], tmp_path)
 
 
 def test_a_mirrored_camera_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
