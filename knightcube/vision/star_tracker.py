@@ -289,10 +289,7 @@ class StarTracker:
         )
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
-        """Return the camera for an image of `shape`, and the lowest and highest possible scale.
-
-        The scale is the factor on the tangents of the observed field angles, see `camera_of_field`.
-        """
+        """Return the camera for an image of `shape`, and the range of scale (see `camera_of_field`)."""
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)

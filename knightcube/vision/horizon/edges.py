@@ -485,10 +485,7 @@ def _hidden_samples(masked: BoolArray) -> BoolArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return unit vectors (m, 3) to the m of k sampled pixels that the lens images, and their mask (k,).
-
-    The directions are cached, because successive frames have the same directions.
-    """
+    """Return cached unit vectors (m, 3) to the imaged ones of k sampled pixels, and their mask (k,)."""
     x, y = np.meshgrid(columns, _sample_places(camera.rows), indexing="ij")
     other_y, other_x = np.meshgrid(rows, _sample_places(camera.columns), indexing="ij")
     points = np.stack(
