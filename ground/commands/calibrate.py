@@ -12,6 +12,8 @@ from typing import Any
 
 from flight.app.cli import PROGRAM
 from flight.app.cli.run import seed_number
+from flight.schema import reader as configuration
+from flight.schema.devices import camera_model
 from ground.commands.options import add_field, check_size, positive, print_result, write_new
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
@@ -274,9 +276,6 @@ def run_index(options: argparse.Namespace) -> int:
     if options.camera is None:
         settings = IndexSettings.of_field(math.radians(options.fov))
     else:
-        from flight.schema import reader as configuration  # noqa: PLC0415 - not needed by `calibrate`
-        from flight.schema.devices import camera_model  # noqa: PLC0415
-
         camera = camera_model(configuration.load_camera(options.camera))
         settings = IndexSettings.of_field(field_of_view(camera), 1.0 / camera.focal_length)
     sky = build(replace(settings, faintest=options.faintest, epoch=options.epoch))
