@@ -118,7 +118,7 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     link = tmp_path_factory.mktemp("line") / "unit"
     words = [sys.executable, "-m", "sim_hal", "emulate", "vn100", "--link", str(link), "--duration", "60"]
     with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as server:
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 300.0
         while not link.exists() and time.monotonic() < deadline:
             time.sleep(0.02)
         yield link

@@ -136,7 +136,7 @@ def test_the_log_works_on_the_machines_clock(tmp_path: Path) -> None:
     packets = timing_packets(200)
     for packet in packets:
         log.write(packet)
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 300.0
     while len(content(tmp_path)) < sum(map(len, packets)) and time.monotonic() < deadline:
         time.sleep(0.002)
     assert content(tmp_path) == b"".join(packets), "drained by the ticker, not by close"
@@ -166,7 +166,7 @@ def test_a_killed_process_leaves_a_readable_log(tmp_path: Path) -> None:
     root = Path(__file__).resolve().parents[4]
     writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], cwd=root)
     try:
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 300.0
         while len(content(tmp_path)) < 150_000 and time.monotonic() < deadline:
             assert writer.poll() is None
             time.sleep(0.005)
