@@ -599,7 +599,9 @@ def diagnose_coils(
     askew, strength = ASKEW if exact else RECOGNISED, sign * strength
     state = CoilsFound(response, expected, serves, strength, misfit, live, drawn, 1.0, joined, askew, found)
     shared, shunt = _shared_fault(test, state, size_known)
-    state = replace(state, drawn=drawn / shunt, shunt=shunt)
+    # A monitor that measures no current says nothing about single coils.
+    unmeasured = any(one.kind == "no current" for one in shared)
+    state = replace(state, drawn=np.full_like(drawn, math.nan) if unmeasured else drawn / shunt, shunt=shunt)
     found += shared
     if not any(one.part in {"coils", "inertial_unit.magnetometer"} and one.kind in _ALL for one in shared):
         legs = np.linalg.norm(np.stack([plus, minus], axis=1), axis=2)

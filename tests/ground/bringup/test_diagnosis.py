@@ -497,6 +497,7 @@ def coils(
         ({"field": 0.0, "drawn": [0.1, 0.2, 0.1]}, ["inertial_unit.magnetometer no response"],
          "not change"),
         ({"sensed": False}, ["inertial_unit.magnetometer no response"], ""),
+        ({"drawn": 0.025}, ["power_monitor no current"], "current stays zero"),
         ({"drawn": 0.035}, ["power_monitor wrong shunt"], "0.035 times"),
         ({"drawn": 1.13}, [], ""),
         ({"drawn": 1.25}, ["power_monitor wrong shunt"], "current is 1.25 times the commanded one"),
