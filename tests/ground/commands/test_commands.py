@@ -56,7 +56,7 @@ def test_a_short_flight_says_what_it_did_and_what_to_do_next(tmp_path: Path) -> 
     done = command("run", DEMO, "--duration", "3", "--out", tmp_path / "run", "--seed", "4")
     assert done.returncode == 0
     assert "knightcube report" in done.stdout
-    assert "\r" not in done.stderr, "a progress bar is redrawn although the output is no terminal"
+    assert "\r" not in done.stderr, "a progress bar is redrawn although the output is not a terminal"
     assert (tmp_path / "run" / "config.yaml").read_text() == DEMO.read_text()
 
 
