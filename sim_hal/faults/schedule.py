@@ -230,8 +230,17 @@ def put(faults: Sequence[ScheduledFault], bench: Bench, epoch_ns: int) -> None:
     for fault in faults:
         if fault.kind.begin is None:
             continue
-        begin, removals = partial(fault.kind.begin, bench, fault.kind, fault.parameters), list[Removal]()
+        removals: list[Removal] = []
         timeline, begin_ns = bench.hardware.faults, epoch_ns + round(fault.at * 1e9)
-        timeline.at(begin_ns, lambda begin=begin, removals=removals: removals.append(begin()))
+        timeline.at(begin_ns, partial(_begin, fault, bench, removals))
         if fault.span is not None and not fault.kind.momentary:
-            timeline.at(begin_ns + round(fault.span * 1e9), lambda removals=removals: removals.pop()())
+            timeline.at(begin_ns + round(fault.span * 1e9), partial(_end, removals))
+
+
+def _begin(fault: ScheduledFault, bench: Bench, removals: list[Removal]) -> None:
+    assert fault.kind.begin is not None  # faults without `begin` are not scheduled
+    removals.append(fault.kind.begin(bench, fault.kind, fault.parameters))
+
+
+def _end(removals: list[Removal]) -> None:
+    removals.pop()()
