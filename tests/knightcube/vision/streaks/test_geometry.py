@@ -1,4 +1,4 @@
-"""Tests of the distorted pinhole: positions in both directions, and the motion of stars in the image."""
+"""Tests of star paths on the detector against rotations about the boresight and numerical derivatives."""
 
 from __future__ import annotations
 
@@ -8,8 +8,26 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.lens import CameraKnowledge, Lens, Pinhole
 from knightcube.vision.streaks import geometry
-from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, paths, positions, sensitivities
+from knightcube.vision.streaks.geometry import (
+    CameraMotion,
+    Course,
+    DistortedPinhole,
+    Shutter,
+    Vibration,
+    azimuth_differences,
+    exposure_bounds,
+    image_flow,
+    mid_exposure_positions,
+    near_streaks,
+    path_lengths,
+    paths,
+    polar_angles,
+    positions,
+    sensitivities,
+    streak_pinhole,
+)
 from tests.support.compiled_forms import assert_forms_agree
 
 _LENS = DistortedPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
@@ -72,3 +90,292 @@ def test_the_compiled_paths_equal_those_in_numpy(
     assert_forms_agree(geometry._ideal_paths, *arguments)
     for growing in (False, True):
         assert_forms_agree(geometry._ideal_sensitivities, *arguments, growing)
+
+
+def _stars_on_circles(time: FloatArray, angle: FloatArray, stars: FloatArray) -> FloatArray:
+    """Return the positions of stars after the camera has rotated by `angle` (m,) about its boresight."""
+    x, y = (stars - _CENTRE).T
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return np.stack([x * cosine + y * sine, y * cosine - x * sine], axis=1) + _CENTRE
+
+
+_PINHOLE = Pinhole(1024, 824, 2903.0)
+_CENTRE = np.array([511.5, 411.5])
+_SHAKING = Vibration(
+    np.array([1.5, 4.0]),
+    np.array([[0.0, 0.0, 0.02], [0.0, 0.0, -0.01]]),
+    np.array([[0.0, 0.0, 0.005], [0.0, 0.0, 0.03]]),
+)
+
+
+@pytest.mark.parametrize("vibration", [Vibration(), _SHAKING])
+def test_stars_move_on_circles_about_the_boresight(vibration: Vibration) -> None:
+    """A rotation about the boresight moves stars on circles, by the sum of all terms of the rotation angle.
+
+    The velocity and the acceleration are numerical derivatives of the position on the circle.
+    """
+    motion = CameraMotion(
+        np.array([0.0, 0.0, 0.5]),
+        np.array([0.0, 0.0, -0.3]),
+        np.array([[0.0, 0.0, 0.8], [0.0, 0.0, -0.6]]),
+        vibration,
+    )
+
+    def angle(t: FloatArray) -> FloatArray:
+        total = 0.5 * t - 0.15 * t**2 + 0.8 * t**3 - 0.6 * t**4
+        for f, (*_, s), (*_, c) in zip(vibration.frequency, vibration.sine, vibration.cosine, strict=True):
+            total = total + s * np.sin(2.0 * np.pi * f * t) + c * (np.cos(2.0 * np.pi * f * t) - 1.0)
+        return total
+
+    def on_circle(t: FloatArray) -> FloatArray:
+        return _stars_on_circles(t, angle(t), _STARS)
+
+    step = 1e-4
+    drawn = paths(_PINHOLE, motion, _STARS, _TIME)
+    before, here, after = (on_circle(_TIME + way * step) for way in (-1.0, 0.0, 1.0))
+    assert drawn.position == pytest.approx(here, abs=1e-6)
+    assert positions(_PINHOLE, motion, _STARS, _TIME) == pytest.approx(here, abs=1e-6)
+    assert drawn.velocity == pytest.approx((after - before) / (2.0 * step), abs=1e-2)
+    assert drawn.acceleration == pytest.approx((after - 2.0 * here + before) / step**2, rel=1e-3, abs=1.0)
+    changed = sensitivities(_PINHOLE, motion, _STARS, _TIME)
+    turned = (_stars_on_circles(_TIME, angle(_TIME) + way, _STARS) for way in (1e-6, -1e-6))
+    by_angle = np.subtract(*turned) / 2e-6
+    assert changed[:, :, 2] == pytest.approx(by_angle * _TIME[:, None], abs=1e-2)
+    assert changed[:, :, 5] == pytest.approx(0.5 * by_angle * _TIME[:, None] ** 2, rel=0.03, abs=1.0)
+    sine, cosine = np.sin(angle(_TIME)), np.cos(angle(_TIME))
+    assert changed[:, :, 6] == pytest.approx(np.stack([cosine, -sine], axis=1))
+    assert changed[:, :, 7] == pytest.approx(np.stack([sine, cosine], axis=1))
+    assert not sensitivities(_PINHOLE, motion, _STARS, _TIME, growing=False)[:, :, 3:6].any()
+
+
+def test_a_vibration_has_the_derivatives_of_its_rotation() -> None:
+    shaking = Vibration(np.array([0.7]), np.array([[0.3, 0.0, 0.1]]), np.array([[0.4, 0.2, 0.0]]))
+    time, step = np.array([-0.31, 0.0, 0.12, 0.44]), 1e-5
+    known = [
+        0.3 * np.sin(1.4 * np.pi * time) + 0.4 * (np.cos(1.4 * np.pi * time) - 1.0),
+        0.2 * (np.cos(1.4 * np.pi * time) - 1.0),
+        0.1 * np.sin(1.4 * np.pi * time),
+    ]
+    assert shaking.rotation(time) == pytest.approx(np.stack(known))
+    for order in (1, 2):
+        ahead, behind = (shaking.rotation(time + way * step, order - 1) for way in (1.0, -1.0))
+        assert shaking.rotation(time, order) == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-6)
+    assert shaking.reversed().rotation(time) == pytest.approx(shaking.rotation(-time))
+    assert shaking.amplitude == pytest.approx([np.sqrt(0.3**2 + 0.1**2 + 0.4**2 + 0.2**2)])
+    more = shaking.with_frequency(2.5)
+    assert more.frequency == pytest.approx([0.7, 2.5])
+    assert more.sine == pytest.approx(np.array([[0.3, 0.0, 0.1], [0.0, 0.0, 0.0]]))
+    assert more.cosine == pytest.approx(np.array([[0.4, 0.2, 0.0], [0.0, 0.0, 0.0]]))
+    assert shaking.exists
+    assert not Vibration().exists
+
+
+_HIGHER = np.array([[0.02, -0.01, 0.03], [0.01, 0.05, -0.04]])
+
+
+def test_the_rotation_of_an_exposure_follows_from_the_terms_of_the_motion() -> None:
+    """Odd terms contribute to the rotation between start and end, and even terms to the halfway rotation."""
+    motion = CameraMotion(np.array([0.3, 0.1, -0.2]), np.array([0.4, -0.2, 0.8]), _HIGHER)
+    assert motion.rotation == pytest.approx([0.305, 0.0975, -0.1925])
+    assert motion.halfway == pytest.approx([0.05 + 0.000625, -0.025 + 0.003125, 0.1 - 0.0025])
+    assert motion.progress(np.array([-0.5, 0.5])) @ [-1.0, 1.0] == pytest.approx(1.0)
+    time, step = np.array([-0.4, 0.1, 0.35]), 1e-5
+    slope = (motion.progress(time + step) - motion.progress(time - step)) / (2.0 * step)
+    assert motion.relative_rate(time) == pytest.approx(slope)
+    bend = (motion.relative_rate(time + step) - motion.relative_rate(time - step)) / (2.0 * step)
+    assert motion.relative_rate(time, 1) == pytest.approx(bend)
+    ends = motion.relative_rate(np.array([-0.5, 0.5]))
+    assert motion.relative_acceleration == pytest.approx(ends[1] - ends[0])
+    made = CameraMotion.between(np.array([0.1, 0.2, 0.3]), motion.acceleration, _HIGHER)
+    assert made.rotation == pytest.approx([0.1, 0.2, 0.3])
+    assert np.array_equal(made.acceleration, motion.acceleration)
+    assert motion.scaled_to(np.array([0.5, 0.2, -0.1])).rotation == pytest.approx([0.5, 0.2, -0.1])
+    assert motion.scaled_to(np.array([-0.5, -0.2, 0.1])).rotation == pytest.approx([0.5, 0.2, -0.1])
+    assert CameraMotion.steady(np.zeros(3)).relative_acceleration == 0.0
+    assert CameraMotion.steady(np.ones(3)).relative_rate(time) == pytest.approx(np.ones(3))
+
+
+def test_a_reversed_motion_visits_the_same_positions_in_reverse_order() -> None:
+    shaking = replace(_SHAKING, sine=_SHAKING.sine + 0.01, cosine=_SHAKING.cosine - 0.02)
+    motion = CameraMotion(np.array([0.3, 0.1, -0.2]), np.array([0.2, -0.1, 0.1]), _HIGHER, shaking)
+    assert motion.directed(motion.rotation) is motion
+    back = motion.directed(-motion.rotation)
+    assert back.rotation == pytest.approx(-motion.rotation)
+    assert positions(_PINHOLE, back, _STARS, -_TIME) == pytest.approx(
+        positions(_PINHOLE, motion, _STARS, _TIME), abs=1e-6
+    )
+    assert not motion.smooth.vibration.exists
+    assert motion.smooth.rate is motion.rate
+    steady, rising = CameraMotion.steady(motion.rate), CameraMotion(motion.rate, motion.acceleration)
+    assert (steady.constant, steady.accelerates) == (True, False)
+    assert (rising.constant, rising.accelerates) == (False, True)
+    assert (replace(steady, vibration=shaking).constant, replace(steady, vibration=shaking).accelerates) == (
+        False,
+        False,
+    )
+    assert replace(steady, higher_terms=_HIGHER).accelerates
+
+
+def test_the_image_flow_is_the_velocity_at_a_rate() -> None:
+    for camera in (_PINHOLE, _LENS):
+        flow = image_flow(camera, _STARS)
+        for axis in np.eye(3):
+            ahead, behind = (
+                positions(camera, CameraMotion.steady(axis), camera_points, np.full(20, t))
+                for camera_points, t in ((_STARS, 1e-6), (_STARS, -1e-6))
+            )
+            velocity = (ahead - behind) / 2e-6
+            if camera is _PINHOLE:
+                assert flow @ axis == pytest.approx(velocity, rel=1e-5, abs=1e-3)
+            else:  # without the derivative of the distortion, which is a few percent
+                assert np.abs(flow @ axis - velocity).max() < 0.05 * np.abs(velocity).max()
+
+
+def test_a_calibrated_lens_becomes_a_pinhole_with_the_same_image() -> None:
+    """The pinhole with distortion has the image positions of the lens, within the error of a cubic term."""
+    lens = Lens(1024, 824, 2903.0, (514.0, 409.0), k1=0.15, k2=0.4)
+    camera = DistortedPinhole.of(lens)
+    away = lens.unit_vectors(_STARS)
+    ideal = lens.ideal.project(away)
+    assert np.abs(ideal - _STARS).max() > 2.0
+    assert camera.distorted(ideal) == pytest.approx(_STARS, abs=0.05)
+    assert camera.undistorted(_STARS) == pytest.approx(ideal, abs=0.05)
+    covariance = np.eye(2)
+    assert streak_pinhole(lens, CameraKnowledge()) == lens.ideal
+    assert streak_pinhole(lens, replace(CameraKnowledge(), covariance=covariance)) == camera
+    assert streak_pinhole(_PINHOLE, replace(CameraKnowledge(), covariance=covariance)) is _PINHOLE
+
+
+def test_a_binned_lens_has_the_same_distortion() -> None:
+    small = _LENS.binned(256, 256, 4)
+    binned = (_STARS + 0.5) / 4.0 - 0.5
+    # The corners of the two detectors differ by 0.4 px, which changes the cubic distortion by 0.6 %.
+    assert small.distorted(binned) == pytest.approx((_LENS.distorted(_STARS) + 0.5) / 4.0 - 0.5, abs=0.01)
+    assert (small.columns, small.rows, small.focal_length) == (256, 256, 2903.0 / 4.0)
+
+
+def test_rows_are_exposed_later_with_their_distance_from_the_middle_row() -> None:
+    shutter = Shutter(2e-3, 100.0)
+    assert shutter.delay(np.array([100.0, 150.0, 60.0])) == pytest.approx([0.0, 0.1, -0.08])
+    assert shutter.delay(np.array([1.0], dtype=np.float32)).dtype == np.float32
+
+
+def test_a_star_is_exposed_while_its_row_is_exposed() -> None:
+    """Start and end of a star's exposure are those of the row in which the star then is.
+
+    A star below or above the detector has the times of the nearest row.
+    """
+    shutter = Shutter(3e-4, 411.5)
+    stars = np.array([[500.0, 300.0], [200.0, 700.0], [800.0, 5000.0], [800.0, -900.0]])
+    bounds = exposure_bounds(_PINHOLE, _MOTION, shutter, stars)
+    for end, nominal in enumerate((-0.5, 0.5)):
+        row = positions(_PINHOLE, _MOTION, stars, bounds[:, end])[:, 1]
+        expected = nominal + (np.clip(row, 0.0, 823.0) - 411.5) * 3e-4
+        assert bounds[:, end] == pytest.approx(expected, abs=1e-6)
+    assert exposure_bounds(_PINHOLE, _MOTION, Shutter(), stars) == pytest.approx(
+        np.tile([-0.5, 0.5], (4, 1)), abs=0.0
+    )
+
+
+def test_the_position_at_mid_exposure_follows_from_the_middle_of_the_streak() -> None:
+    """The middle of a streak is at half the angle between its ends, and at the time of its row."""
+    growing = CameraMotion(np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 0.4]))
+    halfway = np.full(20, 0.4 / 8.0)  # the mean of the angles -0.1 and 0.2 rad at start and end
+    middles = _stars_on_circles(_TIME, halfway, _STARS)
+    assert mid_exposure_positions(_PINHOLE, growing, Shutter(), middles) == pytest.approx(_STARS, abs=1e-6)
+    steady, shutter = CameraMotion.steady(np.array([0.02, 0.01, 0.3])), Shutter(2e-4, 300.0)
+    time = np.zeros(20)
+    for _ in range(20):
+        time = 2e-4 * (positions(_PINHOLE, steady, _STARS, time)[:, 1] - 300.0)
+    seen = positions(_PINHOLE, steady, _STARS, time)
+    assert np.abs(seen - _STARS).max() > 1.0
+    assert mid_exposure_positions(_PINHOLE, steady, shutter, seen) == pytest.approx(_STARS, abs=1e-6)
+    assert len(mid_exposure_positions(_PINHOLE, steady, shutter, np.zeros((0, 2)))) == 0
+
+
+def test_a_path_about_the_boresight_is_an_arc() -> None:
+    motion = CameraMotion(np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, 0.5]))
+    radius = np.hypot(*(_STARS - _CENTRE).T)
+    assert path_lengths(_PINHOLE, motion, _STARS) == pytest.approx(0.6 * radius, rel=2e-3)
+
+
+def test_stars_have_polar_coordinates_about_the_rotation_axis() -> None:
+    offset = _STARS - _CENTRE
+    for sign in (1.0, -1.0):
+        motion = CameraMotion.steady(np.array([0.0, 0.0, 0.2 * sign]))
+        polar, azimuth = polar_angles(_PINHOLE, motion, _STARS)
+        angle = np.arctan(np.hypot(*offset.T) / 2903.0)
+        assert polar == pytest.approx(angle if sign > 0.0 else np.pi - angle)
+        turned = np.arctan2(offset[:, 1], offset[:, 0])
+        apart = np.abs(np.exp(1j * turned[:, None]) - np.exp(1j * turned))
+        assert np.abs(np.exp(1j * azimuth[:, None]) - np.exp(1j * azimuth)) == pytest.approx(apart, abs=1e-9)
+        about = np.exp(1j * sign * (azimuth[1:] - azimuth[:-1]))
+        assert about == pytest.approx(np.exp(1j * (turned[1:] - turned[:-1])))
+    tilted = polar_angles(_PINHOLE, CameraMotion.steady(np.array([3.0, 0.0, 4.0])), _CENTRE[None])[0]
+    assert tilted == pytest.approx([np.arctan2(3.0, 4.0)])
+
+
+def test_azimuths_differ_by_at_most_half_a_turn() -> None:
+    found = azimuth_differences(np.array([3.0, -1.0]), np.array([-3.0, 0.5, 3.0]))
+    expected = np.array([[2.0 * np.pi - 6.0, 2.5, 0.0], [2.0, 1.5, 2.0 * np.pi - 4.0]])
+    assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("radius", "angle", "near"),
+    [
+        (200.0, 0.49, True),
+        (200.0, -0.49, True),
+        (200.0, 0.51, False),
+        (200.0, -0.51, False),
+        (218.0, 0.3, True),
+        (222.0, 0.3, False),
+        (182.0, 0.3, True),
+        (178.0, 0.3, False),
+    ],
+)
+def test_streaks_are_near_if_their_arcs_pass_within_the_distance(
+    radius: float, angle: float, near: bool
+) -> None:
+    """Two arcs of 0.4 rad are near if the gap along the arc or across it is less than 20 px.
+
+    At a radius of 200 px, 20 px along the arc are 0.1 rad.
+    """
+    motion = CameraMotion.steady(np.array([0.0, 0.0, 0.4]))
+    one = _CENTRE + np.array([[200.0, 0.0], [-10.0, 0.0]])
+    other = _CENTRE + radius * np.array([[np.cos(angle), np.sin(angle)]])
+    assert near_streaks(_PINHOLE, motion, other, one, 20.0).tolist() == [near]
+
+
+def test_a_course_has_the_mean_rates_and_their_linear_change() -> None:
+    time = np.linspace(-0.5, 0.5, 21)[:, None]
+    first, slope = np.array([0.3, -0.1, 0.2]), np.array([0.05, 0.4, -0.1])
+    course = Course.of_rates(first + slope * time, 0.2, 0.003)
+    assert course.terms[0] == pytest.approx(0.2 * first)
+    assert course.terms[1] == pytest.approx(0.1 * slope)
+    assert np.abs(course.terms[2:]).max() < 1e-9
+    assert course.sigma == pytest.approx(0.2 * 0.003)
+    ripple = np.where(np.arange(21)[:, None] % 2 == 0, 0.03, -0.03) * np.array([1.0, 0.0, 0.0])
+    # A polynomial with seven coefficients follows a little of the ripple.
+    rough = Course.of_rates(first + slope * time + ripple, 0.2, 0.04)
+    assert rough.sigma == pytest.approx(0.2 * 0.05, rel=0.1)
+    assert course.covariance(0.2) == pytest.approx(np.eye(3) * (geometry._COURSE_SHARE * 0.003) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma", "used"), [(1.05, 0.98, True), (0.95, 0.98, False), (1.05, 1.02, False)]
+)
+def test_a_course_is_used_if_it_is_certain_and_not_uniform(share: float, sigma: float, used: bool) -> None:
+    """A course is used if stars depart from uniform motion, and if its error on the image is small.
+
+    For a constant acceleration g, the departure g t^2/2 varies by g/8 within the exposure.
+    """
+    focal = 1000.0
+    growth = 8.0 * share * geometry._UNEVEN / focal
+    terms = np.array([[0.1, 0.0, 0.0], [0.5 * growth, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    motion = Course(terms, sigma * geometry._MOST_VAGUE / focal).motion(focal)
+    assert (motion is not None) == used
+    if motion is not None:
+        assert motion.rate == pytest.approx([0.1, 0.0, 0.0])
+        assert motion.acceleration == pytest.approx([growth, 0.0, 0.0])
+        assert motion.higher_terms.shape == (1, 3)
