@@ -6,17 +6,32 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
+from knightcube.vision.streaks import uncertainty
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, sensitivities
+from knightcube.vision.streaks.geometry import (
+    CameraMotion,
+    DistortedPinhole,
+    Shutter,
+    StreakScene,
+    sensitivities,
+)
 from knightcube.vision.streaks.joint_fit import FitProblem, brightest_fit
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
-from knightcube.vision.streaks.uncertainty import apparent_rates, correct, end_displacement, side_displacement
+from knightcube.vision.streaks.uncertainty import (
+    Displacement,
+    apparent_rates,
+    correct,
+    distorted_camera,
+    end_displacement,
+    side_displacement,
+)
 from knightcube.vision.streaks.vibration import StreakResiduals
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky, turn_of
@@ -241,3 +256,183 @@ def test_streaks_without_ends_in_the_frame_have_no_displacement_of_ends() -> Non
     left, scene = _left(0.5, 1.0, "sides")
     left.images[:, 3] = 0.0
     assert end_displacement(left, scene) is None
+
+
+@pytest.mark.parametrize("spread", [1.0, 2.5])
+@pytest.mark.parametrize("counted", [None, np.array([0.3, -0.7, 0.2])])
+def test_calibration_errors_are_estimated_together_with_the_motion(
+    spread: float, counted: FloatArray | None
+) -> None:
+    """The correction is that of dense equations for the motion and all calibration errors.
+
+    Each calibration error has a prior standard deviation of one. The errors that the fit has already
+    corrected are part of the prior. The covariance grows by that of the errors and by the squared correction.
+    """
+    rng = np.random.default_rng(8)
+    n, k, m, described = 6, 4, 3, 2
+    root = rng.normal(size=(n, k, 7))
+    information, apparent = root @ root.swapaxes(1, 2), rng.normal(size=(n, k, m)) * [5.0, 2.0, 3.0]
+    true = np.array([2.0, -1.5, 1.0])
+    score = np.einsum("nij,nj->ni", information, apparent @ true + 0.1 * rng.normal(size=(n, k)))
+    found = correct(information, score, apparent, spread, described, counted)
+    assert found is not None
+
+    def dense(of: int) -> FloatArray:
+        """Return the information matrix of the motion and the first `of` calibration errors."""
+        whole = np.zeros((k + of, k + of))
+        for known, change in zip(information / spread, apparent[:, :, :of], strict=True):
+            design = np.hstack([np.eye(k), change])
+            whole += design.T @ known @ design
+        whole[range(k, k + of), range(k, k + of)] += 1.0
+        return whole
+
+    prior = np.zeros(m) if counted is None else counted
+    right = np.append(score.sum(axis=0), np.einsum("nkm,nk->m", apparent, score)) / spread
+    right[k:] -= prior
+    both = np.linalg.solve(dense(m), right)
+    alone = np.linalg.solve(information.sum(axis=0), score.sum(axis=0))
+    assert found.error == pytest.approx(both[k:])
+    assert found.step == pytest.approx(both[:k] - alone)
+    exact = spread * np.linalg.inv(information.sum(axis=0))
+    change = both[:k] - alone
+    more = np.linalg.inv(dense(m))[:k, :k] - exact + np.outer(change, change)
+    assert found.added == pytest.approx(more)
+    partial = np.linalg.solve(information.sum(axis=0), (information @ apparent).sum(axis=0))[:, :described]
+    described_change = partial @ both[k : k + described]
+    stated = np.linalg.inv(dense(described))[:k, :k] - exact
+    assert found.described == pytest.approx(stated + np.outer(described_change, described_change))
+    left = score - np.einsum("nij,nj->ni", information, apparent @ both[k:] + change)
+    assert found.score == pytest.approx(left)
+
+
+def test_a_calibration_error_is_corrected_if_it_is_hardly_due_to_chance() -> None:
+    """A calibration error is corrected if chi-square exceeds its quantile for a probability of 1e-5.
+
+    One star with a large error of its own determines the common motion; the difference of two stars has the
+    variance 2, of which the calibration error contributes 4.
+    """
+    information = np.array([[[1.0]], [[1.0]]])
+    apparent = np.array([[[1.0]], [[-1.0]]])
+    limit = float(chi2.isf(uncertainty._BY_CHANCE, 1))
+    for share, corrected in ((0.99, False), (1.01, True)):
+        # The estimates (d, -d) have the sum of products 2 d with the error, of the information 2 + 1.
+        difference = np.sqrt(share * limit * 3.0) / 2.0
+        score = np.array([[difference], [-difference]])
+        done = correct(information, score, apparent, 1.0, 1)
+        assert done is not None
+        assert done.error == pytest.approx([2.0 * difference / 3.0])
+        # The error has no effect on the common motion.
+        assert done.step == pytest.approx([0.0], abs=1e-12)
+        tilted = correct(np.array([[[1.0]], [[1.001]]]), score, apparent, 1.0, 1)
+        assert tilted is not None
+        assert tilted.step.any() == corrected
+    assert correct(0.0 * information, score, apparent, 1.0, 1) is None
+
+
+def _camera(knowledge: CameraKnowledge) -> FitProblem:
+    frame = reduce_frame(np.zeros((64, 80), np.uint16), SATURATION, 1.0)
+    settings = LikelihoodSettings(line_time=0.0, knowledge=knowledge)
+    return FitProblem(frame, replace(CAMERA.pinhole, columns=80, rows=64), Shutter(), settings, 1.0)
+
+
+def test_a_lens_is_corrected_by_its_errors() -> None:
+    """The errors are those of focal length, image centre and distortion; exactly known values are omitted."""
+    camera = _camera(replace(EXACT, focal_length=0.01, centre=3.0, distortion=0.02, line_time=1e-5))
+    lens = distorted_camera(camera, np.array([0.5, -1.0, 2.0, 0.25, 7.0])).pinhole
+    assert isinstance(lens, DistortedPinhole)
+    assert (lens.scale, lens.cubic) == pytest.approx((0.005, 0.005))
+    assert lens.shift == pytest.approx((-3.0, 6.0))
+    assert (lens.columns, lens.rows, lens.focal_length) == (80, 64, camera.pinhole.focal_length)
+    partly = _camera(replace(EXACT, centre=3.0))
+    again = distorted_camera(replace(partly, pinhole=lens), np.array([1.0, 0.5])).pinhole
+    assert isinstance(again, DistortedPinhole)
+    assert (again.scale, again.cubic) == pytest.approx((0.005, 0.005))
+    assert again.shift == pytest.approx((0.0, 7.5))
+
+
+def test_correlated_calibration_errors_have_the_stated_covariance() -> None:
+    root = np.random.default_rng(5).normal(size=(5, 5)) * np.array([[0.01], [2.0], [3.0], [0.02], [0.0]])
+    covariance = root @ root.T
+    knowledge = replace(EXACT, covariance=tuple(tuple(row) for row in covariance.tolist()))
+    found = uncertainty._error_root(_camera(knowledge))
+    assert found @ found.T == pytest.approx(covariance)
+
+
+@pytest.mark.parametrize("share", [-0.3, 0.0, 0.4, 0.9])
+@pytest.mark.parametrize("length", [30.0, 44.0])
+def test_the_intensity_of_a_reversing_motion_is_that_of_many_instants(share: float, length: float) -> None:
+    """The chi-square of a reversing motion is that of a fit of flux and sky level to all pixels.
+
+    The star is `share` of the time after the reversal away from the point of rest at the beginning, and its
+    distance from the point of rest grows with the square of the time.
+    """
+    rng = np.random.default_rng(2)
+    places = np.arange(-uncertainty._BEFORE, 60.0, uncertainty._STEP)
+    nearest = rng.integers(0, len(places), 500)
+    across, weight = rng.uniform(0.1, 1.0, 500), rng.uniform(0.5, 2.0, 500)
+    time = np.linspace(-share, 1.0, 400_001)
+    middle = 0.5 * (time[1:] + time[:-1])
+    edges = np.append(places, places[-1] + uncertainty._STEP) - 0.5 * uncertainty._STEP
+    light = np.histogram(length * middle**2, edges)[0] / len(middle)
+    light = gaussian_filter1d(light, 1.2 / uncertainty._STEP, mode="constant")
+    data = 300.0 * light[nearest] * across + 2.0 + rng.normal(size=500)
+    design = np.stack([light[nearest] * across, np.ones(500)], axis=1) * np.sqrt(weight)[:, None]
+    solved = np.linalg.lstsq(design, data * np.sqrt(weight), rcond=None)[0]
+    expected = float(np.sum((data * np.sqrt(weight) - design @ solved) ** 2))
+    terms = across**2, across * data, across
+    sums = (np.bincount(nearest, weight * each, len(places)) for each in terms)
+    moments = float(np.sum(weight)), float(weight @ data), float(weight @ data**2)
+    one = uncertainty._PathLight(places, *sums, moments, 500)
+    found = uncertainty._reversal_chi2(one, np.array([share, 0.2]), np.array([length, 20.0, 25.0]), 1.2)
+    assert found.shape == (2, 3)
+    assert found[0, 0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The uncertainty is the root of the difference of the variances, or less if the residuals are small."""
+    left, scene = _left(0.0, 1.0, "ends")
+    described = 1.2**2 + 1.0 / 12.0
+    difference = 0.49 + uncertainty._SAME_SPREAD * described
+
+    def found(change: float, misfit: float, ends: Displacement | None) -> float:
+        monkeypatch.setattr(uncertainty, "end_displacement", lambda *_: ends)
+        width = float(np.sqrt(described + change))
+        return uncertainty._end_uncertainty(left, replace(scene, width=width), 1.2, misfit)
+
+    another = uncertainty._END_SHARE * 0.7
+    assert found(difference, 0.5, None) == pytest.approx(another)
+    assert found(-difference, 0.5, None) == pytest.approx(another)
+    assert found(difference, 1.5, None) == pytest.approx(1.5 * another)
+    assert found(0.99 * uncertainty._SAME_SPREAD * described, 1.0, None) == 0.0
+    assert found(difference, 1.0, Displacement(50.0, 60.0)) == pytest.approx(another)
+    ends = Displacement(0.04, 0.1)
+    shown = np.array([uncertainty._END_FLOOR, uncertainty._END_SHOWN * 0.04, uncertainty._END_CHANCE * 0.1])
+    assert found(difference, 1.0, ends) == pytest.approx(float(np.linalg.norm(shown)))
+
+
+def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -> None:
+    """Two standard deviations of chi-square are subtracted from the significant part, and one is added."""
+    left, scene = _left(0.0, 0.0, "ends")
+    left.images[:] = 0.0
+    left.images[:1, 3] = 0.2
+    left.images[:1, 4] = 0.1
+    left.weight[:] = 0.25
+    left.residual[:] = 2.0
+    left.residual[0] = 6.0
+    count, information = 90, 90 * 0.25 * (500.0 * 0.3) ** 2
+    found = end_displacement(left, scene)
+    assert found is not None
+    chance = np.sqrt(2.0 * count)
+    beyond = count * (9.0 - 1.0)
+    assert found.shown == pytest.approx(np.sqrt((beyond - 2.0 * chance) / information))
+    assert found.chance == pytest.approx(np.sqrt((beyond + chance) / information))
+    # If the residuals elsewhere are smaller than the noise, they are the usual residuals.
+    left.residual[1:] = 1.0
+    small = end_displacement(left, scene)
+    assert small is not None
+    assert small.shown == pytest.approx(np.sqrt((count * (9.0 - 0.25) - 2.0 * chance) / information))
+    # Residuals elsewhere that exceed the noise do not excuse those at the ends.
+    left.residual[1:] = 4.0
+    large = end_displacement(left, scene)
+    assert large is not None
+    assert large.shown == pytest.approx(found.shown)
