@@ -15,6 +15,7 @@ from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.vision.lens_calibration import MIN_STARS, calibrate_lens
 from knightcube.vision.startracker.detect import detect
+from knightcube.vision.startracker.survey import LEAST_SIDE
 
 _FRAMES = 3
 _LENS_FRAMES = 6
@@ -175,6 +176,8 @@ def psf_width(pixels: Image) -> tuple[float, int]:
     Stars that are many pixels wide are measured in binned frames.
     """
     for factor in (16, 8, 4, 2, 1):
+        if factor > 1 and min(pixels.shape) < factor * LEAST_SIDE:
+            continue  # too small for the detection
         rows, columns = (size // factor * factor for size in pixels.shape)
         squares = pixels[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
         summed = pixels if factor == 1 else squares.sum(axis=(1, 3), dtype=np.uint32)
