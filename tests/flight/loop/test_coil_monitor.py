@@ -447,10 +447,11 @@ def wander(rng: np.random.Generator, samples: int) -> FloatArray:
 def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
     """No coil is suspected in 2,388 driver readings (seed 11).
 
-    The current gains are within 15 %. Every driven coil has an error within the thesis's 3.5 mA in every
-    cycle, and the readings have the resolution of the monitor. Single ADC samples differ from the mean of the
-    chopped current by up to 18 %. Without a suspicion in N readings, the rate of suspicions is below 3 / N at
-    95 % confidence. Only a suspicion of a single axis leads to the decision that a coil is faulty.
+    The gains of the supply current are within 15 %. Every driven coil has an error within the thesis's 3.5 mA
+    in every cycle, and the readings have the resolution of the monitor. Single ADC samples differ from the
+    mean of the chopped current by up to 18 %. Without a suspicion in N readings, the rate of suspicions is
+    below 3 / N at 95 % confidence. Only a suspicion of a single axis leads to the decision that a coil is
+    faulty.
     """
     rng = np.random.default_rng(11)
     suspected = readings = 0

@@ -17,7 +17,7 @@ S = 1_000_000_000
 
 
 class Bench:
-    """A load-shedding task. Counters that the test sets are its indications of overload."""
+    """A load-shedding task, and counters by which a test simulates an overload."""
 
     def __init__(self) -> None:
         self.frames = self.cycles = 0

@@ -116,7 +116,7 @@ def test_a_mask_that_becomes_wrong_is_discarded_at_once() -> None:
     known = learned(BOOM)
     gone = known.after(frame(64.0))
     assert gone.mask is None or np.mean(gone.mask[BOOM]) < 0.1
-    # If half of the image is constant, the cause is not a structure, but a limb that hardly moves.
+    # If half of the image is equal in all frames, the cause is a limb that hardly moves, not the structure.
     large = learned(polygon_mask(SIZE, SIZE, [[(-1.0, -1.0), (128.0, -1.0), (128.0, 80.0), (-1.0, 80.0)]]))
     assert large.mask is None
 

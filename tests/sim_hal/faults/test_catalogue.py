@@ -31,7 +31,7 @@ IN_ORBIT = {"gps", "strings", "wide", "battery-monitor", "bus-monitor", "battery
 def orbit() -> LockStep:
     """Return the emulated devices of a satellite.
 
-    The tests share the devices, because every fault ends without effect.
+    The tests share the devices, because no fault has an effect after its end.
     """
     config = configuration.replace(orbit_config(), power=Power(battery=Battery(capacity=2.6)))
     return build_lockstep(config, orbit_world(), None, SimClock())

@@ -144,7 +144,7 @@ def measured(
         "p95_ms": float(np.percentile(ms, 95)),
         "max_ms": max(ms),
     }
-    # Another program may use its whole time limit for a list that shows no part of the sky.
+    # Another program may use its whole time limit for a list of random positions.
     if peer is None or row.strewn:
         return figures
     theirs = peer_answers(peer, python, [job_of(one, row.hint) for one in drawn])

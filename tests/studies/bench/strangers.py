@@ -152,7 +152,7 @@ def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[st
 
 
 def _send(port: int, source: str, datagrams: Sequence[bytes], a_second: int, count: Any) -> None:
-    """Send random ones of the datagrams from the address `source`."""
+    """Send randomly chosen `datagrams` to the port, from the address `source`."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     burst = round(a_second * _BURST_S)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:

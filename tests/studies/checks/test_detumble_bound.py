@@ -50,7 +50,7 @@ def test_a_torque_of_other_causes_shortens_the_bound() -> None:
 
 
 def test_no_control_of_full_strength_beats_the_bound() -> None:
-    """Dipoles along -B x (h + constant vector) include the greedy law and laws that wait for the field."""
+    """No law with full dipoles along -B x (h + c), with a random constant c, ends before the bound."""
     speed, rng = 2.2e-3, np.random.default_rng(7)
     turning = STRENGTH * np.stack([np.sin(speed * MIDDLES), 0.0 * MIDDLES, np.cos(speed * MIDDLES)], axis=1)
     for _ in range(40):

@@ -101,7 +101,7 @@ def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
 def refly(
     monkeypatch: pytest.MonkeyPatch, seed: int, number: int, fault: str, mode: str, seconds: float
 ) -> dict[str, Any]:
-    """Repeat a flight of the campaign with a named fault, whatever the order of the catalogue."""
+    """Repeat a flight of the campaign with the fault of a given name."""
     monkeypatch.undo()
     for module in (orbit_faults, orbit_fault_flights, judgement):
         monkeypatch.setattr(module, "DURATION", seconds)
