@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.telemetry.definitions import GPS_LINK, Packet
+from flight.link.telemetry.definitions import FIX, GPS_LINK, Packet
 from flight.link.telemetry.log import Recorder
 from flight.loop.body import FixVerdict
 from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams
 from flight.loop.navigation import GPS_DELAY_NS, Positioning
 from hal.interfaces.devices import GpsLink, GpsReading
+from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 
@@ -146,3 +147,78 @@ def test_the_receiver_corrects_a_clock_that_is_more_than_a_second_off(off: float
     bench.receiver.readings = []
     bench.clock.sleep_until_ns(100 * SECOND_NS)
     assert bench.clock.utc_ns() - 100 * SECOND_NS == (true_ns if abs(off) > 1.0 else UTC_NS)
+
+
+def fix(time_ns: int, **changes: object) -> GpsReading:
+    """Return a valid fix of a satellite, with its time in ns."""
+    position, velocity = np.array([7e6, 1e5, 2e5]), np.array([10.0, 7e3, 3e3])
+    made = GpsReading(time_ns, time_ns, UTC_NS + time_ns, position, velocity, 3.0, 0.2, 9, True)
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("seconds", "lost"), [(60, False), (61, True)])
+def test_a_receiver_is_lost_after_its_age_limit_without_a_usable_fix(seconds: int, lost: bool) -> None:
+    bench = Bench()
+    bench.run(seconds)
+    assert ("gps-lost" in bench.texts) is lost
+    later = Bench()
+    later.verdict = FixVerdict(used=True)
+    later.receiver.readings = [fix(5 * SECOND_NS)]
+    later.run(5)
+    later.receiver.readings = []
+    later.run(seconds)
+    assert ("gps-lost" in later.texts) is lost
+    refused = Bench()
+    refused.receiver.readings = [fix(5 * SECOND_NS)]
+    refused.run(seconds)
+    assert ("gps-lost" in refused.texts) is lost, "a fix that is not used does not count"
+
+
+def test_a_receiver_that_does_not_respond_is_lost_at_once() -> None:
+    bench = Bench()
+
+    def gone() -> list[GpsReading]:
+        raise NotResponding("gps", "unplugged")
+
+    bench.receiver.poll = gone  # type: ignore[method-assign]
+    bench.run(1)
+    assert "unplugged" in bench.texts["gps-lost"][0]
+
+
+def test_a_fix_is_recorded_every_ten_seconds_with_its_values_and_the_clock_error() -> None:
+    bench = Bench()
+    records: list[tuple[int, dict[str, Any]]] = []
+    packer = bench.recorder.record
+
+    def record(packet: Packet, time_ns: int, **values: Any) -> bytes | None:
+        if packet is FIX:
+            records.append((time_ns, values))
+        return packer(packet, time_ns, **values)
+
+    bench.recorder.record = record  # type: ignore[method-assign]
+    bench.receiver.readings = [fix(1 * SECOND_NS)]
+    bench.run(1)
+    ((at, first),) = records
+    assert at == SECOND_NS
+    assert first["utc_ns"] == UTC_NS + SECOND_NS
+    assert (first["sigma"], first["velocity_sigma"], first["satellites"], first["used"]) == (
+        3.0,
+        0.2,
+        9,
+        False,
+    )
+    np.testing.assert_array_equal(first["position"], [7e6, 1e5, 2e5])
+    np.testing.assert_array_equal(first["velocity"], [10.0, 7e3, 3e3])
+    assert np.isnan(first["clock_off"]), "no fix was used yet"
+    bench.verdict = FixVerdict(used=True)
+    bench.clock.sleep_until_ns(11 * SECOND_NS)
+    bench.receiver.readings = [fix(11 * SECOND_NS - 1)]
+    bench.run(1)
+    assert len(records) == 1
+    early = UTC_NS + 11 * SECOND_NS - GPS_DELAY_NS - 400_000_000
+    bench.receiver.readings = [fix(11 * SECOND_NS, utc_ns=early)]
+    bench.run(1)
+    assert len(records) == 2
+    assert records[1][1]["used"] is True
+    assert abs(records[1][1]["clock_off"]) == pytest.approx(0.4)
+    assert bench.recorder.lost == 0
