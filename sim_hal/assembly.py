@@ -60,7 +60,7 @@ ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Futu
 
 @dataclass(frozen=True, slots=True)
 class OrbitDevices:
-    """Emulated devices that need an orbit. The attribute `wide` holds the horizon cameras."""
+    """Emulated devices that need an orbit. The attribute `wide` contains the emulated horizon cameras."""
 
     gps: Any = None
     cells: Any = None
@@ -123,7 +123,8 @@ def assemble(
     The function `now_ns` returns the simulation time. The functions `expose` and `expose_wide` replace the
     camera renderers; in real time they run in another process. Raises ConfigError for an invalid world.
     """
-    # All devices use this start time, because in real time the clock advances while they are built.
+    # All devices get the same start time, because in real time the clock advances while the devices are
+    # built.
     start_ns = now_ns()
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     circuit, monitor = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wires)

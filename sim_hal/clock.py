@@ -1,9 +1,9 @@
 """Simulated time: the clock, the scheduling of emulated devices, and a queue of timed actions.
 
-A sleep on the simulated clock advances the world to the deadline and returns at once. Tickers that are due
-run one after the other, in the order in which they were created, so that a repeated flight is identical to
-the bit. A job that sleeps, such as a driver that waits for its chip, advances the world, but other tickers do
-not run during this sleep.
+A sleep on the simulated clock advances the world to the deadline and returns at once. Periodic jobs (tickers)
+that are due run one after the other, in the order in which they were created, so that a repeated flight is
+identical to the bit. A job that sleeps, such as a driver that waits for its chip, advances the world, but
+other periodic jobs do not run during this sleep.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hal.buses.system import ContainedJob
 from hal.interfaces.wires import Ticker
 
 NEVER = 1 << 62
-"""Time (ns) that is later than the end of any run, 146 years."""
+"""Time (ns) of an event that never occurs: 146 years, later than the end of any simulation."""
 
 
 class EmulatedDevice(Protocol):
@@ -96,7 +96,7 @@ class SimClock:
     """A Clock of simulated time, which jumps to each deadline without waiting.
 
     The clock begins at the time `start_ns`, and `utc_start_ns` is the UTC at the time 0. The list `tickers`
-    is in the order of creation.
+    contains the periodic jobs in the order of their creation.
     """
 
     def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:

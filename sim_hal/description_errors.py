@@ -1,9 +1,9 @@
 """Errors of the described (configured) properties of a satellite, drawn from a seed.
 
 The flight software knows moments of inertia, coils and sensors to the accuracies that its configuration
-states. The simulated satellite therefore differs from the description: each error is drawn uniformly and
-independently within a multiple of its accuracy. Moments of inertia that violate the triangle inequality are
-drawn again.
+states. The simulated satellite differs from its configuration: each error is drawn uniformly and
+independently within a multiple of the configured accuracy. Moments of inertia that violate the triangle
+inequality are drawn again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class DescriptionErrors:
         moments: ratios (3,) of the true to the configured principal moments of inertia.
         axes: rotation vector (3,) from the configured to the true principal axes, rad, body axes.
         coils: true dipole of each coil divided by the magnitude of its configured dipole, as columns of a
-            matrix (3, 3 g) for g groups of three coils. The columns are in axes of
+            matrix (3, 3 g) for g groups of three coils. The columns are vectors in the coil axes from
             `sim_hal.worlds.free_body.coil_frames`.
         gyro: matrix (3, 3) from the true rate to the rate that the gyro measures, without the gyro's bias.
         field: matrix (3, 3) from the true to the measured magnetic field, without the magnetometer's bias.

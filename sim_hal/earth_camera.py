@@ -9,11 +9,11 @@ of the Sun's disc is 46,000.
 
 The air density decreases exponentially with height. Single scattering of sunlight in the air produces the
 soft limb, twilight, and haze over the ground. The optical depth along an oblique path is the vertical optical
-depth times Chapman's function. For a scale height far below the Earth's radius this function is sqrt(pi X/2)
-exp(X mu^2/2) erfc(mu sqrt(X/2)), where X is the ratio of Earth radius to scale height and mu the cosine of
-the zenith angle (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). The formula is also valid for
-a Sun below the horizon. The model omits refraction (which raises the apparent limb by 0.2 km, or 0.004 deg),
-ozone, and clouds above the limb.
+depth times Chapman's function. For a scale height far below the Earth's radius, Chapman's function is sqrt(pi
+X/2) exp(X mu^2/2) erfc(mu sqrt(X/2)), where X is the ratio of Earth radius to scale height and mu the cosine
+of the zenith angle (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). Huestis's formula is also
+valid for a Sun below the horizon. The model omits refraction (which raises the apparent limb by 0.2 km, or
+0.004 deg), ozone, and clouds above the limb.
 
 Lines of sight are intersected exactly with the WGS 84 ellipsoid, in axes that are scaled so that the
 ellipsoid is the unit sphere. The ground is Lambertian. Direct sunlight is attenuated by the air on the way to
@@ -205,11 +205,11 @@ LAND_SHARE, CLOUD_SHARE = 0.29, 0.55
 """Fractions of the Earth covered by land and by cloud."""
 
 _CELLS = 96
-"""Edge length (cells) of the periodic noise volume."""
+"""Edge length (grid cells) of the periodic noise volume."""
 _SLOPE = -2.3
 """Exponent of the noise amplitude as a power of the wave number, as for the spectrum of clouds."""
 _RADIUS = 0.42 * _CELLS
-"""Radius (cells) of the Earth's sphere in the noise volume."""
+"""Radius (grid cells) of the Earth's sphere in the noise volume."""
 _MAGNIFICATION, _FINE = 11.0, 0.5
 """Magnification of the coordinates, and amplitude, of the fine noise relative to the coarse noise."""
 _SOFT = 0.1
@@ -237,7 +237,7 @@ def _covered(heights: Float32Array, share: float) -> Float32Array:
 
 
 def _read(noise: npt.NDArray[np.complex64], places: Float32Array) -> npt.NDArray[np.complex64]:
-    """Return the periodic noise (n,), linearly interpolated, at `places` (3, n) in cells."""
+    """Return the periodic noise (n,), linearly interpolated, at `places` (3, n), in grid cells."""
     low = np.floor(places)
     along, across, up = places - low
     i, j, k = low.astype(np.int32) % _CELLS
@@ -293,7 +293,8 @@ class EarthIntersection:
     """First intersections of n lines of sight with the Earth's ellipsoid, or the points nearest to it.
 
     The heights (n,), m, are 0 for lines that meet the ground and infinite for lines that point away from the
-    Earth. The places (n, 3) are in Earth-fixed axes that are scaled to the unit sphere.
+    Earth. The points `places` (n, 3) are in Earth-fixed axes that are scaled so that the ellipsoid is the
+    unit sphere.
     """
 
     hits: BoolArray
@@ -305,7 +306,7 @@ def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
     """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth."""
     axes = semi_axes()
     origin, into_earth = scene.on_unit_sphere()
-    # The coordinates are computed as rows of contiguous numbers, which is several times faster.
+    # Computing with contiguous rows of coordinates is several times faster than with rows of vectors.
     scaled = into_earth @ rays.T
     squares, along = np.sum(scaled * scaled, axis=0), origin @ scaled
     # The distance of the nearest point from the centre is more accurate than a quadratic's discriminant.
@@ -373,7 +374,7 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> F
 
 
 def _chosen(vectors: FloatArray, at: IntArray) -> Float32Array:
-    """Return the columns `at` of vectors (3, n) as 32-bit numbers."""
+    """Return the columns with the indices `at` of vectors (3, n) as 32-bit numbers."""
     coarse = vectors.astype(np.float32)
     return coarse if len(at) == vectors.shape[1] else coarse[:, at]
 

@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 
 _LINE_STREAM = 0x11E
 ORBIT_STREAM = 0x0B17
-"""First key of the random streams of the devices that need an orbit."""
+"""Second number, after the simulation's seed, in the seeds of the devices that need an orbit."""
 _LINE_KEYS = {"inertial_unit": (), "gps": (1,)}
-"""Keys of the random streams for faults of the serial lines."""
+"""Last numbers in the random seeds for the faults of the serial lines of two devices."""
 
 
 class EmulatedWires:
@@ -61,7 +61,7 @@ class EmulatedWires:
     def __init__(
         self, now_ns: Callable[[], int], seed: int, coil_bus: int | str, *, pty: bool = False
     ) -> None:
-        """Make the bus of the coils. If `pty` is true, serial lines are pseudo-terminals."""
+        """Create the I2C bus of the coil driver. If `pty` is true, serial lines are pseudo-terminals."""
         self._now_ns, self._seed, self._pty = now_ns, seed, pty
         self._coil_bus = device_file(coil_bus)
         self.buses = {self._coil_bus: EmulatedI2cBus()}
@@ -70,7 +70,7 @@ class EmulatedWires:
         self._kinds: dict[str, str] = {}
 
     def connect(self, kind: str, device: str, baud_rate: int) -> DeviceEnd:
-        """Make a serial line for the device of section `kind`, and return the device's end."""
+        """Create a serial line for the device of section `kind`, and return the device's end of the line."""
         if device in self.lines:
             raise ConfigError(f"{kind}.device", f"is {device!r}, which another device uses")
         generator = line_generator(self._seed, *_LINE_KEYS.get(kind, (zlib.crc32(device.encode()),)))
@@ -82,11 +82,11 @@ class EmulatedWires:
         return in_memory.device
 
     def line_of(self, kind: str) -> EmulatedSerialLine | PtyLine | None:
-        """Return the serial line of the device of section `kind`, or None if it has none."""
+        """Return the serial line of the device of section `kind`, or None without such a line."""
         return self.lines.get(self._kinds.get(kind, ""))
 
     def i2c(self, bus: int | str | None = None) -> EmulatedI2cBus:
-        """Return an I2C bus, which is created at its first use; None means the bus of the coils."""
+        """Return an I2C bus, created at its first use, or the coil driver's bus if `bus` is None."""
         name = self._coil_bus if bus is None else device_file(bus)
         return self.buses.setdefault(name, EmulatedI2cBus())
 
@@ -141,12 +141,12 @@ class Emulation:
     supply: Callable[[int, int], tuple[float, float]]
 
     def connect(self, device: str, baud_rate: int) -> DeviceEnd:
-        """Make the device's serial line, and return the device's end of the line."""
+        """Create the device's serial line, and return the device's end of the line."""
         return self.wires.connect(self.kind, device, baud_rate)
 
 
 def emulated(emulation: Emulation) -> object | None:
-    """Return the emulated device of the emulation's section, or None if it is not configured.
+    """Return the emulated device of the section `emulation.kind`, or None if it is not configured.
 
     Raises ConfigError for a driver without an emulator.
     """

@@ -1,8 +1,8 @@
 """Interface of the simulator to the flight application, which opens emulated devices with their faults.
 
-In lock-step the devices run in the flight process and advance while the flight loop sleeps. The clock then
-jumps from event to event, and repeated runs are identical. In real time the devices run in a server process
-(`sim_hal.serving.server`), with bus and cameras on a socket and the serial lines on pseudo-terminals.
+In lock-step the devices run in the flight process and advance while the flight loop sleeps. In lock-step, the
+clock jumps from event to event, and repeated runs are identical. In real time the devices run in a server
+process (`sim_hal.serving.server`), with bus and cameras on a socket and the serial lines on pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) ->
 
 
 def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: FloatArray) -> PosedCamera:
-    """Return the star camera that `open_camera` describes on the clock `clock`."""
+    """Return the star camera of `open_camera`, with the clock `clock`."""
     camera = config.camera
     assert camera is not None, "the caller checks that the configuration has a camera"
     begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
@@ -192,7 +192,7 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
 
 @dataclass(frozen=True, slots=True)
 class EmulatedBench:
-    """Rig of a body on a bench, and the emulated hand that rotates the body and covers lenses."""
+    """Emulated devices of a body on a bench, and the emulated manual rotation, lens caps and lamp."""
 
     rig: Rig
     hardware: Hardware
@@ -200,7 +200,7 @@ class EmulatedBench:
     def turn(self, axis: FloatArray, angle: float, seconds: float) -> None:
         """Rotate the upright body about `axis` (3,) by `angle` rad, beginning now.
 
-        0 restores the upright attitude.
+        The angle 0 restores the upright attitude.
         """
         held: Any = self.hardware.world
         held.turn(axis, angle, self.rig.clock.now_ns(), seconds)
@@ -226,7 +226,7 @@ def open_bench(request: SimulationRequest, config: Config) -> EmulatedBench:
     """Return the emulated devices of a configuration for a bench, in lock-step, with the configured faults.
 
     The noise of the inertial unit is that of its data sheet plus the errors that `simulation.imu` adds. Each
-    coil produces a field at the magnetometer even if the section does not describe this field.
+    coil produces a field at the magnetometer even if the section `simulation` does not describe this field.
     """
     section = request.section()
     check(section.faults, config, False)
@@ -342,7 +342,7 @@ class SimulatedUtcClock(SystemClock):
 class RemoteFrameSource:
     """Client of a camera in the server process.
 
-    The server announces frames, and pixels are read from files.
+    The server announces each frame in a message, and the client reads the pixels from a file.
     """
 
     def __init__(self, path: Path, clock: SystemClock, number: int = 0) -> None:
@@ -404,7 +404,7 @@ class ServedWires:
         return port
 
     def i2c(self, bus: int | str | None = None) -> RemoteI2cBus:
-        """Return the emulated I2C bus with a number or device file; None means the bus of the coils.
+        """Return the emulated I2C bus with a number or device file; None is the bus of the coil driver.
 
         Raises NotResponding.
         """
@@ -441,7 +441,7 @@ class Served:
         self.bus.call("release", epoch_ns, list(faults), os.getpid())
 
     def lateness(self) -> tuple[int, float]:
-        """Return how many events were late since the release, and the largest lateness, s. Raises OSError."""
+        """Return the number of delayed events since the release, and the largest delay, s. Raises OSError."""
         late, latest_ns = self.bus.call("lateness")
         return int(late), 1e-9 * latest_ns
 

@@ -1,9 +1,9 @@
 """The `simulation` section of a configuration: the true properties of the world.
 
-A true constant that the `simulation` section omits is taken from the flight configuration. A constant in this
-section makes the world differ from the flight software's model. All values are in SI units unless the name of
-the key states another unit. In `free_body`, each disturbance is given as a multiple of its worst case, and
-zero switches the disturbance off.
+A true constant that the `simulation` section omits is taken from the flight configuration. A constant in the
+section `simulation` makes the world differ from the flight software's model. All values are in SI units
+unless the name of the key states another unit. In `free_body`, each disturbance is given as a multiple of its
+worst case, and zero switches the disturbance off.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class CageTruth(Section, frozen=True, kw_only=True):
-    """Magnetic field of the simulated cage, which reproduces the field along `orbit` (elements at time 0).
+    """Field of the simulated Helmholtz cage, which reproduces the field along `orbit` (elements at time 0).
 
     `gain` is the ratio of the cage's field to the commanded field. `ring_current` scales the mean field of
     the ring current, 20 nT.
@@ -261,7 +261,7 @@ class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
 class SolarPanel(Section, frozen=True, kw_only=True):
     """A solar panel on a face with the outward `normal` (3,), body axes, of any length.
 
-    `peak` (W) is the electrical power at perpendicular sunlight at one astronomical unit.
+    `peak` (W) is the electrical power in sunlight at normal incidence and one astronomical unit.
     """
 
     normal: Vector
@@ -299,7 +299,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     """Section `simulation`; the value `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
 
     The three rows of `coil_field`, T/A, map the coil currents to the components of the coils' field at the
-    magnetometer, body axes. Each row has one value for each coil.
+    magnetometer, body axes. Each row of `coil_field` has one value for each coil.
     """
 
     seed: Annotated[int, Meta(ge=0)] = 1

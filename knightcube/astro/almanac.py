@@ -32,7 +32,7 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
         position: (3,) geocentric position in ICRS axes, m.
 
     Raises:
-        GeomagneticError: outside the years of the model.
+        GeomagneticError: if the time is outside the years of the model.
     """
     date = julian_date(time)
     geomagnetism.check_year(float(julian_epoch(date)))
@@ -51,7 +51,7 @@ def magnetic_field_on_ground(
         height: height above the WGS 84 ellipsoid, m.
 
     Raises:
-        GeomagneticError: outside the years of the model, or for an invalid position.
+        GeomagneticError: for a time outside the years of the model, or an invalid position.
     """
     year = float(julian_epoch(julian_date(time)))
     geomagnetism.check_year(year)

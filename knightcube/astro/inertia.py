@@ -32,7 +32,7 @@ def principal_axes(inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def inertia_problem(inertia: FloatArray) -> str:
-    """Return why an inertia tensor (3, 3), kg m^2, is impossible, with the remedy; empty for a valid one."""
+    """Return the reason why an inertia tensor (3, 3), kg m^2, is impossible, or "" for a valid tensor."""
     scale = float(np.abs(inertia).max())
     for row, column in ((0, 1), (0, 2), (1, 2)):
         above, below = float(inertia[row, column]), float(inertia[column, row])

@@ -58,8 +58,8 @@ class EmulatedCamera:
         fault: present fault, "off", "frozen", "torn" or a key of `SPOILT`; empty for a camera without a
             fault.
         late_ns: additional delay of the frames, ns.
-        one_of: number n of triggers per frame. A fault can set n to more than 1; the camera then reacts only
-            to every n-th trigger.
+        one_of: number n of triggers per frame; a camera with n > 1 has a fault and reacts only to every n-th
+            trigger.
     """
 
     def __init__(

@@ -120,7 +120,7 @@ class ChoppedSupply:
 
 
 CURRENT_UNCERTAINTY = 3.5e-3
-"""Bound (A) of the error of a coil current in the thesis."""
+"""Bound (A) of the uniform random error of a coil current in Sease 2013."""
 
 _LOW, _HIGH = (0, 0), (0, COUNTS)
 _OFF = Bridge(_LOW, _LOW)
@@ -440,7 +440,10 @@ class EmulatedDrv8830(Registers):
 
 
 class BridgeCircuit:
-    """Coils on DRV8830 bridges, the `parts`. At each write, random errors are added to the coil currents."""
+    """Coils on the DRV8830 bridges in `parts`.
+
+    At each write, random errors are added to the coil currents.
+    """
 
     chip = None  # the coils have no PWM chip
 

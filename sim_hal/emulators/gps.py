@@ -66,7 +66,7 @@ class GpsErrors:
         walk_time: correlation time of the position's random walk, s.
         noise: standard deviation of the position's white noise on each axis, m.
         velocity_noise: standard deviation of the velocity's white noise on each axis, m/s.
-        latency: delay from the time of a fix to its frame, s.
+        latency: delay from the time of a fix to the transmission of its message, s.
         start: time from power-on to the first fix, s.
     """
 
@@ -86,7 +86,7 @@ class EmulatedGps:
         clock_ns: error of the reported time that a fault adds, ns.
         blind: whether a fault blocks the signals of all satellites.
         frozen: whether a fault makes the receiver repeat its last fix.
-        protocol: protocol version; a receiver with version 27 or later accepts only CFG-VALSET.
+        protocol: u-blox protocol version; a receiver with version 27 or later accepts only CFG-VALSET.
         obeys: whether the receiver executes commands.
     """
 

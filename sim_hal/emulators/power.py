@@ -12,9 +12,9 @@ visible ground, which is Lambertian and has a uniform albedo. The default albedo
 Earth's mean of 0.29 (Stephens et al. 2015, Rev. Geophys. 53).
 
 The emulated ADS1115 has the registers Config and Conversion and the conversion times of the data sheet (TI
-SBAS444, Table 8-3). It converts single-ended inputs in single-shot mode, which the driver uses. Other
-settings are stored, but start no conversion. A conversion returns the voltage at the end of the conversion
-time.
+SBAS444, Table 8-3). The emulated ADS1115 converts single-ended inputs in single-shot mode, which the driver
+uses. Other settings of the register Config are stored, but start no conversion. A conversion returns the
+voltage at the end of the conversion time.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from sim_hal.worlds.orbit import sun_position
 from sim_hal.worlds.world import OrbitingWorld, utc_date
 
 PERIOD_NS = 250_000_000
-"""Period (ns) of the steps, shorter than the time over which the coils' supply current is recorded."""
+"""Time step (ns) of the power system, less than the recording time of the coils' supply current."""
 FRAME_POWER = 1.0
-"""Power (W) of the star camera and its processing after a frame, until the frame's energy is used up."""
+"""Power (W) that star camera and processing draw after a frame until the energy per frame is used up."""
 Supply = Callable[[int, int], tuple[float, float]]
 """Function from start and end of a time window (ns) to the coils' mean supply voltage (V) and current (A)."""
 
@@ -224,13 +224,13 @@ class SolarCellsModel:
         return self._produced(LAMP * lit, generator)
 
     def _produced(self, light: FloatArray, generator: np.random.Generator) -> FloatArray:
-        """Return the currents (n,), A, in the light (n,), relative to sunlight at normal incidence."""
+        """Return the currents (n,), A, for irradiances (n,) relative to sunlight at normal incidence."""
         noise = self.noise * generator.standard_normal(len(self.peaks))
         # The diode of a solar string blocks reverse current.
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
-        """Return the relative currents (...), 0 to 1, for `cosines` (...) of the angle of incidence."""
+        """Return the currents (...) relative to normal incidence, for `cosines` (...) of incidence angles."""
         grazing = math.sin(self.grazing)
         dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
         return np.asarray(np.maximum(dimmed, 0.0))
@@ -281,7 +281,7 @@ class EmulatedAds1115:
         self._converting = False
 
     def answers(self, address: int) -> bool:
-        """Return whether the address is the converter's own or the general call."""
+        """Return whether the address is the converter's own address or the general call."""
         return address in {_GENERAL_CALL, self.address}
 
     def write(self, address: int, data: bytes) -> None:
@@ -303,7 +303,7 @@ class EmulatedAds1115:
                 self._ready_ns = self._now_ns() + 1_000_000_000 // _RATES[word >> 5 & 0b111]
 
     def read(self, count: int) -> bytes:
-        """Return the two bytes of the selected register, repeatedly."""
+        """Return `count` bytes, which repeat the two bytes of the selected register."""
         self._complete()
         word = self._conversion if self._pointer == CONVERSION else self._config
         if self._pointer == CONFIG and not self._converting:
@@ -311,7 +311,7 @@ class EmulatedAds1115:
         return (word.to_bytes(2, "big") * (count // 2 + 1))[:count]
 
     def _complete(self) -> None:
-        """Complete a conversion whose time has passed."""
+        """Store the result of the running conversion if its conversion time has elapsed."""
         if not self._converting or self._now_ns() < self._ready_ns:
             return
         self._converting = False
@@ -322,14 +322,14 @@ class EmulatedAds1115:
 
 
 _FRESH_NS = 20_000_000
-"""Time (ns) for which computed string currents are reused."""
+"""Time (ns) after which the cached currents of the solar strings are computed again."""
 
 
 class EmulatedSolarCells:
-    """The n emulated solar strings and the converters that measure their currents.
+    """The n emulated solar strings and the analogue-to-digital converters that measure their currents.
 
     Attributes:
-        parts: the converters.
+        parts: the emulated ADS1115 converters.
         dead: mask (n,) of the failed strings, which give no current.
         frozen: whether a fault holds all currents constant.
         gain: gain of all amplifiers relative to the nominal gain.

@@ -29,7 +29,7 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class LineFaults:
-    """Faults of a wire, which affect bytes that are sent after the faults begin.
+    """Faults of one direction of a serial line, which affect bytes sent after the beginning of a fault.
 
     Attributes:
         silent: whether a fault loses all bytes.
@@ -37,7 +37,7 @@ class LineFaults:
         cut_probability: probability that a message loses a random run of its bytes.
         flip_probability: probability that a bit arrives inverted.
         delay_ns: additional delay of each byte.
-        thinned: number n; only every n-th message arrives.
+        thinned: number n of messages of which one arrives; the other messages are lost.
     """
 
     silent: bool = False
@@ -53,7 +53,7 @@ SOUND = LineFaults()
 
 @dataclass(slots=True)
 class _Message:
-    """Bytes in transmission; byte i arrives at start + (i + 1) * 10 / baud."""
+    """Bytes in transmission; byte i arrives 10 (i + 1) / `baud_rate` s after `start_ns`."""
 
     start_ns: int
     data: bytes
@@ -96,10 +96,11 @@ class Wire:
         if faults is not SOUND:
             data = self._disturb(data, faults)
             start_ns += faults.delay_ns
-        # This keeps the order of the bytes when a delay fault ends.
+        # Bytes sent after the end of a delay fault arrive after the delayed bytes, as on a real line.
         start_ns = max(start_ns, self._last_ns)
         if data and sender_baud != receiver_baud:
-            # A receiver with a lower baud rate receives fewer characters; all are random.
+            # A receiver with a lower baud rate than the sender receives fewer characters; all characters are
+            # random.
             data = self._rng.bytes(max(1, len(data) * min(receiver_baud, sender_baud) // sender_baud))
         room = self._capacity - self._waiting
         self.lost_bytes += max(0, len(data) - room)
@@ -156,7 +157,7 @@ class DeviceEnd:
     """The device's end of a line, with the wires of both directions, each with its own faults."""
 
     def __init__(self, baud_rate: int, rng: np.random.Generator, host_rate: Callable[[], int]) -> None:
-        """Make the wires; the function `host_rate` returns the baud rate of the host's end."""
+        """Create the wires; the function `host_rate` returns the baud rate of the host's end."""
         self.baud_rate = baud_rate
         self.to_host, self.to_device = (Wire(generator) for generator in rng.spawn(2))
         self._host_rate = host_rate
@@ -166,7 +167,7 @@ class DeviceEnd:
         self.to_host.push(data, now_ns, self.baud_rate, self._host_rate())
 
     def read(self, now_ns: int) -> bytes:
-        """Return the host's bytes that have arrived by `now_ns`."""
+        """Return the bytes from the host that have arrived by `now_ns`."""
         return b"".join(data for _, data in self.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:

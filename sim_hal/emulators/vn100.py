@@ -191,7 +191,7 @@ REGISTERS: Mapping[int, Register] = {
 _OFF = ("0", "0", "00")
 
 FIELD_BITS = 16
-"""Number of bits per register field, of which a fault can flip one."""
+"""Number of bits of each register field that a fault can address."""
 _BASE_10 = 2  # number of decimal fields at the start of registers 75 to 77; later fields are hexadecimal
 
 
@@ -304,10 +304,17 @@ _VPE_CONTROL, _HEADING_MODE, _ABSOLUTE = 35, 1, 0
 
 
 class AttitudeCommands:
-    """State of the attitude filter that commands can change; KMD and KAD set the VPE status word."""
+    """State of the attitude filter (VPE) that commands can change.
+
+    The commands KMD and KAD (known magnetic disturbance, known acceleration disturbance) set bits of the
+    status word.
+    """
 
     def __init__(self, registers: RegisterFile, gyro_bias: FloatArray) -> None:
-        """Store the filter's estimate `gyro_bias` (3,), rad/s, sensor axes, which SGB and SFB save."""
+        """Store the filter's estimate `gyro_bias` (3,), rad/s, sensor axes.
+
+        The commands SGB and SFB (set gyro bias, set filter bias) save this estimate in registers.
+        """
         self._registers, self._gyro_bias = registers, gyro_bias
         self._turn: FloatArray | None = None
         self.status = 0
@@ -324,7 +331,7 @@ class AttitudeCommands:
         return replace(sample, quaternion=multiply(sample.quaternion, self._turn))
 
     def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Vn100Sample]) -> None:
-        """Execute one of ATTITUDE_COMMANDS; the function `sample` returns a sample of the present motion."""
+        """Execute one of `ATTITUDE_COMMANDS`; the function `sample` returns the present sample."""
         if command in _DISTURBANCES:
             bit = _DISTURBANCES[command]
             self.status = self.status | bit if flag(fields) else self.status & ~bit
@@ -350,7 +357,7 @@ class AttitudeCommands:
 
 
 def flag(fields: tuple[str, ...]) -> bool:
-    """Return the only field, 0 or 1, of a command as a bool.
+    """Return the field of a command with one field, 0 or 1, as a bool.
 
     Raises UnitError for a field other than 0 or 1.
     """
@@ -400,8 +407,8 @@ class OutputStreams:
 
     Attributes:
         muted: registers whose output is silent until the register is written again.
-        foreign: packet and rate divisor of an output of a different firmware version, stored in the flash
-            copy of register 75, or None; the output ends when register 75 is written.
+        foreign: packet and rate divisor of an output that another firmware version stored in the flash copy
+            of register 75, or None; the output ends when register 75 is written.
     """
 
     def __init__(self, registers: RegisterFile) -> None:
@@ -412,7 +419,7 @@ class OutputStreams:
         self._sends_foreign = False
 
     def reset(self) -> None:
-        """Remove all output streams, and start the output in the attribute `foreign` unless it is None."""
+        """Remove all output streams, and start the output `foreign` unless it is None."""
         self._streams = {}
         self.muted.clear()
         self._sends_foreign = self.foreign is not None
@@ -455,7 +462,7 @@ class OutputStreams:
         return [stream for stream in self._streams.values() if tick % stream.divisor == 0]
 
     def checksum(self) -> Checksum:
-        """Return the checksum of the kind that register 30 selects."""
+        """Return the kind of checksum, 8-bit XOR or CRC-16, that register 30 selects."""
         return "crc16" if self._registers.integer(30, 4) == 3 else "xor8"
 
     def _suffix(self, status: int) -> str:
@@ -731,7 +738,8 @@ class Vn100Emulator:
     # Output.
 
     def _sample(self, now_ns: int) -> Vn100Sample:
-        # The fields of register 85 are the filter lengths of magnetometer, accelerometer and gyro.
+        # The first three fields of register 85 are the filter lengths of magnetometer, accelerometer and
+        # gyro.
         windows = tuple(map(int, self.registers.values[85][:3]))
         sample = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return sample if self.alter is None else self.alter(sample)

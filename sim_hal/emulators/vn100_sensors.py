@@ -36,7 +36,8 @@ class NoiseProfile:
     """Sensor errors: uniform noise, white noise, and errors that are constant until the unit's next start.
 
     Attributes:
-        attitude_bound: bound of each vector component of the error quaternion, body axes.
+        attitude_bound: bound of the uniform noise of each vector component of the error quaternion, body
+            axes.
         rate_bound: bound of the uniform rate noise, rad/s.
         rate_density, field_density, acceleration_density: white noise densities, rad/s, T and m/s^2 per
         sqrt(Hz).
@@ -125,8 +126,8 @@ class Sensors:
         """
         self._rng, self._profile = rng, profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
-        # The measured quaternion is bilinear in the true and the error quaternion, so a matrix product is
-        # enough.
+        # The measured quaternion is bilinear in the true quaternion and the error quaternion, so one matrix
+        # computes it.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
         self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
         self._fixed_bias = gyro_bias
@@ -179,7 +180,7 @@ class MessageData:
     """Data for all messages of one sampling time.
 
     Attributes:
-        device_ns: unit's time since its start, ns.
+        device_ns: time of the unit's clock since the unit's start, ns.
         sample: measured sample.
         status: VPE status word.
         interval: time since the previous output of the same kind, s, over which changes are integrated.
@@ -202,7 +203,7 @@ class MessageData:
         """Return the values of named quantities as text in the format of the VN-100."""
         quantities = (_QUANTITIES[name] for name in names.split())
         pairs = [(form, value) for read, form in quantities for value in read(self)]
-        # With zero padding, the text for NaN could not be parsed.
+        # Zero padding would turn NaN into the text +0000nan, which cannot be parsed.
         return [form % value if math.isfinite(value) else f"{value:+}" for form, value in pairs]
 
     def linear_acceleration(self) -> FloatArray:
@@ -236,7 +237,7 @@ _QUANTITIES: Mapping[str, tuple[Callable[[MessageData], Values], str]] = {
     "delta_angle": (_vector(lambda now: np.degrees(now.sample.rate) * now.interval), "%+08.3f"),
     "delta_velocity": (_vector(lambda now: now.sample.accel * now.interval), "%+08.3f"),
 }
-"""Function and ASCII format for each quantity; delta angles are in degrees, delta velocities in m/s."""
+"""Read function and ASCII format of each quantity; delta angles in deg, delta velocities in m/s."""
 
 
 @lru_cache(maxsize=64)

@@ -212,7 +212,7 @@ class FaultKind:
         begin: function that applies the fault to the bench and returns a function that removes it, or None
             for faults in the flight process.
         parameters: parameters of the fault by name.
-        momentary: whether the fault is an event without duration, such as a reset. Its effect lasts until
+        momentary: whether the fault is an event without duration, such as a reset, whose effect lasts until
             the flight software repairs it.
         where: kind of simulation in which the fault can occur.
         adds: whether the fault may be present together with other faults of the same device.
@@ -236,7 +236,7 @@ class FaultKind:
     def part(self) -> str:
         """Name of the affected part.
 
-        A coil and its bridge are one part, as are inertial unit and magnetometer.
+        A coil and its bridge count as one part, and so do the inertial unit and its magnetometer.
         """
         return self.device.replace("bridge-", "coil-").replace("magnetometer", "imu")
 
@@ -256,7 +256,7 @@ def _fault(
 
 
 def _chance(default: float) -> Parameter:
-    # The minimum is above 0, because the probability 0 would have no effect.
+    # The minimum is above 0, because a fault with the probability 0 would have no effect.
     return Parameter(default, 1e-6, 1.0)
 
 
@@ -528,7 +528,7 @@ def _stuck_monitor(bench: Bench, *_: object) -> Removal:
     if monitor is None:
         return no_removal
     monitor.frozen = {number: monitor.register(number) for number in range(6)}
-    monitor.frozen[2] |= 0b10  # this keeps the conversion-ready flag set
+    monitor.frozen[2] |= 0b10  # the conversion-ready flag stays set
     return monitor.frozen.clear
 
 
@@ -539,7 +539,7 @@ def _lossy_bus(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
 
 
 def _on_bus(name: str, *arguments: None) -> Begin:
-    """Return a fault that a method of the emulated bus begins."""
+    """Return a function that begins a fault by calling the method `name` of the emulated bus."""
     return lambda bench, *_: cast("Removal", getattr(bench.hardware.bus, name)(*arguments))
 
 

@@ -70,7 +70,7 @@ DEVICES = ("planner", "vision", "clock", "disk")
 
 
 class ProcessFaults:
-    """Faults inside the flight process after `begin`; in real time, jobs can also hang and be killed."""
+    """Faults inside the flight process; in real time, jobs can also hang and be killed."""
 
     def __init__(self, faults: Sequence[ScheduledFault], clock: Clock, realtime: bool) -> None:
         self._faults = [fault for fault in faults if fault.kind.device in DEVICES]

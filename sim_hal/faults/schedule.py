@@ -1,9 +1,9 @@
 """Syntax of faults, and functions that check and schedule the faults of a flight.
 
-A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. Both times are in seconds;
-the value after `@` is the mission time. A fault without `@` begins at mission time 0, and a fault without
-`for` lasts until the end of the flight. In the `simulation` section of a configuration the same fault is
-written `{fault: 'imu: silent', at: 120, for: 5}`.
+A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. The value after `@` is the
+mission time of the beginning (s), and the value after `for` the duration (s). A fault without `@` begins at
+mission time 0, and a fault without `for` lasts until the end of the flight. In the `simulation` section of a
+configuration the same fault is written `{fault: 'imu: silent', at: 120, for: 5}`.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ _EMULATED = {
     "strings": ("solar_strings", "ads1115"),
     **dict.fromkeys(("coil", "bridge", "pwm"), ("coils", "pca9685")),
 }
-"""Section and driver that the faults of a device need in the configuration, by the name's first word."""
+"""Section and driver that a device's faults need in the configuration, by first word of the device name."""
 
 
 def other_driver(device: str, config: Config) -> str:

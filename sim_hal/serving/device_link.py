@@ -137,7 +137,7 @@ class RemoteI2cBus:
         return bytes(self.call("exchange", address, list(data), count))
 
     def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
-        """Transfer frames, if the selected name is that of an SPI device."""
+        """Transfer frames to and from the selected device, which must be an SPI device."""
         return [bytes(frame) for frame in self.call("spi", [list(frame) for frame in frames])]
 
     def close(self) -> None:

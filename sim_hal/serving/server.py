@@ -119,7 +119,7 @@ class DeviceServer:
         self.lines = {name: line.name for name, line in self._lines.items()}
         self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
-        # Number of events that were late since the release, and the largest lateness (ns).
+        # Number of delayed device events since the release, and the largest delay (ns).
         self._late = self._latest_ns = 0
         self._served_anybody = False
         self._selector = selectors.DefaultSelector()

@@ -39,7 +39,7 @@ from knightcube.vision.camera.lens import Pinhole
 DEVICE = "star camera model"
 
 STEPS = 256
-"""Table entries per pixel; the error of linear interpolation is less than 1e-5 of the peak."""
+"""Entries per pixel of the point spread table; its interpolation error is less than 1e-5 of the peak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ def bilinear_gaussian(sigma: float) -> PointSpread:
         return np.asarray(np.clip(1.0 - distance, 0.0, None) @ taps)
 
     def quadrature(length: float) -> int:
-        # The slope of the profile is discontinuous, so the distance of samples must be far less than a pixel.
+        # The slope of the profile is discontinuous, so samples must be much closer than a pixel.
         return 1 if length < 1e-3 else math.ceil(2.0 + 8.0 * length)
 
     return PointSpread(profile, 2, 8.0, quadrature)
@@ -135,8 +135,8 @@ Vectors = Callable[[FloatArray], FloatArray]
 class Span:
     """Quadrature samples (m,) of a short interval of the exposure, in segments of smooth motion.
 
-    Start and end are those of each sample's segment, s. The position in the segment (`nodes`) is from 0 to 1,
-    and the quadrature weights of a segment add up to 1.
+    The arrays `starts` and `ends` contain the start and end (s) of each sample's segment. The positions
+    `nodes` in the segment are from 0 to 1, and the quadrature weights of a segment add up to 1.
     """
 
     starts: FloatArray
@@ -576,7 +576,7 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""Largest ratio of a faint pixel's charge (e-) to the variance of the background noise (e-^2)."""
+"""Largest ratio of charge (e-) to background noise variance (e-^2) in pixels with Gaussian noise only."""
 GREATEST_SKEWNESS = 0.05
 """Largest skewness of noise that is drawn as Gaussian; by the Edgeworth series, the error is 0.004."""
 

@@ -207,7 +207,7 @@ class SkyObjects:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FreeFall:
-    """Free fall for about a second from a position (3,), m, and a velocity (3,), m/s, at time `at`, s."""
+    """Trajectory of about one second from a position (3,), m, and a velocity (3,), m/s, at time `at`, s."""
 
     at: float
     position: FloatArray

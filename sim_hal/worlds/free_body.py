@@ -1,20 +1,20 @@
 """A free body in low Earth orbit, rotated by its coils and by the disturbance torques.
 
-The flight software assumes nominal properties of the craft. The true properties of the craft differ from
-these by random errors drawn from a seed, as a built satellite differs from its design. The torques on the
-body are those of coils, residual dipole, gravity gradient, drag and solar radiation. The drag on a face that
-is exposed to the flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2. The solar radiation
-force on a sunlit face is given by Montenbruck & Gill 2000, eq. 3.73. The faces of a box do not shade each
-other.
+The flight software assumes nominal properties of the craft. The true properties of the craft differ from the
+nominal properties by random errors drawn from a seed, as a built satellite differs from its design. The
+torques on the body are those of coils, residual dipole, gravity gradient, drag and solar radiation. The drag
+on a face that is exposed to the flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2. The
+solar radiation force on a sunlit face is given by Montenbruck & Gill 2000, eq. 3.73. The faces of a box do
+not shade each other.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
 the torques that depend on the attitude, namely those of the dipole in the field and of the gravity gradient
 (Wertz 1978, eq. 17.28). The error of a step in which the body rotates by 0.01 rad is 1e-13 rad. The code uses
 Python floats, because numpy takes ten times as long for three components.
 
-The rotation is integrated when the state is read and when the currents change. The result depends on the
-times at which the state is read by less than a microradian. Drag torque, solar radiation torque and residual
-dipole are kept constant in body axes for 0.1 s.
+The rotation is integrated when the state is read and when the currents change. Reading the state at other
+times changes the attitude by less than a microradian. Drag torque, solar radiation torque and residual dipole
+are kept constant in body axes for 0.1 s.
 """
 
 from __future__ import annotations
@@ -163,14 +163,14 @@ PRESSURE_ARM = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CraftModel:
-    """Properties of a craft as described by a configuration, without the errors of the true craft.
+    """Configured properties of a craft, without the errors of the true craft.
 
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         size: edges (3,) of the box along the body axes, m.
         dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         centre_of_mass: vector (3,) from the centre of the box to the centre of mass, m, body axes.
-        offset: distance between the true and the described centre of mass, m.
+        offset: distance between the true and the configured centre of mass, m.
         residual_dipole: residual dipole (3,) in shadow, A m^2, body axes.
     """
 
@@ -187,7 +187,7 @@ CRAFTS = {
     "knightcube": CraftModel(
         inertia=np.diag([1.10e-3, 1.05e-3, 0.99e-3]), size=(0.1, 0.1, 0.1), dipoles=0.648 * np.eye(3)
     ),
-    # This craft is assumed to have 4 kg and coils of 57.8 ohm with 0.2 A m^2 at 58.8 mA, or 5 W/(A m^2)^2.
+    # The 3U CubeSat has an assumed mass of 4 kg and coils of 57.8 ohm, 0.2 A m^2 at 58.8 mA, 5 W/(A m^2)^2.
     "cubesat_3u": CraftModel(
         inertia=np.diag([0.0066, 0.0333, 0.0333]), size=(0.3, 0.1, 0.1), dipoles=3.4 * np.eye(3)
     ),
@@ -444,7 +444,7 @@ class CoilSupply:
 
 KNIGHTCUBE_SUPPLY = CoilSupply((23.0, 23.0, 23.0), 3.4)
 VARIED_FOR = 20.0
-"""Time (s) for which the dipole per ampere of a coil that varies is constant."""
+"""Interval (s) between the random changes of a coil's dipole per ampere."""
 
 
 class FreeBody:
@@ -490,7 +490,7 @@ class FreeBody:
         self._read: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
-        # The state is that at `_done_ns`; the coil currents `_acting` flow from `_done_ns` to `time_ns`.
+        # The state `_state` is valid at `_done_ns`; the currents `_acting` flow from `_done_ns` to `time_ns`.
         self._done_ns = self.time_ns = start_ns
         self._pull, self._field = self._gravity_and_field(0.0)
         self.energy = 0.0
@@ -641,7 +641,7 @@ class FreeBody:
             self._factors = (1.0 + generator.uniform(-largest, largest, len(self._acting))).tolist()
 
     def _varied(self, currents: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the currents (n,), A, that cause the present dipoles in coils that do not vary."""
+        """Return the currents (n,), A, that would cause the present dipoles in nominal coils."""
         return tuple(map(mul, currents, self._factors)) if self._factors else currents
 
     def _gravity_and_field(self, time: float) -> tuple[Floats, Floats]:
@@ -673,11 +673,11 @@ def built_craft(
     description: DescriptionErrors,
     craft: CraftModel | None = None,
 ) -> TrueCraft:
-    """Return the true craft, which differs from the described craft by errors.
+    """Return the true craft, which differs from the configured craft by random errors.
 
-    The described craft is `craft` or, if `craft` is None, the craft of `section`. The argument `description`
-    holds the differences of the true craft from the described craft. The disturbances are drawn from the
-    generator `errors`. Raises ConfigError like `craft_model`.
+    The configured craft is `craft` or, if `craft` is None, the craft of `section`. The argument `description`
+    contains the ratios and rotations from the configured to the true properties. The disturbances are drawn
+    from the generator `errors`. Raises ConfigError like `craft_model`.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
     if description is NO_ERRORS:

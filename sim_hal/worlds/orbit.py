@@ -26,10 +26,10 @@ The field is an expansion in spherical harmonics of degree 13 (Alken et al. 2021
 eq. 1), whose coefficients (2024, doi 10.5281/zenodo.14012302) are interpolated linearly between epochs. After
 the last epoch, 2030, the coefficients are extrapolated with the secular variation and acceleration of the
 last epochs. The flight software uses a different model (`knightcube.astro.earth.geomagnetism`), so that the
-simulation includes a realistic model error. `ring_current` gives the field of the ring current. Currents in
-the ionosphere are not modelled.
+simulation includes a realistic model error. The function `ring_current` returns the field of the ring
+current. Currents in the ionosphere are not modelled.
 
-The table `igrf.npz` holds the coefficients as integers in units of 0.01 nT. `tests/support/build_igrf.py`
+The table `igrf.npz` contains the coefficients as integers in units of 0.01 nT. `tests/support/build_igrf.py`
 makes the table from the file that the package ppigrf ships. The package ppigrf itself is not used, because it
 needs pandas and takes 81 ms for one position instead of 3 ms. The fields of ppigrf and of this module agree
 within 0.06 nT.
@@ -237,7 +237,7 @@ def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
 
 
 _FARTHEST_ELEMENTS, _TILT = 100e3, 0.25
-"""Limits for elements that fit an orbit: distance (m) in the first revolution, and inclination error (deg).
+"""Tolerances between two-line elements and an orbit: distance (m) in a revolution, inclination (deg).
 
 The inclination of two-line elements refers to the equator of date, whose pole is 0.15 deg from the ICRS pole
 in 2026. J2 varies the inclination by 0.03 deg in a revolution.
@@ -297,7 +297,10 @@ _PROFILE = np.array([
 Above 1,000 km, the values are extrapolated with the scale height at 1,000 km, 268 km.
 """
 _LOWEST_PERIGEE = 150e3
-"""Lowest permitted perigee height (m) of a configured orbit. A lower orbit decays within a revolution."""
+"""Lowest permitted perigee height (m) of a configured orbit.
+
+An orbit with a lower perigee decays within a revolution.
+"""
 _NIGHT, _DAY = 0.4, 1.6
 """Factors of the air density: opposite to the diurnal bulge, and at the apex of the diurnal bulge."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
@@ -344,7 +347,7 @@ class Chunk:
     """Interpolation of the environment over 1,000 s.
 
     `cubics` (knots, 4, columns) contains cubic polynomial coefficients, highest power first. `sunlit`
-    (seconds,) holds the visible fraction of the Sun's disc.
+    (seconds,) contains the visible fraction of the Sun's disc in each second.
     """
 
     start: float

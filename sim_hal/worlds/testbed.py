@@ -3,13 +3,13 @@
 The testbed is a rigid body on a thread in the field of a Helmholtz coil, controlled by torque coils. The
 model is that of Sease 2013, chapter 5. The testbed has one degree of freedom, the angle theta about the
 thread, with J theta'' = M - k theta - c theta', where M is the component of m x B along the thread. The
-testbed frame T has y down along the thread and the magnetic field along -z. The body axes coincide with those
-of T at theta = 0. The coil on body x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on body z
-gives n A B I sin(theta), and the coil on body y has no effect because its axis lies along the thread.
+testbed frame T has y down along the thread and the magnetic field along -z. The body axes coincide with the
+axes of T at theta = 0. The coil on body x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on
+body z gives n A B I sin(theta), and the coil on body y has no effect because its axis lies along the thread.
 
-The body held by hand on a bench is the world of `knightcube bringup` with emulated devices. It stands with
-its z axis up until it is rotated by hand. For devices that need an orbit, a satellite has the orbit of its
-configuration, as if a signal simulator were connected to the GPS receiver.
+The body held by hand on a bench is the world of `knightcube bringup` with emulated devices. The body stands
+with its z axis up until it is rotated by hand. For devices that need an orbit, a satellite has the orbit of
+its configuration, as if a signal simulator were connected to the GPS receiver.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Interface between simulated worlds and emulated devices, and recorder of the true state.
 
-A configuration names its world in `simulation.world`. The name is a key of `WORLDS`, or names a factory of
-another package as `module:factory`. A factory takes `WorldInputs` and returns a `World`. A world in orbit
-implements `OrbitingWorld`.
+A configuration names its world in `simulation.world`. The name of a world is a key of `WORLDS`, or
+`module:factory` for a factory of another package. A factory takes `WorldInputs` and returns a `World`. A
+world in orbit implements `OrbitingWorld`.
 """
 
 from __future__ import annotations

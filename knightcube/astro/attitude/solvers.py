@@ -77,7 +77,7 @@ _MINIMUM_SLOPE = 1e-13
 In a narrow field of view, two of the three eigenvalue differences are of the order of one.
 """
 _WORST_CONDITION = 1e12
-"""Condition of the normal matrix above which directions do not determine a rotation by OLAE."""
+"""Condition number of the normal matrix above which directions do not determine a rotation by OLAE."""
 
 
 def skew_part(profile: FloatArray) -> FloatArray:
@@ -337,7 +337,7 @@ def gain(solution: OlaeSolution, weights: FloatArray) -> FloatArray:
 
 
 def olae(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the OLAE attitude, with its own covariance.
+    """Return the OLAE attitude, with the covariance of the OLAE estimate.
 
     The reference frame is first rotated by 180 deg about an axis chosen from the TRIAD attitude, which limits
     the remaining rotation angle to 120 deg and |g| to 1.74. An error e of the observed direction b enters the

@@ -39,7 +39,7 @@ Source = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class AddedStar:
-    """Bright star that Hipparcos lists without a position, which is at epoch J1991.25, deg.
+    """Bright star that Hipparcos lists without a position, with its position (deg) at epoch J1991.25.
 
     The magnitude is Johnson V, and the proper motion is mu_alpha cos(delta) and mu_delta, mas/yr.
     """

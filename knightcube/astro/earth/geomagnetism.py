@@ -91,12 +91,13 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
 def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the fields (n, 3) at n Julian dates UTC and positions (n, 3), equal to the results of `field`.
 
-    The expansion is evaluated for all positions together, which takes 0.03 ms each for a hundred positions.
+    The expansion is evaluated for all positions together, which takes 0.03 ms per position for a hundred
+    positions.
     """
     to_ground = celestial_to_terrestrial(julian_dates)
     there = np.array([turn @ position for turn, position in zip(to_ground, positions, strict=True)])
     longitude, latitude, height = geodetic(there)
-    if not np.abs(latitude).max() < _NEAR_POLE:  # also for NaN, for which `field` raises an error
+    if not np.abs(latitude).max() < _NEAR_POLE:  # true for NaN, too: `field` then raises an error
         return np.array([field(float(date), at) for date, at in zip(julian_dates, positions, strict=True)])
     parts = zip(
         _expansion(julian_epoch(julian_dates), latitude, longitude, height),
@@ -112,7 +113,7 @@ def _expansion(
 ) -> list[tuple[float, float, float]]:
     """Return the north, east and down components, nT, with the same operations as `GeoMag.calculate`."""
     model = _model()
-    assert model.model  # the model has read its coefficients
+    assert model.model  # not empty, because the coefficients have been read
     lowest, highest = FIRST_YEAR - LONGEST_EXTRAPOLATION, LAST_YEAR + LONGEST_EXTRAPOLATION
     since = np.minimum(np.maximum(years, lowest), highest) - model._epoch
     at = [math.radians(math.degrees(angle)) for angle in latitude.tolist()]

@@ -1,8 +1,9 @@
 """Reader of mean elements for SGP4 from files: two-line elements, and OMM in JSON, XML, KVN and CSV.
 
 The Orbit Mean-Elements Message (OMM) is defined in CCSDS 502.0-B-3. CelesTrak and Space-Track publish OMMs
-for satellites with numbers above 99999. Two-line elements can hold numbers only up to 339999 (Alpha-5). Each
-OMM is converted to two-line elements. The rounding of the epoch to 1e-8 days shifts a satellite by up to 3 m.
+for satellites with numbers above 99999. Two-line elements can represent satellite numbers only up to 339999
+(Alpha-5). Each OMM is converted to two-line elements. The rounding of the epoch to 1e-8 days shifts a
+satellite by up to 3 m.
 """
 
 from __future__ import annotations
@@ -55,9 +56,9 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
 }
 """Bounds and unit of the numerical fields of an OMM, which are all required."""
 _LEAST_DRAG = 1e-9
-"""Smallest nonzero absolute value of B* that two-line elements can hold (one-digit exponent)."""
+"""Smallest nonzero absolute value of B* that two-line elements can represent (one-digit exponent)."""
 _YEARS = 1957, 2056
-"""First and last year that two-line elements can hold."""
+"""First and last year that two-line elements can represent."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,7 +229,7 @@ class _Field:
         name: name of the quantity.
         form: regular expression of the whole field.
         example: example of a valid field.
-        low, high: bounds of the value, if the field holds a number.
+        low, high: bounds of the value, if the field contains a number.
         unit: unit of the value, with a leading blank.
     """
 

@@ -82,7 +82,7 @@ class BasiliskWorld:
         )
         self._currents, self._supply = currents, supply
         self._acting: FloatArray = np.zeros(3)
-        self._stepped_ns = 0  # simulation time of Basilisk, which begins at zero
+        self._stepped_ns = 0  # Basilisk's time begins at zero
         self._placed_ns = 0
         self.time_ns = start_ns
         self.energy = self.supply_energy = 0.0
