@@ -29,7 +29,7 @@ from hal.interfaces.guardian import CoilReach
 from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
-"""Driver classes of pluggable serial lines and video devices; I2C buses are not pluggable and have none."""
+"""Driver classes of pluggable devices: serial lines, video devices, and no class for I2C buses."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 """Driver classes by the kind of a device."""
 
@@ -175,7 +175,7 @@ def _bus(config: Config) -> list[str]:
 
 
 def check_single(path: Path) -> None:
-    """Raise ConfigError for a configuration that extends another file, which its checksum does not cover."""
+    """Raise ConfigError if a configuration extends another file, which the file's checksum does not cover."""
     if len(read_document(read_text(path), str(path)).chain) > 1:
         problem = "the checksum covers a single file: merge the files by `knightcube check FILE --merged NEW`"
         raise ConfigError(str(path), f"`extends` cannot be used on a board: {problem}")

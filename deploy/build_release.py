@@ -101,8 +101,7 @@ class Build:
         if problem := _damaged_package(old):
             sys.stderr.write(f"install: failed: add the folder wheels, because {problem}\n")
             raise SystemExit(1)
-        # Bytecode is not copied: it records the times of the old source files, so Python would compile it
-        # again.
+        # Bytecode records the times of the old source files, so Python would not use copies of it.
         caches = shutil.ignore_patterns("__pycache__")
         ours = shutil.ignore_patterns(*_OURS, "__pycache__")
         for packages in old.glob("venv/lib/python3*/site-packages"):

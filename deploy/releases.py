@@ -41,7 +41,7 @@ def files_of(release: Path) -> Iterator[Path]:
 
 
 def manifest_text(release: Path) -> str:
-    """Return the manifest: SHA-256 of all further lines, then SHA-256, size and path of each file."""
+    """Return the manifest: first the SHA-256 of its other lines, then SHA-256, size and path of each file."""
     lines = [
         f"{_sum(path)} {path.stat().st_size} {path.relative_to(release).as_posix()}\n"
         for path in files_of(release)

@@ -196,7 +196,7 @@ class OrbitPrediction:
                 yield self._described(station, place, own)
 
     def _described(self, station: Station, place: GeographicPosition, own: list[datetime]) -> Pass:
-        """Return the pass whose times `own` are those of rise, culminations and set."""
+        """Return the pass with the given times `own` of rise, culminations and set."""
         elevations, azimuths, ranges = self._seen_from(place, own)
         top = 1 + int(np.argmax(elevations[1:-1]))
         sun = -earth_from_sun(float(terrestrial_time(julian_date(own[top]))))[0]

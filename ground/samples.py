@@ -78,7 +78,7 @@ def _streaks(name: str, generator: np.random.Generator) -> SamplePicture:
 
 
 def _limb(name: str, generator: np.random.Generator) -> SamplePicture:
-    """Render the Earth's limb by day from a low orbit, with the boresight 8 deg below it."""
+    """Render the Earth's limb by day from a low orbit, with the boresight 8 deg below the limb."""
     lens = Pinhole.from_field_of_view(EARTH_PIXELS, EARTH_PIXELS, math.radians(EARTH_FIELD_DEG))
     model = earth_camera.EarthCameraModel(
         lens=lens, rows=EARTH_PIXELS, columns=EARTH_PIXELS, response="linear", seed=1
@@ -137,8 +137,8 @@ def _satellite(attitude: FloatArray) -> star_camera.SourceTrack:
 def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_length: float) -> dict[str, Any]:
     """Return the true parameters of a frame as plain numbers for a JSON file.
 
-    The camera turns at `rate` (3,), rad/s, in its axes. The attitude (4,) from ICRS to the camera is that at
-    mid-exposure. The focal length is in px.
+    The camera rotates at `rate` (3,), rad/s, in camera axes. The attitude (4,) from ICRS to the camera is
+    that at mid-exposure. The focal length is in px.
     """
     pointing = Pointing.of(attitude)
     return {

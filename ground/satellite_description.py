@@ -3,8 +3,8 @@
 The file extends the configuration `orbit` (a 1U CubeSat) and contains only differing values. Values that are
 not described are computed: the inertia is that of a homogeneous cuboid, and limits are scaled between those
 of the configurations `orbit` and `orbit_3u`. The file omits weights and noise levels that the flight
-application computes from craft and coils. The questions of `knightcube new-satellite` stand with the
-functions that read and check the answers.
+application computes from craft and coils. The questions of `knightcube new-satellite` are defined together
+with the functions that read and check the answers.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _EQUATOR_FIELD = 2.98e-5  # field of the Earth's dipole at the equator at one Ea
 _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
 """Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, solar pressure (Pa)."""
 _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
-"""Bound of the simulated current error, and assumed current noise, as fractions of the limit [`orbit`]."""
-_STRAY_FIELD = 7.4e-5  # field (T) of a coil at the magnetometer at the current limit [as in `orbit`]
+"""Bound of the simulated current error, and assumed current noise, as fractions of the current limit."""
+_STRAY_FIELD = 7.4e-5  # field (T) of a coil at the magnetometer at the current limit [configuration `orbit`]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class Derived:
         disturbance: aerodynamic and solar torque on the largest face for a mass offset of 2 cm, N m.
         momentum_time: time (s) in which `coil_torque` removes the angular momentum at release.
         period: orbital period, s.
-        slow_within: estimate of the longest time of detumbling, s.
+        slow_within: estimated upper limit of the detumbling time, s.
         duration: duration of the flight, s.
         detumble_horizon: planning horizon of detumbling, s.
         roll: roll error (rad) that has the same cost as an error of 1 deg of the pointing axis.

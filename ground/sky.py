@@ -104,7 +104,7 @@ def _in_file(points: FloatArray, rows: int) -> FloatArray:
 def _polynomials(
     names: tuple[str, str], places: FloatArray, shift: FloatArray, least: int
 ) -> dict[str, str | int | float | bool]:
-    """Return coefficients of polynomials of `places` (n, 2), px, for `shift` (n, 2), from order `least`."""
+    """Return FITS coefficients, from order `least` on, of polynomials in `places` (n, 2) that fit `shift`."""
     powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i) if least <= i + j]
     size = float(np.abs(places).max())
     x, y = (places / size).T

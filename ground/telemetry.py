@@ -108,7 +108,7 @@ def _missing(layout: Layout, packets: bytes) -> int:
 def decode(data: bytes) -> dict[str, PacketArray]:
     """Return arrays of the packets in `data` by packet name.
 
-    Raises TelemetryError if a byte belongs to no valid packet or a packet is of another version.
+    Raises TelemetryError if a byte belongs to no valid packet or a packet's definition has another version.
     """
     result = scan(data)
     bad = result.skipped_bytes + result.truncated_bytes
@@ -275,7 +275,7 @@ def _in_database(values: list[str] | npt.NDArray[Any]) -> tuple[str, list[Any]]:
 def write_parquet(run: Run, folder: Path) -> list[Path]:
     """Write `<packet>.parquet` for each packet type, with unit and meaning as metadata, and return the files.
 
-    Raises OSError, and UsageError without pyarrow.
+    Raises OSError if a file cannot be written, and UsageError if pyarrow is not installed.
     """
     try:
         import pyarrow  # noqa: PLC0415 - an extra

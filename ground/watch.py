@@ -43,7 +43,7 @@ class PacketSource(Protocol):
         """Time (s) since the last packet."""
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name that arrived since the last call. Raises FlightError or UsageError."""
+        """Return the packets by name that arrived since the last call, or raise FlightError or UsageError."""
 
 
 class LogTail:

@@ -149,7 +149,7 @@ class Guardian:
     def __init__(self, flight: socket.socket, switch: CoilSwitch, now_ns: Callable[[], int]) -> None:
         self._flight, self._switch, self._now_ns = flight, switch, now_ns
         self._watch = Watch(now_ns())
-        self._reported = 0  # number of reported outages
+        self._reported = 0  # number of reported interruptions of the heartbeats
         self._failing = False
 
     def serve(self) -> None:
@@ -249,8 +249,8 @@ class GuardianLine:
     def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
         """Wait until the guardian has set the coils to zero.
 
-        Raises NotResponding after `patience` seconds. If `patient` is true, no error is raised. In that case,
-        the guardian sends a report as soon as the coils are at zero, which `tend` returns.
+        Raises NotResponding after `patience` seconds, unless `patient` is true. The guardian's later report
+        that the coils are at zero is returned by `tend`.
         """
         received = b""
         if select.select([self._line], [], [], patience)[0]:
@@ -324,8 +324,8 @@ class GuardianLine:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # A separate process group keeps signals to the group of the flight process away from the
-                # guardian. If the guardian is stopped, the kernel continues it when its parent dies.
+                # Signals to the flight's process group must not reach the guardian. If the guardian is
+                # stopped, the kernel continues it when its parent dies.
                 process_group=0,
             )
         except OSError as error:

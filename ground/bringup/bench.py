@@ -35,13 +35,13 @@ _ATTEMPTS = 3
 _LOST_FRAMES = 2  # number of additional triggers if a trigger yields no frame
 _LATE_FRAME_S = 2.0  # longest time (s) from the end of an exposure to the arrival of the frame
 STILL_S = 0.5
-"""Time (s) in which a body that stands still is measured."""
+"""Duration (s) of a measurement of the body at rest."""
 
 
 class StepSkipped(Exception):
     """Raised if a step of the bring-up cannot be performed.
 
-    The text states the reason. The attribute `finding` is the fault that prevents the step, or None.
+    The message states the reason. The attribute `finding` is the fault that prevents the step, or None.
     """
 
     def __init__(self, reason: str, finding: Finding | None = None) -> None:
@@ -75,9 +75,9 @@ class Session:
     Attributes:
         config: configuration of the devices.
         rig: hardware or emulated devices.
-        stack: closes every device that was opened.
+        stack: exit stack that closes every opened device.
         ask: function that requests an action of the person at the bench and waits for its completion.
-        hand: the emulated hand (`sim_hal.rig.EmulatedBench`), or None at a real bench.
+        hand: emulation of the person at the bench (`sim_hal.rig.EmulatedBench`), or None at a real bench.
         guardian: guardian of the coils, or None with emulated devices.
         coil_field: expected field of each coil (n, 3) at the magnetometer, T/A, body axes, or None if the
             configuration does not describe it.
@@ -100,7 +100,7 @@ class Session:
     def device(self, key: str) -> Any:
         """Return the open device of a section, such as `gps`, `power.bus_monitor` or `wide_cameras[1]`.
 
-        Raises StepSkipped if it is not configured or not found.
+        Raises StepSkipped if the device is not configured or not found.
         """
         if key not in self._open:
             missing = [one for one in self.known.get("find", Outcome()).findings if one.part == key]
@@ -270,10 +270,10 @@ def chip_at(bus: I2cBus, address: int) -> str | None:
 
 
 def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int, float]:
-    """Return which kind of device sends on a serial line, its baud rate, and its longest pause, s.
+    """Return which kind of device sends on a serial line, its baud rate, and its longest sending pause, s.
 
     The kind is `vn100` or `gps`, or "" if none is recognised. The pause is 0 for a device that sends
-    regularly. The `rates` are tried first, and then all rates of a VN-100.
+    regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100.
     """
     for rate in dict.fromkeys((*rates, *BAUD_RATES)):
         try:

@@ -26,7 +26,7 @@ _HOT = 1e-3  # largest fraction of hot pixels of a healthy sensor
 
 
 def step_dark(session: Session) -> Outcome:
-    """Take frames with the lens cap on: level, noise and hot pixels."""
+    """Take frames with the lens cap on, and measure level, noise and hot pixels."""
     session.device("camera")
     session.ask("Put the cap on the lens of the camera.")
     if session.hand is not None:
@@ -121,14 +121,14 @@ def _format_faults(part: str, camera: Camera | WideCamera, frames: Sequence[Fram
 
 
 def _dead_lines(first: FloatArray, second: FloatArray) -> str:
-    """Return a text about the number of rows and columns that are equal in two frames, or an empty text."""
+    """Return a text about the numbers of rows and columns that two frames share exactly, or an empty text."""
     same = first == second
     rows, columns = int(same.all(axis=1).sum()), int(same.all(axis=0).sum())
     return f"{rows} rows and {columns} columns do not change" if rows or columns else ""
 
 
 def step_light(session: Session) -> Outcome:
-    """Take the first light: a frame without the cap, which must differ from a dark frame."""
+    """Take the first frame without the lens cap, which must differ from a dark frame."""
     session.device("camera")
     session.ask("Take the cap off, and point the camera at stars or at small lamps in the dark.")
     findings: list[Finding] = []
@@ -250,7 +250,7 @@ def step_lens(session: Session) -> Outcome:
     return Outcome(findings, values, changes)
 
 
-# Cameras for the directions to Sun and horizon.
+# Horizon cameras, which measure the directions to Sun and horizon.
 
 
 def step_wide(session: Session) -> Outcome:
@@ -299,7 +299,7 @@ def step_wide(session: Session) -> Outcome:
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
-    """Return the keys of the cameras whose cover darkens a frame, given the frame without covers."""
+    """Return the cameras whose covering darkens the frame `pixels`, given its frame for each covered lens."""
     level = float(np.mean(pixels))
     levels = {key: float(np.mean(frame)) for key, frame in covered.items()}
     darkest = min(levels.values())

@@ -33,9 +33,9 @@ GRAVITY = 9.80665
 RECOGNISED = math.radians(25.0)
 """Largest angle (rad) at which a measured direction is assigned to an expected direction."""
 ASKEW = math.radians(15.0)
-"""Largest angle (rad) of a coil's field to its expected direction, if the magnetometer's axes are exact."""
+"""Largest accepted angle (rad) from a coil's expected field to the field that an aligned unit measures."""
 FEWEST = 20
-"""Smallest number of samples from which the noise is determined."""
+"""Smallest number of samples that determines the noise."""
 ALIKE = math.radians(15.0)
 """Largest angle (rad) between the axes of two sensors that count as equally mounted."""
 SCALE = 0.1
@@ -56,7 +56,7 @@ class Finding:
         kind: kind of the fault in one or two words, for example `reversed`.
         text: measured value and its meaning.
         cure: remedy.
-        factor: factor by which a coil's resistance differs from the configured one, or None.
+        factor: ratio of actual to configured resistance of a coil, or None.
     """
 
     part: str
@@ -439,7 +439,7 @@ class FieldFound:
         axes: orthogonal matrix (3, 3) from body axes to measured axes, or None if no orthogonal matrix
             explains the values.
         size, bias: magnitudes of the site's field and of the body's constant field, T.
-        scales: relative scales (3,) of the measured axes, or None if the scales are equal.
+        scales: scale factors (3,) of the measured axes relative to their median, or None if they are equal.
     """
 
     axes: FloatArray | None
@@ -551,7 +551,7 @@ class CoilsFound:
         misfit: angle (n,), rad, between the axes of measured and expected field, from 0 to pi / 2.
         live: mask (n,) of the commands that produce a field.
         drawn: supply current (n,) relative to the command, corrected for a wrong shunt; NaN if unknown.
-        shunt: factor by which the shunt differs from the configured one, or 1.
+        shunt: ratio of actual to configured shunt resistance, or 1.
         joined: commands (j, k) whose coils are connected, so that command j also drives coil k.
         askew: largest angle (rad) between the measured and the expected field of a healthy coil.
         findings: the faults.
@@ -599,7 +599,7 @@ def diagnose_coils(
     askew, strength = ASKEW if exact else RECOGNISED, sign * strength
     state = CoilsFound(response, expected, serves, strength, misfit, live, drawn, 1.0, joined, askew, found)
     shared, shunt = _shared_fault(test, state, size_known)
-    # A monitor that measures no current says nothing about single coils.
+    # A monitor that measures no current gives no information about single coils.
     unmeasured = any(one.kind == "no current" for one in shared)
     state = replace(state, drawn=np.full_like(drawn, math.nan) if unmeasured else drawn / shunt, shunt=shunt)
     found += shared
@@ -670,7 +670,7 @@ def _match(
 
 
 def _shared_fault(test: CoilTest, state: CoilsFound, size_known: bool) -> tuple[list[Finding], float]:
-    """Return the faults that all coils share, and the ratio of measured to commanded current."""
+    """Return the faults common to all coils, and the ratio of measured to commanded current."""
     live, drawn, count = state.live, state.drawn, len(state.live)
     flowing = drawn > 0.12
     found = []

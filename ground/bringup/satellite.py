@@ -252,7 +252,10 @@ def step_strings(session: Session) -> Outcome:
 
 
 def _currents(session: Session, strings: SolarStrings, normal: FloatArray) -> FloatArray:
-    """Return the currents (n,), A, in the light of a lamp along `normal` (3,). Raises StepSkipped."""
+    """Return the string currents (n,), A, under a lamp along `normal`.
+
+    Raises StepSkipped without currents.
+    """
     if session.hand is not None:
         session.hand.light(normal)
     begun_ns = session.rig.clock.now_ns()

@@ -148,7 +148,7 @@ def step_coils(session: Session) -> Outcome:
     if monitor is not None and math.isnan(test.idle):
         problem = monitor.error() or "no conversion arrives"
         found.findings.append(Finding("power_monitor", "no reading", problem, "check its supply and wiring"))
-    # Braking a bridge stops the current that flows while the coils are off.
+    # A braked bridge carries no current, even if a leg that is stuck high drives the coil while it is off.
     if any(one.kind == "current while off" for one in found.findings):
         coils.brake(frozenset(range(len(section.windings))))
     values = {

@@ -188,9 +188,9 @@ def fly(
     """Run the cases of a campaign that have no result in the folder `out`, and summarise all results.
 
     The cases run in `workers` processes (default: the number of cores), or on the Dask cluster whose
-    scheduler has the address `dask`. If `only` is given, only cases run whose key contains this text. Raises
-    UsageError if the folder contains another campaign or if no cluster is found, and CampaignError if the
-    cluster is lost.
+    scheduler has the address `dask`. If `only` is given, only the cases whose key contains this text are run.
+    Raises UsageError if the folder contains another campaign or if no cluster is found, and CampaignError if
+    the cluster is lost.
     """
     cases = [case for case in campaign.cases(runs, seed) if only in case.key]
     if only and not cases:
@@ -249,7 +249,7 @@ def _opened(out: Path) -> Iterator[IO[str]]:
 
 
 def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
-    """Return the results by key, and remove an incomplete last line. Raises UsageError for another label."""
+    """Return the results by key, and remove an incomplete last line. Raises UsageError if `label` differs."""
     label_path = out / "campaign.json"
     if label_path.exists():
         found = json.loads(label_path.read_text(encoding="utf-8"))
@@ -343,7 +343,7 @@ def _worker(campaign: Campaign, scratch: str) -> _Worker:
     pipe, end = context.Pipe()
     process = context.Process(target=_serve, args=(end, campaign.run, os.getpid(), scratch))
     process.start()
-    end.close()  # if this end stayed open, the pipe would outlive the worker process
+    end.close()  # so that the pipe is closed when the worker process ends
     return _Worker(process, pipe)
 
 
@@ -364,7 +364,7 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
     """Run the cases that a worker process receives through a pipe, and send back result or exception."""
     # The kernel kills this process when its parent, the process of the campaign, ends.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # the campaign ended before the call
+    if os.getppid() != parent:  # the campaign's process ended before the call of prctl
         os._exit(1)
     tempfile.tempdir = scratch
     with suppress(EOFError, OSError, KeyboardInterrupt):

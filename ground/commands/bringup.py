@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     kept = {} if options.again else _kept(options.out / REPORT, key)
     wanted = options.only or [name for name in steps_of(config) if name not in kept]
-    # Ctrl-C sets the coils to zero before the end.
+    # After Ctrl-C the coils are set to zero before the program ends.
     with interruptible(), _opened(options, text, config, emulated) as session:
         session.known |= kept
         for name in wanted:

@@ -111,7 +111,7 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Make or fit elements and print them with their residuals."""
+    """Read or fit two-line elements, and print them, with the residuals of a fit."""
     if options.altitude is None:
         given = [name for name in _ORBIT if getattr(options, name) is not None]
         if given:

@@ -169,8 +169,7 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
     for nadir in solution.candidates if solution.nadir is None else (solution.nadir,):
         values = _nadir_facts(nadir, altitude_fitted)
         x, y, z = nadir.direction
-        # The uncertainty of nadir perpendicular to the arc from boresight to nadir differs from that along
-        # the arc.
+        # The uncertainties of nadir along and across the arc from boresight to nadir differ.
         sigmas = np.degrees(np.sqrt(np.linalg.eigvalsh(nadir.tangent_covariance)))
         lines += [
             f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",

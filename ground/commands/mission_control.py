@@ -44,7 +44,7 @@ _END_S = 30.0  # longest time (s) to wait for the end of Yamcs
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `knightcube mission-control` to the parser."""
     parser.description = (
         "Run the mission control system Yamcs for the satellite of a configuration. Yamcs gets the "
         "satellite's telemetry, limits and commands from our tables, and reaches the satellite through a "
@@ -176,7 +176,7 @@ def _packets(run: Path) -> list[bytes]:
 
 
 def _mission_zero(packets: Sequence[bytes]) -> datetime | None:
-    """Return the UTC of mission time zero from the last packet that states it, or None if none does."""
+    """Return the UTC of mission time zero from the last packet that states it, or None if no packet does."""
     rows = decode(b"".join(packets))[RUN.name]
     if not len(rows) or not rows[-1]["utc_ns"]:
         return None
@@ -194,8 +194,8 @@ class Replay:
     def __init__(self, packets: Sequence[bytes], folder: Path, speed: float | None, begun: float) -> None:
         """Begin a replay at the monotonic time `begun` (s), in the folder of Yamcs's configuration.
 
-        The `speed` is the ratio of mission time to the time of this computer; None replays all packets at
-        once.
+        The `speed` is the ratio of mission time to the time of this computer; without a speed (None), all
+        packets are replayed at once.
         """
         self._folder, self._speed, self._begun = folder, speed, begun
         end = HEADER_BYTES + SECONDARY_BYTES

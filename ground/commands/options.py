@@ -84,7 +84,7 @@ def raw_shape(text: str) -> tuple[int, int, int]:
 
 
 def positive(text: str) -> float:
-    """Return the positive finite number in an argument. Raises ArgumentTypeError for other texts."""
+    """Return the positive finite number in an argument. Raises ArgumentTypeError for any other argument."""
     value = finite(text)
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
@@ -92,14 +92,14 @@ def positive(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """Return the positive whole number in an argument. Raises ArgumentTypeError for other texts."""
+    """Return the positive whole number in an argument. Raises ArgumentTypeError for any other argument."""
     if not re.fullmatch(r"0*[1-9][0-9]{0,8}", text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
     return int(text)
 
 
 def finite(text: str) -> float:
-    """Return the finite number in an argument. Raises ArgumentTypeError for other texts."""
+    """Return the finite number in an argument. Raises ArgumentTypeError for any other argument."""
     try:
         value = float(text)
     except ValueError as error:

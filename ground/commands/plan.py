@@ -298,8 +298,7 @@ def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, 
         "peak_of_limit": plan.peak,
         "dipole_limit_A_m2": made.task.craft.limit.tolist(),
         "turn_deg": math.degrees(float(angle_between(path.quaternion[0], path.quaternion[-1]))),
-        # The quaternion of the path is continuous, so its scalar part changes sign after a rotation by 180
-        # deg.
+        # The path's quaternion is continuous: its scalar part changes sign after a rotation by 180 deg.
         "way_round": "short" if around[3] >= 0.0 else "long",
         "way_deg": math.degrees(float(np.trapezoid(speed, path.times))),
         "peak_rate_deg_s": math.degrees(float(speed.max())),

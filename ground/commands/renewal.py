@@ -234,7 +234,7 @@ def artefact(kind: str, path: Path) -> bytes:
 
 
 def _two_lines(data: bytes, path: Path) -> bytes:
-    """Return the two-line elements in a text file or in a YAML file's `elements`. Raises UsageError."""
+    """Return the two-line elements in a text or YAML file. Raises UsageError if the file has none."""
     lines = [line.rstrip() for line in data.decode(errors="replace").splitlines() if line.strip()]
     if [len(line) for line in lines] == [69, 69]:
         return data
@@ -248,7 +248,7 @@ def _two_lines(data: bytes, path: Path) -> bytes:
 
 
 def _release_version(kind: str, source: Path) -> int:
-    """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError if it has none."""
+    """Return a release's version as one number, 10203 for 1.2.3. Raises UsageError if no version is found."""
     if kind != "release":
         raise UsageError(f"{kind}: give its version with --version N")
     text = read_text(source / "pyproject.toml")
@@ -296,7 +296,7 @@ def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def _new_key(path: Path, *, replaced: bool = False) -> CryptoSigner:
-    """Make a key and store it in a file that only its owner can read. An old key gets the suffix .old."""
+    """Make a key in a file that only its owner can read. A replaced key's file gets the suffix .pem.old."""
     signer = CryptoSigner.generate_ed25519()
     if replaced and path.exists():
         path.replace(path.with_suffix(".pem.old"))

@@ -371,7 +371,7 @@ class LinkFiles:
         return found
 
     def get(self, name: str) -> Path:
-        """Request a file and return its local copy. Raises FlightError and UsageError."""
+        """Request a file and return its local copy. Raises UsageError for a wrong name, and FlightError."""
         if problem := problem_of_name(name):
             raise UsageError(f"{name!r:.80}: {problem}")
         return self._request(SendFile(name), name)

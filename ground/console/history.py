@@ -184,7 +184,7 @@ class PageState:
         self._shown: dict[str, int] = {}
 
     def reset(self) -> None:
-        """Send a complete state next, after a jump in time."""
+        """Make the next state complete, because the shown time has jumped."""
         self._shown.clear()
 
     def at(self, time_ns: int, names: Mapping[str, Any]) -> Object:

@@ -82,7 +82,7 @@ class Console:
         trouble: reason why the last read failed, or an empty text.
         files: files of the satellite, or None if the files are not accessible.
         stations: ground stations in the panel of passes until the operator enters other stations.
-        settled_ns: newest time (ns) of which all packets have been received, which the live page shows.
+        settled_ns: newest time (ns) up to which all packets have been received, which the live page shows.
         sockets: open WebSockets.
     """
 
@@ -120,8 +120,7 @@ class Console:
         self.trouble = ""
         newest_ns = self.history.span_ns[1]
         self.history.append(packets)
-        # Packets with equal times may arrive in two reads, so the page shows only times up to the previous
-        # read.
+        # Packets of one time may arrive in two reads, so the page shows times up to the previous read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
@@ -375,7 +374,7 @@ class _Pages:
         name, given = await _command_of(request)
         try:
             return web.json_response({"words": self._console.forms.text(name, given)})
-        except UsageError as error:  # usual while the operator fills in a form
+        except UsageError as error:  # occurs whenever a form is not filled in completely
             return web.json_response({"error": str(error)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:

@@ -74,7 +74,7 @@ class FlightSurroundings:
         return cls(elements, view, dipole, body, config.coils.resistance, currents, lines)
 
     def at(self, utc_ns: int) -> Object | None:
-        """Return satellite position, ICRS directions (3,), and the points (deg) below satellite and Sun."""
+        """Return subsatellite and subsolar points (deg), height (km), field (T), and ICRS directions (3,)."""
         state = self._state(_julian_date(utc_ns))
         if state is None:
             return None
@@ -166,7 +166,7 @@ class FrameFolder:
 def pixels_of(data: bytes) -> Image:
     """Return a view of the pixels (rows, columns) of a kept frame.
 
-    Raises ValueError if the file has another size.
+    Raises ValueError if the number of pixels does not agree with the file's header.
     """
     parts = data.split(b"\n", 4)
     if len(parts) != 5 or parts[0] != b"P5":

@@ -374,7 +374,7 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return `restarts` and the samples whose innovations exceed the gate. Raises IdentificationError."""
+    """Return `restarts` and the samples beyond the gate. Raises IdentificationError if these are too many."""
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(
@@ -421,7 +421,7 @@ def _step(passed: Innovations, constants: MotionConstants) -> tuple[FloatArray, 
 
 
 def _inverse(information: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric matrix with widely different units. Raises IdentificationError."""
+    """Return the inverse of an information matrix. Raises IdentificationError if it is singular."""
     scale = 1.0 / np.sqrt(np.diag(information))
     correlation = information * np.outer(scale, scale)
     if not np.all(np.isfinite(correlation)) or np.linalg.cond(correlation) > 1e12:
@@ -519,7 +519,8 @@ class ScaledValue:
     """An estimated value, its standard deviation, and the contribution of its own prior.
 
     The attribute `own_prior` is the derivative of the value's logarithm with respect to the logarithm of its
-    prior, which is 1 if the motion added no information. The attribute is None for a value without a prior.
+    prior, which is 1 if the motion added no information. The attribute `own_prior` is None for a value
+    without a prior.
     """
 
     value: float

@@ -167,9 +167,9 @@ def command(
     show: Show,
     ended: Callable[[list[Report]], bool] = lambda _: False,
 ) -> list[Report]:
-    """Send a command, pass its reports to `show` and return them. Raises FlightError if none arrives.
+    """Send a command, pass its reports to `show` and return them. Raises FlightError without a report.
 
-    The call ends with the final report, if `ended` is true for the list of received reports, or after
+    The call ends with the final report, when `ended` is true for the list of received reports, or after
     `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
     the ground when it restarts, and after a minute without a frame.
     """
@@ -290,7 +290,7 @@ class FileSession:
             if units.is_unit(packet, units.DOWN):
                 try:
                     self.entity.take(units.unit_of(packet), now_ns)
-                except units.PduError:  # the satellite's software release may have different PDUs
+                except units.PduError:  # the satellite's software release may define other PDUs
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
@@ -328,13 +328,14 @@ class FileSession:
         return found
 
     def reason_of(self, progress: Progress) -> str:
-        """Return why a transfer ended. If the satellite refused it, the text is that of the satellite."""
+        """Return why a transfer ended: the satellite's reason for a refusal, or else that of the transfer."""
         return self._texts.get((progress.source, progress.number), "") or progress.said
 
     def ended(self, name: str, number: int | None = None) -> bool:
         """Return whether a transfer of a file has ended, and forget all ended transfers.
 
-        Only the transfer `number` counts if it is given. Raises FlightError with the reason if it has failed.
+        If `number` is given, only the transfer with this number is considered. Raises FlightError with the
+        reason if the transfer has failed.
         """
         found = [one for one in self.entity.ended if one.name == name and number in {None, one.number}]
         self.entity.ended.clear()
@@ -344,14 +345,14 @@ class FileSession:
         return bool(found)
 
     def completed(self) -> bool:
-        """Return whether the satellite reports a command as completed. Raises FlightError if it failed."""
+        """Return whether the satellite reports a command as completed. Raises FlightError after a failure."""
         reports = self.reports()
         if problem := failed(reports):
             raise FlightError(problem)
         return any(report.stage is Stage.COMPLETED for report in reports)
 
     def received_file(self, name: str) -> bool:
-        """Return whether a file has been received completely. Raises FlightError with the reason if not.
+        """Return whether a file has been received completely. Raises FlightError if its transfer has failed.
 
         The satellite reports a transfer as completed after the ground has received the file.
         """
@@ -364,7 +365,7 @@ class FileSession:
 
 
 def sha256_of(path: Path) -> bytes:
-    """Return the SHA-256 of a file. Raises FlightError."""
+    """Return the SHA-256 of a file. Raises FlightError if the file cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").digest()

@@ -84,7 +84,7 @@ class TerminalSettings:
         return cls(link.spacecraft, *sizes, link.encrypt_telemetry, link.coding, link.call_signs)
 
     def codes(self) -> LinkCodes:
-        """Return the codes of the link, with error counters at zero."""
+        """Return a coder and decoder of the link's frames, with error counters at zero."""
         codes = self.coding.randomiser, self.coding.reed_solomon, self.coding.cltu
         return LinkCodes(self.frame_bytes, *codes, self.call_signs)
 
@@ -111,7 +111,7 @@ class Terminal:
     Attributes:
         gate: authentication of the telemetry frames, with the numbers of refused frames.
         lost_frames: number of telemetry frames that are missing according to their authenticated counters.
-            The number includes counters that the satellite's link process skips at a restart.
+            This number of frames includes the counters that the satellite's link process skips at a restart.
         idle_frames: number of received frames of idle data.
         packet_bytes: longest packet that a telecommand frame can carry, bytes.
     """
@@ -199,8 +199,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        The report that a frame was repeated is final if it is the first report on the command. If another
-        report has arrived before, a third party has replayed the frame, and the report is skipped.
+        A report that the frame was refused as repeated ends the reports if it is the first report on the
+        command. After another report it means that a third party has replayed the frame, and it is skipped.
         """
         reported = False
         for _, packet in self.packets(seconds):

@@ -186,7 +186,7 @@ def camera_errors(run: Run) -> AttitudeErrors:
 
 
 def star_camera_knowledge(run: Run) -> Object | None:
-    """Return the rms error with stars and the NEES per axis of the star camera's attitude.
+    """Return rms error with stars and NEES (normalised squared error) of the star camera's attitude per axis.
 
     Returns None without description packets of the estimate and of the truth.
     """

@@ -213,7 +213,7 @@ def streaks(run: Run) -> Object:
 
     The errors are those of the camera's rate, so the true misalignment of a simulated camera does not count.
     A rate of unknown sign (status `ambiguous`) is counted, but has no error. `normalised` is the mean of e'
-    P^-1 e / 3 over the rates with a positive definite covariance P. The mean is 1 if the covariances are
+    P^-1 e / 3 over the rates with a positive definite covariance P. This mean is 1 if the covariances P are
     correct.
     """
     packets = run["streak"]

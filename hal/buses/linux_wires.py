@@ -33,8 +33,8 @@ from hal.buses.smbus_byte import I2C_TIMEOUT
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import SECOND_NS, Clock
 
-_READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port is to be closed
-_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; usually the kernel's buffer accepts a command at once
+_READ_TIMEOUT_S = 0.1  # longest time (s) until the thread notices that the port is to be closed
+_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; the kernel's buffer is rarely full
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 
@@ -63,9 +63,9 @@ class PySerialPort:
     ) -> None:
         """Open the port.
 
-        Raises NotResponding if the port cannot be opened. If `patient` is true, no error is raised: the port
-        counts as lost, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is
-        short enough for the thread that drives the coils.
+        Raises NotResponding if the port cannot be opened. If `patient` is true, a missing port raises no
+        error: the port counts as lost, and is opened later. A call of `send` takes at most `write_timeout`,
+        s; the default is short enough for the thread that drives the coils.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
@@ -130,7 +130,7 @@ class PySerialPort:
             return
         self._closing.set()
         with self._port_lock:
-            self._serial.cancel_read()  # this has no effect on a closed port
+            self._serial.cancel_read()  # has no effect on a port that is not open
         self._thread.join(timeout=2.0)
         self._serial.close()
         self._failure = self._failure or "the port was closed"
@@ -240,7 +240,7 @@ class LinuxI2cBus:
                 an error.
             exclusive: whether the bus is locked, so that two flight processes cannot drive the same coils.
 
-        Raises NotResponding if there is no such bus. Raises Refused if the permission to open the bus is
+        Raises NotResponding if the bus does not exist. Raises Refused if the permission to open the bus is
         missing or the adapter does not support block transfers.
         """
         if timeout_ns <= 0:
@@ -294,7 +294,7 @@ class LinuxI2cBus:
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+        """Write `data`, if any, and read `count` bytes, if any, after a repeated START."""
         messages = [i2c_msg.write(address, data)] if data or not count else []
         if count:
             messages.append(i2c_msg.read(address, count))
@@ -403,7 +403,10 @@ class LinuxSpiDevice:
             raise NotResponding(device, f"cannot be opened ({error.strerror}): {cure}") from error
 
     def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
-        """Send frames one after the other, and return the bytes received during each. Raises OSError."""
+        """Send frames one after the other, and return the bytes received during each frame.
+
+        Raises OSError.
+        """
         buffers = [(array("B", frame), array("B", bytes(len(frame)))) for frame in frames]
         request = SPI_MESSAGE | len(frames) * SPI_TRANSFER.size << 16
         calls = b"".join(
@@ -455,7 +458,7 @@ class LinuxWires:
         return self._ports[device]
 
     def i2c(self, bus: int | str | None = None) -> LinuxI2cBus:
-        """Return the I2C bus with a number or device file; None means the bus of the coils.
+        """Return the I2C bus with a number or device file, or for None the bus of the coils.
 
         Raises DeviceError.
         """

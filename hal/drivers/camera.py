@@ -124,7 +124,7 @@ class ServedCamera:
         self._ticker = clock.ticker(f"camera {device.name}", PERIOD_NS, self._serve)
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start one exposure now and abandon an exposure in progress. Raises NotResponding or OutOfRange."""
+        """Start one exposure, which replaces an exposure in progress. Raises NotResponding or OutOfRange."""
         self._device.check(exposure_ns)
         with self._lock:
             self._raise_failure()

@@ -12,15 +12,15 @@ zero. While zero is requested, the job writes zero in each period. Twice a secon
 and outputs back, and after a brown-out it configures the chip again. After any failure the job tries to write
 zero.
 
-Zero current is commanded by low levels at both inputs of all bridges, because the chip executes this message
-even without a configuration. If a leg of a bridge is stuck high, low inputs would drive current through the
-coil, so this bridge is braked (both inputs high) immediately afterwards.
+Zero current is commanded by low levels at both inputs of all bridges, because the chip executes a write to
+its register ALL_LED_OFF_H even without a configuration. If a leg of a bridge is stuck high, low inputs would
+drive current through the coil, so this bridge is braked (both inputs high) immediately afterwards.
 
 Instead of a PWM chip with H-bridges, bridges DRV8830 (TI SLVSAB2) with an I2C interface and a regulated
 output voltage can drive the coils, one bridge for each coil. The output voltage has 58 steps of 0.08 V, and
-no values between zero and 0.48 V. A periodic job therefore modulates the voltage: it writes the step nearest
-to the wanted voltage plus the accumulated error. To `PwmTorqueCoils`, which retries, checks and brakes, the
-bridges look like a PWM chip.
+no values between zero and 0.48 V. To produce the voltages between these steps on average, a periodic job
+writes the step nearest to the sum of requested voltage and accumulated error. The bridges have the interface
+of a PWM chip, so that `PwmTorqueCoils` performs retries, checks and braking.
 """
 
 from __future__ import annotations
@@ -83,7 +83,10 @@ def wirings(
     signs: Sequence[int],
     limits: Sequence[float],
 ) -> Wirings:
-    """Return the wiring of the coils from the attributes of each coil. Raises OutOfRange like CoilWiring."""
+    """Return the wiring of the coils from the attributes of each coil.
+
+    Raises OutOfRange under the same conditions as CoilWiring.
+    """
     return tuple(
         CoilWiring(a, b, ohm, sign, limit)
         for (a, b), ohm, sign, limit in zip(channels, resistance, signs, limits, strict=True)
@@ -429,7 +432,7 @@ class PwmTorqueCoils:
         self._wire = threading.RLock()
         self._serving = False
         self._served = -1  # number of the last written request
-        # Newest state, and the values from which it was made.
+        # Newest state of the driver, and the values of which this state consists.
         self._state: CoilState
         self._state_key: tuple[object, ...] = ()
 
@@ -453,8 +456,8 @@ class PwmTorqueCoils:
     def command(self, currents: FloatArray) -> None:
         """Request the current of each coil (n,), A, as `hal.interfaces.devices.TorqueCoils` describes.
 
-        A wrong shape has the effect of a value that is not finite. Raises Refused before `start` and after
-        `close`.
+        Currents of a wrong shape are handled like values that are not finite. Raises Refused before `start`
+        and after `close`.
         """
         values = np.asarray(currents, dtype=np.float64)
         problem = self._problem(values)
@@ -559,7 +562,7 @@ class PwmTorqueCoils:
         due = outputs.check_is_due()
         if number == self._served and any(counts) and not due and not outputs.failing:
             return
-        # The message `off` works in any state of the chip, so a failing chip receives it first.
+        # A failing chip is first set to zero, because this command works in any state of the chip.
         if outputs.failing and not self._try_zero():
             return
         try:
@@ -656,7 +659,7 @@ class Drv8830Bridges:
         return intact
 
     def holds(self, first: int, channels: Sequence[PwmCounts]) -> bool:
-        """Return whether the outputs from channel `first` on were written last and are intact.
+        """Return whether the outputs from channel `first` on were last set to `channels` and are intact.
 
         Raises NotResponding.
         """

@@ -4,8 +4,8 @@ The INA219 (TI SBOS448G) measures the coils' total current and voltage. The curr
 voltage divided by shunt resistance. The Calibration register of the chip is not used, because a brown-out
 clears the register. Each conversion averages 128 samples within 68 ms. Because 68 ms is not a multiple of the
 PWM period of 20 ms, a single conversion has an error of up to 18 %, and the mean of five conversions has an
-error of up to 7 %. The test of this driver computes these errors. A current outside the measuring range is
-reported as the limit of the range and marked as clipped.
+error of up to 7 %. The driver's test computes the errors of single conversions and of means. A current
+outside the measuring range is reported as the limit of the range and marked as clipped.
 
 An A/D converter ADS1115 (TI SBAS444) has four inputs. The current of a string flows through a shunt, whose
 voltage is amplified; the output voltage per current is `volt_per_ampere`. A periodic job reads the completed
@@ -104,7 +104,7 @@ def config_for(range_bits: int) -> int:
 class Ina219(PolledMonitor[PowerReading]):
     """Current monitor that a periodic job reads.
 
-    The job also configures it at the start and after a brown-out.
+    The job also configures the monitor at the start and after a brown-out.
     """
 
     def __init__(
@@ -283,8 +283,7 @@ class AdsSolarStrings(PolledMonitor[StringReading]):
                 with answering(f"ads1115 at 0x{address:02x}"):
                     self._bus.write_i2c_block_data(address, ADS1115_CONFIG, [word >> 8, word & 0xFF])
         except DeviceError as error:
-            # A reading contains all strings, so after a failure the measurement begins again at the first
-            # channel.
+            # A reading contains all strings, so a failed measurement is repeated from the first channel.
             self._step = -1
             with self._lock:
                 self._error = str(error)

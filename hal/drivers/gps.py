@@ -4,8 +4,8 @@ UBX is the binary protocol of u-blox receivers (u-blox M8 interface description,
 UBX frame consists of the bytes B5 62, class, identifier, length (little endian), payload and checksum. The
 checksum is an 8-bit Fletcher checksum over all bytes except the first two. One NAV-PVT message contains the
 time, position, velocity and accuracies of one epoch. For a u-blox receiver the NMEA protocol is not used,
-because it distributes these values over several sentences, usually rounds the position to 2 m, and lacks the
-vertical velocity.
+because NMEA distributes the values of a fix over several sentences, usually rounds the position to 2 m, and
+lacks the vertical velocity.
 
 A u-blox receiver loses its configuration at a power loss. The driver therefore requests NAV-PVT messages at
 the start, and again whenever no NAV-PVT has arrived for three seconds. Receivers with protocol version 27 or
@@ -17,10 +17,10 @@ rates, and switches a receiver that it finds to the configured baud rate. Consum
 above 18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
 
 A receiver with the driver `nmea` sends sentences by itself, about once a second. The sentence RMC contains
-date, time, ground speed and course, and GGA the position with altitude, quality and number of satellites. Two
-sentences RMC and GGA with the same time make a reading. NMEA does not provide a vertical velocity; the driver
-computes it from the altitudes of two fixes. NMEA does not provide an accuracy either; the driver reports the
-horizontal dilution of precision times an assumed range error.
+date, time, ground speed and course, and the sentence GGA contains the position with altitude, quality and
+number of satellites. Two sentences RMC and GGA with the same time make a reading. NMEA does not provide a
+vertical velocity; the driver computes it from the altitudes of two fixes. NMEA does not provide an accuracy;
+the driver reports the horizontal dilution of precision times an assumed range error.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ ACK_NAK, ACK_ACK = (0x05, 0x00), (0x05, 0x01)
 CFG_PRT, CFG_MSG, CFG_RATE, CFG_VALSET = (0x06, 0x00), (0x06, 0x01), (0x06, 0x08), (0x06, 0x8A)
 MON_VER = 0x0A, 0x04
 VALSET_PROTOCOL = 27.0
-"""First protocol version with CFG-VALSET."""
+"""Lowest u-blox protocol version that supports the command CFG-VALSET."""
 NAMES = {CFG_PRT: "CFG-PRT", CFG_MSG: "CFG-MSG", CFG_RATE: "CFG-RATE", CFG_VALSET: "CFG-VALSET"}
 UART1_BAUDRATE, UART1_IN_UBX, UART1_OUT_UBX, UART1_OUT_NMEA = 0x40520001, 0x10730001, 0x10740001, 0x10740002
 RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, PVT_ON_UART1 = 0x30210001, 0x30210002, 0x20210003, 0x20910007
@@ -117,7 +117,7 @@ class Pvt:
 
 
 def unpack_pvt(payload: bytes) -> Pvt:
-    """Return the content of a NAV-PVT payload of 92 bytes, or of 84 bytes, which is that of u-blox 7."""
+    """Return the content of a NAV-PVT payload of 92 bytes, or of 84 bytes from a u-blox 7."""
     old = len(payload) == OLD_PVT_LENGTH
     values = _PVT.unpack(payload.ljust(PVT_LENGTH, b"\0"))
     (_, year, month, day, hour, minute, second, valid, _, nano, fix, flags, _, satellites) = values[:14]

@@ -124,7 +124,7 @@ class Pca9685:
             self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))
 
     def all_off(self) -> None:
-        """Switch all outputs off, whatever the state of the chip. Raises NotResponding if it does not answer.
+        """Switch all outputs off, in any state of the chip. Raises NotResponding if the chip does not answer.
 
         One byte is written to the register ALL_LED_OFF_H, which works without any configuration of the chip.
         """

@@ -334,6 +334,6 @@ class Adis16470:
         return tuple((word - (word >> 31 << 32)) * step for word in words)
 
     def _read(self, registers: Sequence[int]) -> list[int]:
-        """Return the values of 16-bit registers, each in the frame after the register's request."""
+        """Return the values of 16-bit registers, each received in the frame after the register's request."""
         frames = self._device.transfer([bytes((register, 0)) for register in (*registers, 0)])
         return [int.from_bytes(frame, "big") for frame in frames[1:]]

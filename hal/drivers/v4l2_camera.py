@@ -74,7 +74,7 @@ _KINDS: dict[str, Any] = {
 
 
 def _fields(layout: str) -> list[tuple[str, Any]]:
-    """Return ctypes fields; a word `name:16c` is an array of a kind in `_KINDS`, a word `name` a c_uint32."""
+    """Return ctypes fields: `name:16c` is an array of 16 chars (kinds in `_KINDS`), `name` a c_uint32."""
     fields: list[tuple[str, Any]] = []
     for word in layout.split():
         name, _, kind = word.partition(":")
@@ -512,7 +512,7 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
 
 
 def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
-    """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange if this fails."""
+    """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange."""
     if device.control_range(AUTO_GAIN) is not None:
         device.set_control(AUTO_GAIN, 0)
     gain = settings.gain

@@ -373,8 +373,7 @@ _SOURCES = (
 )
 _TIMES = ("common.time_startup", "time.time_startup")
 
-# Index of the device time in a packet's values (None if the packet contains no time), and slices of
-# quaternion, rate, magnetic field and acceleration.
+# Index of the time in a packet's values (or None), and slices of quaternion, rate, field and acceleration.
 _Places = tuple[int | None, tuple[slice, slice, slice, slice]]
 # A sample contains device time (ns), quaternion, rate, magnetic field (gauss) and acceleration.
 _Sample = tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
@@ -401,7 +400,7 @@ class ReadingConverter:
         self.rejection = ""
         self._settings = settings
         rate_map, field_map, self._field_offset = settings.body_maps()
-        # This matrix maps a whole sample in one product: quaternion, rate, magnetic field and acceleration.
+        # One matrix maps all values of a sample: quaternion, rate, magnetic field and acceleration.
         self._map: FloatArray = np.zeros((13, 13))
         self._map[:4, :4] = settings.attitude_map
         self._map[4:7, 4:7] = rate_map

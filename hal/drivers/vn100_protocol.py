@@ -16,7 +16,7 @@ possible packet.
 
 The length of packets with unknown fields, for example of satellite navigation or firmware 3, is unknown.
 `StreamParser` counts such a packet if the bytes up to the next packet with the same header have a valid CRC.
-Such a packet shows that the baud rate is correct.
+A packet with unknown fields shows that the baud rate is correct.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
     `XX`.
     """
     text = line.rstrip(b"\r\n")
-    body, star, digits = text[1:].partition(b"*")  # a valid sentence contains exactly one star
+    body, star, digits = text[1:].partition(b"*")  # a valid sentence contains exactly one `*`
     if not (text.startswith(b"$VN") and star and body.isascii() and len(body) >= 5):
         return None
     checksum = _verify(body, digits, allow_none)

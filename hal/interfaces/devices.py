@@ -204,15 +204,15 @@ class CoilState:
     """State of the coil driver: newest command and last acknowledged output.
 
     Attributes:
-        command: (3,) requested currents, A.
-        current: (3,) currents written to the PWM chip, limited and rounded to PWM counts, A.
-        written_ns: host time at which these currents were first written, ns; -1 before the first write.
+        command: (n,) requested currents of the coils, A.
+        current: (n,) currents written to the PWM chip, limited and rounded to PWM counts, A.
+        written_ns: host time at which `current` was first written, ns; -1 before the first write.
         saturated: whether the current of any coil was limited.
         command_ns: host time of the newest command, ns; -1 before the first command.
         stale: whether the newest command was too old, so that the driver set the coils to zero.
         faults: number of failed bus transactions since start.
         error: text of the present failure, or an empty text if the last transaction succeeded.
-        braked: flags of the braked bridges, which have both inputs high so that no current flows even if a
+        braked: indices of the braked bridges, which have both inputs high so that no current flows even if a
             leg is stuck high.
     """
 

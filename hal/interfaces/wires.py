@@ -120,14 +120,17 @@ class RawI2cBus(I2cBus, Protocol):
     """I2C bus that also executes transactions without a register address."""
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+        """Write `data`, if any, and read `count` bytes, if any, after a repeated START."""
 
 
 class SpiDevice(Protocol):
     """One device on an SPI bus, which is selected by its chip select line during each frame."""
 
     def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
-        """Send frames one after the other, and return the bytes received during each. Raises OSError."""
+        """Send frames one after the other, and return the bytes received during each frame.
+
+        Raises OSError.
+        """
 
 
 class Wires(Protocol):
@@ -141,7 +144,7 @@ class Wires(Protocol):
         """Return the serial port of a device file. Raises NotResponding."""
 
     def i2c(self, bus: int | str | None = None) -> RawI2cBus:
-        """Return the I2C bus with a number or device file; None means the bus of the coils.
+        """Return the I2C bus with a number or device file, or for None the bus of the coils.
 
         Raises DeviceError.
         """
@@ -179,11 +182,11 @@ class Rig:
         latency: simulated latencies of planner and vision (ns), used in a lock-step simulation only.
         reach: how the guardian accesses the coils, used in real time only.
         host: simulated faults inside the flight process, or None.
-        cameras: emulated cameras, beginning with the star camera (None if not fitted); None for real cameras.
+        cameras: emulated cameras, first the star camera (None if not fitted), or None for real cameras.
         earliest_utc_ns: earliest possible UTC (ns since 1970) of the flight, which resolves the ambiguous
             week number of a GPS receiver.
         lateness: function that returns how often emulated devices in real time were later than `LATE_NS`, and
-            their largest lateness, s; None without emulated devices in real time.
+            their largest lateness, s, or None if no emulated devices run in real time.
     """
 
     clock: Clock
