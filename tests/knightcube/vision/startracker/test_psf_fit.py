@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.startracker import psf_fit
 from knightcube.vision.startracker.psf_fit import (
     NoiseModel,
+    StarTargets,
+    StarWindows,
     _noise_terms,
     _solve,
     cut,
+    fit,
     light,
     measure_noise,
+    neighbour_light,
+    neighbours,
     path,
+    profile,
     smoothed,
 )
 from tests.support.compiled_forms import assert_forms_agree
@@ -137,3 +146,234 @@ def test_the_compiled_noise_model_equals_that_in_numpy(photon: float, mismatch: 
     assert_forms_agree(
         _noise_terms, residual, np.full(light.shape, 0.2), light, noise, draw.random(light.shape) < 0.8
     )
+
+
+def test_the_profile_is_the_integral_of_a_gaussian_over_each_pixel() -> None:
+    offset, sigma, half = np.array([0.3, -1.2]), np.array([0.8, 1.4]), 6
+    share, by_offset, by_sigma = profile(offset, sigma, half)
+    pixel = np.arange(-6, 7)
+    for star in (0, 1):
+        upper, lower = ((pixel + side - offset[star]) / sigma[star] for side in (0.5, -0.5))
+        assert share[star] == pytest.approx(ndtr(upper) - ndtr(lower))
+    step = 1e-6
+    ahead, behind = (profile(offset + way * step, sigma, half)[0] for way in (1.0, -1.0))
+    assert by_offset == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-8)
+    ahead, behind = (profile(offset, sigma + way * step, half)[0] for way in (1.0, -1.0))
+    assert by_sigma == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-8)
+
+
+def test_a_path_is_sampled_with_the_moments_of_uniform_motion() -> None:
+    """The nodes have the moments of a uniform line: mean 0, variance L^2/12, fourth moment L^4/80."""
+    trail = np.array([[3.0, -1.0], [0.0, 2.0]])
+    shift, share = (np.array(each) for each in zip(*path(trail), strict=True))
+    assert share.sum() == pytest.approx(1.0)
+    assert np.tensordot(share, shift, 1) == pytest.approx(np.zeros((2, 2)), abs=1e-12)
+    assert np.tensordot(share, shift**2, 1) == pytest.approx(trail**2 / 12.0)
+    assert np.tensordot(share, shift**4, 1) == pytest.approx(trail**4 / 80.0)
+    # A path that is much shorter than a pixel is a point.
+    for short in (np.array([[0.9 * psf_fit._SHORTEST, 0.0]]), np.zeros((0, 2))):
+        ((only, whole),) = path(short)
+        assert whole == 1.0
+        assert only.shape == short.shape
+        assert not only.any()
+    assert len(path(np.array([[-1.1 * psf_fit._SHORTEST, 0.0]]))) > 1
+
+
+def test_the_image_of_a_moving_star_has_its_moments() -> None:
+    offset, sigma, trail = np.array([[0.4, -0.7]]), np.array([0.9]), np.array([[3.0, 1.0]])
+    image = light(offset, sigma, 9, trail)[0]
+    row, column = np.mgrid[-9:10, -9:10]
+    assert image.sum() == pytest.approx(1.0)
+    assert (np.sum(image * column), np.sum(image * row)) == pytest.approx((0.4, -0.7))
+    square = 0.9**2 + 1.0 / 12.0
+    assert np.sum(image * (column - 0.4) ** 2) == pytest.approx(square + 9.0 / 12.0, rel=1e-3)
+    assert np.sum(image * (row + 0.7) ** 2) == pytest.approx(square + 1.0 / 12.0, rel=1e-3)
+    assert np.sum(image * (row + 0.7) * (column - 0.4)) == pytest.approx(3.0 / 12.0, rel=1e-3)
+
+
+def test_targets_have_windows_around_their_own_or_other_pixels() -> None:
+    pixels = np.arange(400.0).reshape(20, 20)
+    trail = np.array([[0.0, 0.0], [2.0, 1.0]])
+    targets = StarTargets(
+        pixels,
+        np.array([[5, 6], [12, 9]]),
+        np.array([10.0, 20.0]),
+        np.ones(2),
+        300.0,
+        np.zeros(2),
+        trail,
+        1.1,
+    )
+    own, other = targets.windows(1), targets.windows(1, np.array([[3, 4], [7, 8]]))
+    assert own.light[1].tolist() == (pixels[8:11, 11:14] - 20.0).tolist()
+    assert other.light[0].tolist() == (pixels[3:6, 2:5] - 10.0).tolist()
+    assert other.middle.tolist() == [[3, 4], [7, 8]]
+    assert own.trail.tolist() == trail.tolist()
+    second = targets.select(np.array([False, True]))
+    assert len(targets) == 2
+    assert len(second) == 1
+    assert (second.level.tolist(), second.ceiling, second.correlation) == ([20.0], 300.0, 1.1)
+
+
+_NOISE = NoiseModel(photon=0.5, mismatch=0.02)
+_TRUE = np.array([[0.4, -0.3, 3000.0, 5.0, 1.1], [-0.2, 0.6, 800.0, -3.0, 1.4]])
+
+
+def _counts(values: FloatArray, trail: FloatArray, half: int = 5) -> FloatArray:
+    return np.asarray(light(values[:, :2], values[:, 4], half, trail) * values[:, 2, None, None])
+
+
+@pytest.mark.parametrize("free_width", [False, True])
+@pytest.mark.parametrize("length", [0.0, 2.5])
+def test_stars_without_noise_are_fitted_exactly(free_width: bool, length: float) -> None:
+    """The fit finds position, flux, sky and width, and the covariance of a linear fit at the solution.
+
+    The residuals of the fit are zero, and the leverages of all pixels add up to the number of parameters.
+    """
+    trail = np.array([[length, -0.5 * length]] * 2)
+    model = _counts(_TRUE, trail)
+    good = np.random.default_rng(4).random((2, 11, 11)) < 0.9
+    noise = np.array([6.0, 8.0])
+    windows = StarWindows(np.zeros((2, 2), np.int64), 5, model + _TRUE[:, 3, None, None], good, noise, trail)
+    width = _TRUE[:, 4] + (0.2 if free_width else 0.0)
+    found = fit(windows, _TRUE[:, :2] + [0.3, -0.4], 0.8 * _TRUE[:, 2], width, _NOISE, free_width, 12)
+    assert found.offset == pytest.approx(_TRUE[:, :2], abs=1e-6)
+    assert found.flux == pytest.approx(_TRUE[:, 2], rel=1e-6)
+    assert found.sky == pytest.approx(_TRUE[:, 3], abs=1e-4)
+    assert found.width == pytest.approx(_TRUE[:, 4], abs=1e-6)
+    assert found.chi2 == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert found.used.tolist() == np.count_nonzero(good, axis=(1, 2)).tolist()
+    assert found.model == pytest.approx(model, abs=1e-3)
+    assert found.residual == pytest.approx(np.zeros((2, 11, 11)), abs=1e-3)
+    variance = noise[:, None, None] ** 2 + 0.5 * model + (0.02 * model) ** 2
+    assert found.variance[good] == pytest.approx(variance[good], rel=1e-5)
+    assert np.all(np.isinf(found.variance[~good]))
+    assert not found.leverage[~good].any()
+    count = 5 if free_width else 4
+    assert found.leverage.sum(axis=(1, 2)) == pytest.approx([count] * 2, rel=1e-5)
+    for star in (0, 1):
+        rows = []
+        for place, step in enumerate((1e-5, 1e-5, 1e-2, 1e-4, 1e-5)[:count]):
+            moved = [_TRUE.copy(), _TRUE.copy()]
+            moved[0][star, place] += step
+            moved[1][star, place] -= step
+            ahead, behind = (_counts(each, trail)[star] + each[star, 3] for each in moved)
+            rows.append(((ahead - behind) / (2.0 * step))[good[star]])
+        change = np.array(rows)
+        covariance = np.linalg.inv((change / variance[star][good[star]]) @ change.T)
+        assert found.covariance[star] == pytest.approx(
+            covariance, rel=1e-3, abs=1e-4 * np.abs(covariance).max()
+        )
+
+
+def test_a_hot_pixel_is_excluded_from_the_fit() -> None:
+    trail = np.zeros((2, 2))
+    counts = _counts(_TRUE, trail) + _TRUE[:, 3, None, None]
+    counts[0, 2, 8] += 400.0
+    windows = StarWindows(
+        np.zeros((2, 2), np.int64), 5, counts, np.ones((2, 11, 11), dtype=np.bool_), np.full(2, 6.0), trail
+    )
+    found = fit(windows, _TRUE[:, :2], _TRUE[:, 2], _TRUE[:, 4], _NOISE, False, 6)
+    assert found.used.tolist() == [120, 121]
+    assert np.isinf(found.variance[0, 2, 8])
+    assert found.offset == pytest.approx(_TRUE[:, :2], abs=0.01)
+    part = found.select(np.array([1]))
+    assert part.flux.tolist() == [found.flux[1]]
+    both = found.replaced(np.array([0]), part)
+    assert both.flux.tolist() == [found.flux[1]] * 2
+    assert found.flux[0] == pytest.approx(3000.0, rel=0.01)
+    assert found.used.tolist() == [120, 121]
+
+
+def test_steps_of_the_fit_are_limited() -> None:
+    values = np.array([[0.0, 0.5, 100.0, 1.0, 1.2], [4.8, -4.9, 50.0, 0.0, 0.3]])
+    step = np.array([[3.0, -2.0, 900.0, -40.0, 2.0], [0.6, -0.6, 10.0, 5.0, -0.2]])
+    psf_fit._advance(values, step, 5)
+    longest, widest = psf_fit._LONGEST_STEP, psf_fit._WIDEST_STEP
+    assert values[0] == pytest.approx([longest, 0.5 - longest, 1000.0, -39.0, 1.2 + widest])
+    assert values[1] == pytest.approx([5.0, -5.0, 60.0, 5.0, psf_fit.NARROWEST])
+    fixed = np.array([[0.0, 0.0, 100.0, 1.0, 9.0]])
+    psf_fit._advance(fixed, np.array([[0.1, 0.2, 1.0, 1.0]]), 3)
+    assert fixed[0] == pytest.approx([0.1, 0.2, 101.0, 2.0, 3.0])
+
+
+def test_normal_matrices_of_different_units_are_inverted() -> None:
+    root = np.random.default_rng(3).normal(size=(4, 5, 9)) * np.array([1e3, 1e2, 1.0, 1e-3, 10.0])[:, None]
+    normal = root @ root.swapaxes(1, 2)
+    out = np.empty((5, 5))
+    for one, found in zip(normal, psf_fit._inverse(normal), strict=True):
+        assert found == pytest.approx(np.linalg.inv(one), rel=1e-5)
+        psf_fit._invert(np.tril(one), out)
+        assert out == pytest.approx(found, rel=1e-4)
+    assert psf_fit._inverse(np.zeros((1, 4, 4)))[0].shape == (4, 4)
+
+
+def test_the_terms_of_the_noise_are_not_negative() -> None:
+    """A least-squares fit with a negative coefficient is replaced by the better fit of a single term."""
+    light = np.array([1.0, 2.0, 5.0, 9.0])
+    of_light, of_both, of_square = (float(np.sum(light**power)) for power in (2, 3, 4))
+
+    def fitted(excess: FloatArray) -> tuple[float, float]:
+        along, across = float(excess @ light), float(excess @ light**2)
+        return psf_fit._non_negative(of_light, of_both, of_square, along, across)
+
+    assert fitted(3.0 * light + 0.5 * light**2) == pytest.approx((3.0, 0.5))
+    linear, bent = 3.0 * light - 0.1 * light**2, 2.0 * light**2 - 1.0 * light
+    assert fitted(linear) == pytest.approx((float(linear @ light) / of_light, 0.0))
+    assert fitted(bent) == pytest.approx((0.0, float(bent @ light**2) / of_square))
+    assert fitted(-light) == (0.0, 0.0)
+    same = np.full(4, 2.0)
+    sums = (float(np.sum(same**power)) for power in (2, 3, 4))
+    assert psf_fit._non_negative(*sums, 16.0, 32.0) == pytest.approx((1.0, 0.0))
+
+
+def test_the_mismatch_of_the_psf_is_the_median_over_the_stars() -> None:
+    """A star with light of a neighbour does not change the mismatch, which most stars have in common."""
+    rng = np.random.default_rng(7)
+    light, noise = rng.uniform(100.0, 900.0, (9, 5, 5)), np.full(9, 3.0)
+    variance = 9.0 + 0.25 * light + (0.04 * light) ** 2
+    residual = np.sqrt(0.8 * variance)
+    residual[2] *= 30.0
+    found = measure_noise(residual, variance, np.full(light.shape, 0.2), light, noise, 4.0)
+    assert found.photon == pytest.approx(0.25)
+    assert found.mismatch == pytest.approx(0.04, rel=1e-6)
+    # Pixels with little light, unused pixels, and pixels that the fit follows are not counted.
+    for spoilt in ("light", "variance", "leverage"):
+        values = {"light": light.copy(), "variance": variance.copy(), "leverage": np.full(light.shape, 0.2)}
+        off = residual.copy()
+        off[:, 2] = 1e4
+        values[spoilt][:, 2] = {"light": 1.4, "variance": np.inf, "leverage": 0.81}[spoilt]
+        again = measure_noise(off, values["variance"], values["leverage"], values["light"], noise, 4.0)
+        assert again.mismatch == pytest.approx(0.04, rel=1e-6)
+
+
+def test_stars_in_reach_of_a_window_are_neighbours() -> None:
+    """A neighbour is within the half-width of the window and three standard deviations of the PSF."""
+    points = np.array([[10.0, 10.0], [17.9, 10.0], [10.0, 18.1], [11.5, 12.0], [9.0, 9.0]])
+    flux = np.array([5.0, 4.0, 3.0, 2.0, 0.0])
+    pairs = neighbours(points, flux, 1.0, 5)
+    of_first = sorted(zip(pairs.first.tolist(), pairs.second.tolist(), strict=True))
+    assert [pair for pair in of_first if pair[0] == 0] == [(0, 1), (0, 3)]
+    assert [pair for pair in of_first if pair[0] == 4] == [(4, 0), (4, 3)]
+    assert not any(second == 4 for _, second in of_first)
+    assert pairs.overlap[0] == pytest.approx(np.exp(-(1.5**2 + 2.0**2) / 4.0))
+    assert pairs.overlap[1] == 0.0
+    assert pairs.overlap[4] == pytest.approx(np.exp(-2.0 / 4.0))
+    close = neighbours(points + np.array([[0.0], [0.0], [0.0], [-1.4], [0.0]]), flux, 1.0, 5)
+    assert close.overlap[0] == pytest.approx(psf_fit._MOST_OVERLAP)
+
+
+def test_the_light_of_neighbours_is_drawn_in_the_window_of_a_star() -> None:
+    middle, offset = np.array([[20, 30], [23, 28], [60, 60]]), np.array([[0.2, -0.3], [0.4, 0.1], [0.0, 0.0]])
+    flux, width = np.array([900.0, 400.0, 100.0]), np.array([1.0, 1.3, 1.0])
+    trail = np.array([[0.0, 0.0], [2.0, 1.0], [0.0, 0.0]])
+    pairs = neighbours(middle + offset, flux, 1.0, 4)
+    blank = np.zeros((3, 9, 9))
+    windows = StarWindows(middle, 4, blank, blank > 1.0, np.ones(3), trail)
+    found = neighbour_light(pairs, windows, middle, offset, flux, width)
+    place = np.array([[3.0 + 0.4, -2.0 + 0.1]])
+    assert found[0] == pytest.approx(400.0 * light(place, width[1:2], 4, trail[1:2])[0])
+    back = np.array([[-3.0 + 0.2, 2.0 - 0.3]])
+    # If any star moves, the paths of all stars are sampled.
+    assert found[1] == pytest.approx(900.0 * light(back, width[:1], 4)[0])
+    assert not found[2].any()
