@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,30 @@ from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.frame import Background, are_hot
+from knightcube.vision.startracker import survey as survey_module
 from knightcube.vision.startracker.detect import find_peaks
 from knightcube.vision.startracker.measurement import centre_of_mass
 from knightcube.vision.startracker.psf_fit import NoiseModel, cut, light, measure_noise, profile
 from knightcube.vision.startracker.survey import (
+    Areas,
+    DetectionSettings,
+    FrameKind,
     Surface,
+    _bright_indices,
     _smoothed_above,
     _smoothed_at,
+    cluttered,
+    correlation_of,
     find_areas,
     find_bright,
+    frame_shape,
+    in_counts,
+    is_streak,
     measure_sky,
+    one_sided,
     share_one_rotation,
+    survey,
+    without_hot_pixels,
 )
 from tests.knightcube.vision.startracker.spoilt_scenes import (
     found_boresight,
@@ -200,3 +214,235 @@ def test_the_compiled_smoothing_equals_that_in_numpy(
     assert_forms_agree(_smoothed_above, pixels, *limit.factors())
     row, column = np.arange(2, shape[0] - 1, 4), np.arange(2, shape[1] - 1, 4)
     assert_forms_agree(_smoothed_at, pixels, row, column)
+
+
+def test_integer_frames_are_kept_and_floating_frames_are_scaled_to_counts() -> None:
+    """The noise of a floating-point frame is scaled to 16 counts."""
+    whole = np.full((16, 16), 7, dtype=np.uint16)
+    kept, unit = in_counts(whole)
+    assert kept is whole
+    assert unit == 1.0
+    draw = np.random.default_rng(8)
+    frame = 0.4 + 0.003 * draw.normal(size=(200, 240))
+    scaled, unit = in_counts(frame)
+    assert unit == pytest.approx(0.003 / 16.0, rel=0.05)
+    assert scaled == pytest.approx(frame / unit, rel=1e-5)
+    assert scaled.dtype == np.float32
+    flat = np.zeros((16, 20))
+    flat[4, 4] = 5.0
+    assert in_counts(flat)[1] == pytest.approx(flat[::4, ::4].std() / 16.0)
+    assert in_counts(np.zeros((16, 16)))[1] == pytest.approx(1.0 / 16.0)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (np.zeros((15, 40), np.uint8), "(15, 40)"),
+        (np.zeros((16, 16, 3), np.uint8), "(16, 16, 3)"),
+        (np.zeros((16, 16), np.complex128), "complex128"),
+        (np.full((16, 16), np.nan), "not finite"),
+    ],
+)
+def test_a_frame_that_cannot_be_searched_is_refused(frame: FloatArray, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        in_counts(frame)
+
+
+def test_noise_of_neighbouring_pixels_may_be_correlated() -> None:
+    """The noise of the smoothed frame is six times that of a pixel, unless the noise is correlated."""
+    assert correlation_of(60.0, 10.0) == 1.0
+    assert correlation_of(40.0, 10.0) == 1.0
+    assert correlation_of(120.0, 10.0) == pytest.approx(2.0)
+    barely = survey_module._CORRELATED * 60.0
+    assert correlation_of(0.999 * barely, 10.0) == 1.0
+    assert correlation_of(1.001 * barely, 10.0) == pytest.approx(1.001 * survey_module._CORRELATED)
+
+
+def test_clipped_or_quantised_noise_is_unreliable() -> None:
+    """The lower tail of normal noise is two standard deviations long. That of clipped noise is shorter."""
+    limit = 2.0 * survey_module._CUT_OFF * 5.0
+    reach = np.array([10.0, 1.01 * limit, 0.99 * limit, 1.0, 1.0])
+    noise = np.array([5.0, 5.0, 5.0, 1.02 * survey_module._HIDDEN, 0.98 * survey_module._HIDDEN])
+    assert one_sided(reach, noise).tolist() == [False, False, True, False, True]
+
+
+def test_many_hot_pixels_are_replaced_and_few_are_kept() -> None:
+    frame = np.random.default_rng(9).normal(200.0, 5.0, (128, 160)).astype(np.uint16)
+    places = [(20, 30), (60, 100), (90, 41), (100, 120)]
+    for row, column in places:
+        frame[row, column] = 5000
+    same, _ = without_hot_pixels(frame, 4)
+    assert same is frame
+    repaired, background = without_hot_pixels(frame, 3)
+    assert np.count_nonzero(repaired != frame) == 4
+    for row, column in places:
+        beside = np.delete(frame[row - 1 : row + 2, column - 1 : column + 2].reshape(-1), 4)
+        assert repaired[row, column] == int(np.median(beside))
+    assert frame[20, 30] == 5000
+    assert background.noise == pytest.approx(np.full_like(background.noise, 5.0), rel=0.25)
+
+
+def test_bright_pixels_are_compared_with_the_threshold_of_their_block() -> None:
+    """Rows and columns beyond the last whole block belong to the last blocks."""
+    pixels = np.random.default_rng(2).integers(0, 100, (23, 31)).astype(np.uint16)
+    lowest = np.array([[50, 70, 90], [20, 97, 60]], dtype=np.uint16)
+    expected = []
+    for row, column in np.ndindex(23, 31):
+        if pixels[row, column] >= lowest[min(row // 11, 1), min(column // 10, 2)]:
+            expected.append(row * 31 + column)
+    assert _bright_indices(pixels, lowest).tolist() == expected
+    assert_forms_agree(_bright_indices, pixels, lowest, compiled=False)
+
+
+def _areas(**changed: FloatArray) -> Areas:
+    """Return ten areas, of which the first seven are streaks along one direction and the others points."""
+    n = 10
+    values: dict[str, Any] = {
+        "pixels": np.full(n, 20),
+        "flux": np.linspace(1000.0, 100.0, n),
+        "centre": np.random.default_rng(3).uniform(50.0, 400.0, (n, 2)),
+        "length": np.where(np.arange(n) < 7, 20.0 + np.arange(n), 1.0),
+        "thickness": np.full(n, 1.2),
+        "direction": np.full(n, 0.5),
+    }
+    values |= changed
+    pixel = np.zeros(0, np.int64)
+    none = np.zeros(0, dtype=np.bool_)
+    return Areas(pixel, pixel, pixel, np.zeros(0), none, none, np.inf, **values, shape=(480, 480))
+
+
+def test_a_frame_of_long_parallel_areas_is_one_of_streaks() -> None:
+    areas = _areas()
+    assert is_streak(areas).tolist() == [True] * 7 + [False] * 3
+    found = frame_shape(areas)
+    assert found.kind is FrameKind.STREAKS
+    assert found.length == 23.0
+    # Three streaks are too few.
+    few = _areas(length=np.where(np.arange(10) < 3, 20.0, 1.0))
+    assert frame_shape(few).kind is FrameKind.POINTS
+    assert frame_shape(few).length == 1.0
+    four = _areas(length=np.where(np.arange(10) < 4, 20.0, 1.0))
+    assert frame_shape(four).kind is FrameKind.STREAKS
+    # Areas in all directions do not follow one rotation of the camera.
+    crossed = _areas(direction=np.array([0.0, 1.5, 0.7, 2.2, 0.3, 1.1, 2.8, 0.0, 0.0, 0.0]))
+    assert frame_shape(crossed).kind is FrameKind.POINTS
+    alone = _areas(length=np.full(10, 20.0), direction=np.arange(10) * 1.3)
+    assert frame_shape(alone).kind is FrameKind.NEITHER
+    assert frame_shape(alone).length == 0.0
+    # Small or thick areas are not classified.
+    small = _areas(pixels=np.where(np.arange(10) < 5, 3, 20))
+    assert frame_shape(small).kind is FrameKind.POINTS
+    thick = _areas(thickness=np.where(np.arange(10) < 5, 6.1, 1.2), length=np.full(10, 30.0))
+    assert frame_shape(thick).length == 30.0
+    all_thick = _areas(thickness=np.full(10, 6.1), length=np.full(10, 30.0))
+    assert frame_shape(all_thick).kind is FrameKind.NEITHER
+
+
+def test_an_area_is_a_streak_if_it_is_long_and_thin() -> None:
+    length = np.array([4.9, 5.1, 10.4, 10.6])
+    areas = _areas(
+        length=length,
+        thickness=np.array([1.0, 1.0, 3.0, 3.0]),
+        pixels=np.full(4, 9),
+        flux=np.ones(4),
+        centre=np.zeros((4, 2)),
+        direction=np.zeros(4),
+    )
+    assert is_streak(areas).tolist() == [False, True, False, True]
+
+
+def test_places_among_many_bright_pixels_are_cluttered() -> None:
+    """A block of 32 x 32 px, on either of two grids along each axis, is cluttered by its bright pixels."""
+    row, column = np.mgrid[48:64, 80:96].reshape(2, -1)
+    areas = _areas()
+    bright = Areas(
+        *(row, column, 0 * row, np.ones(256), row < 0, row < 0, np.inf),
+        *(areas.pixels, areas.flux, areas.centre, areas.length, areas.thickness, areas.direction),
+        shape=(200, 300),
+    )
+    place = np.array([[85, 50], [70, 40], [110, 78], [64, 79], [63, 50], [112, 50], [85, 80], [85, 31]])
+    assert cluttered(bright, place, 0.2).tolist() == [True] * 4 + [False] * 4
+    assert cluttered(bright, place, 0.2501).tolist() == [False] * 8
+    assert cluttered(bright, place[:1], 0.2499).tolist() == [True]
+
+
+def test_areas_have_the_moments_of_their_light() -> None:
+    """An area has the flux, the centroid and the length of its star or streak, and its peaks."""
+    frame = np.full((120, 160), 100.0)
+    time = np.linspace(-0.5, 0.5, 200)[:, None]
+    frame += integrated_by_brute_force((120, 160), np.array([40.3, 60.7]) + 0.0 * time, 40000.0, 1.2)
+    frame += integrated_by_brute_force(
+        (120, 160), np.array([110.2, 50.4]) + time * [16.0, 12.0], 60000.0, 1.2
+    )
+    noisy = np.rint(frame + np.random.default_rng(5).normal(0.0, 2.0, frame.shape)).astype(np.uint16)
+    found = survey(noisy, DetectionSettings(saturation=60_000.0, threshold_sigmas=3.0))
+    areas, order = found.areas, np.argsort(-found.areas.flux)[:2]
+    assert areas.flux[order] == pytest.approx([60000.0, 40000.0], rel=0.02)
+    assert areas.centre[order] == pytest.approx(np.array([[110.2, 50.4], [40.3, 60.7]]), abs=0.05)
+    assert areas.length[order] == pytest.approx([20.0, 0.0], abs=1.0)
+    assert areas.thickness[order] == pytest.approx(np.hypot([1.2, 1.2], 0.29), rel=0.1)
+    assert areas.direction[order[0]] == pytest.approx(np.arctan2(12.0, 16.0), abs=0.01)
+    assert areas.pixels[order].tolist() == [np.count_nonzero(areas.owner == area) for area in order]
+    assert not areas.saturated.any()
+    star = areas.owner == order[1]
+    assert areas.peak[star].sum() == 1
+    assert (areas.column[star & areas.peak][0], areas.row[star & areas.peak][0]) == (40, 61)
+    # The kernel [1 2 1] and the pixels widen the variance of the image by 1/2 and 1/12.
+    wide = 1.2**2 + 0.5 + 1.0 / 12.0
+    top = 16.0 * 40000.0 / (2.0 * np.pi * wide) * np.exp(-0.5 * (0.3**2 + 0.3**2) / wide)
+    assert areas.smooth[star].max() == pytest.approx(top, rel=0.04)
+    saturated = survey(noisy, DetectionSettings(saturation=1500.0)).areas
+    assert saturated.saturated.sum() == np.count_nonzero(noisy >= 1500)
+    assert saturated.ceiling == 1500.0
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("threshold_sigmas", (1.0, 100.0), (0.99, 101.0)),
+        ("most_stars", (1, 10_000), (0, 10_001)),
+        ("psf_sigma", (0.3, 6.0), (0.29, 6.1)),
+        ("gain", (1e-6, 1e6), (0.0, 1.1e6)),
+        ("saturation", (1e-6, 1e9), (0.0, 1.1e9)),
+        ("search_radius", (1.0, 50.0), (0.9, 51.0)),
+        ("window", (5, 31), (3, 6, 33)),
+        ("method", ("psf", "iterative"), ("centre",)),
+    ],
+)
+def test_settings_outside_their_range_are_refused(
+    name: str, good: tuple[Any, ...], bad: tuple[Any, ...]
+) -> None:
+    for value in good:
+        assert getattr(DetectionSettings(**{name: value}), name) == value
+    for value in bad:
+        with pytest.raises(ValueError, match=f"{name} = {value!r}"):
+            DetectionSettings(**{name: value})
+
+
+def test_settings_are_converted_to_the_unit_of_a_frame() -> None:
+    """Counts are divided by the unit, and electrons per count are multiplied by the unit."""
+    stated = DetectionSettings(gain=2.0, saturation=60.0, psf_sigma=1.1).in_units_of(0.5)
+    assert (stated.gain, stated.saturation, stated.psf_sigma) == (1.0, 120.0, 1.1)
+    unknown = DetectionSettings().in_units_of(0.5)
+    assert (unknown.gain, unknown.saturation) == (None, None)
+
+
+def test_the_sky_is_measured_before_and_after_smoothing() -> None:
+    """White noise is multiplied by 6 and the level by 16; correlated noise is larger in sums of pixels.
+
+    The noise of a sky that is clipped at zero counts is that of its upper half.
+    """
+    draw = np.random.default_rng(12)
+    white = draw.normal(0.0, 8.0, (256, 260))
+    correlated = ndimage.correlate(white, np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0])) / 6.0
+    for frame, ratio in ((white, 1.0), (correlated, 6.0 * 70.0 / 36.0**1.5)):
+        sky = measure_sky(np.rint(100.0 + frame).astype(np.uint16))
+        assert sky.level.at(100.0, 80.0) == pytest.approx(100.0, abs=1.0)
+        assert sky.smooth_level.at(100.0, 80.0) == pytest.approx(1600.0, abs=25.0)
+        assert sky.noise.at(100.0, 80.0) == pytest.approx(8.0, rel=0.1)
+        assert sky.pixel_noise.at(100.0, 80.0) == pytest.approx(8.0, rel=0.1)
+        assert sky.smooth_noise.at(100.0, 80.0) == pytest.approx(48.0 * ratio, rel=0.15)
+        assert sky.correlation == pytest.approx(ratio, rel=0.1)
+    clipped = measure_sky(np.clip(np.rint(2.0 + white), 0.0, None).astype(np.uint16))
+    assert clipped.pixel_noise.at(100.0, 80.0) == pytest.approx(8.0, rel=0.35)
+    assert clipped.pixel_noise.values == pytest.approx(clipped.noise.values)
