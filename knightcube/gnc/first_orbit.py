@@ -39,8 +39,9 @@ def smoothed(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the states (n, 6) of the orbit that best fits measured positions.
 
-    The covariance (6, 6) of the state at the instant `middle` is returned too. The standard deviation of each
-    position is `sigma` (n,), m, along each axis. The velocities of `states` are only the initial guess.
+    The function also returns the covariance (6, 6) of the state at the instant `middle`. The standard
+    deviation of each position is `sigma` (n,), m, along each axis. The velocities of `states` are only the
+    initial guess.
     """
     state = states[middle]
     covariance = np.eye(6)
@@ -109,8 +110,8 @@ _LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
 diverging."""
 _ROUNDS, _FINAL_ROUNDS = 6, 20
 _MISFIT = 1e-6
-"""Smallest accepted probability of the chi-square of a fit. A smaller probability means that the object is
-not in free fall or that the sightings have larger errors than stated."""
+"""Smallest accepted probability of the chi-square of a fit. A smaller probability indicates that the object
+is not in free fall, or that the sightings have larger errors than their standard deviations."""
 
 
 class ArcError(FlightError):
@@ -147,7 +148,7 @@ class FirstOrbit:
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
         lasts: whether the orbit `state`, the most likely one, is bound to the Earth and does not hit the
-            Earth. If not, another orbit with a distance in `interval` satisfies both conditions.
+            Earth. Otherwise, another orbit with a distance in `interval` satisfies both conditions.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """

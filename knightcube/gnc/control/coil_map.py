@@ -2,12 +2,12 @@
 
 Column k of the matrix D (3, n) is the dipole moment of coil k per ampere, so the currents i produce the
 dipole moment D i. If a satellite has more than three coils, different currents can produce the same dipole
-moment. Of all possible currents, those with the least heat i' R i are used, where R is the diagonal matrix of
-the coils' resistances. Without current limits, the currents of least heat for a dipole moment m are P m, with
-the weighted pseudo-inverse P of D. If the current of a coil in P m exceeds its limit, the other coils produce
-the remainder of the dipole moment. Control laws and planners need only dipole moments in body axes and one
-limit per body axis. The limits per body axis define the largest box of dipole moments that the coils can
-produce. The heating power of a dipole moment m is m' H m with H = P' R P.
+moment. Of all possible currents i, the currents with the least heat i' R i are used, where R is the diagonal
+matrix of the coils' resistances. Without current limits, the currents of least heat for a dipole moment m are
+P m, with the weighted pseudo-inverse P of D. If an element of P m exceeds the current limit of its coil, the
+other coils produce the remainder of the dipole moment. Control laws and planners need only dipole moments in
+body axes and one limit per body axis. The limits per body axis define the largest box of dipole moments that
+the coils can produce. The heating power of a dipole moment m is m' H m with H = P' R P.
 
 A dipole moment m causes the torque m x B, which has no component along the field B (Wertz 1978, section
 18.1). For three equal coils, the smallest dipole moment that produces a torque T normal to B is B x T / B^2.
@@ -47,7 +47,7 @@ limit."""
 _WEAKEST = 0.15
 """Torque per unit current below which a torque direction is discarded, relative to the direction with the
 largest torque per unit current. A torque in a discarded direction would need the full current, and scaling
-would then reduce the torque in the other directions."""
+all currents to the limit would then reduce the torque in the other directions."""
 
 
 def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None) -> FloatArray:
@@ -127,16 +127,16 @@ class CoilMap:
 
     @property
     def is_redundant(self) -> bool:
-        """Whether different currents can produce the same dipole moment."""
+        """Whether more than one set of currents can produce the same dipole moment."""
         return len(self.current_limits) > 3
 
     def working(self, used: BoolArray, assumed: float = 0.5) -> CoilMap:
         """Return the map of the coils `used` (n,), with the limits and the heating power of these coils.
 
-        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed, with
-        the dipole moment `assumed` as a fraction of that of the weakest coil. To produce the same torque
-        without a dipole moment along the normal, the allocation adds a dipole moment along the magnetic
-        field, which causes no torque. Raises UsageError if all working coils are parallel.
+        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed,
+        whose dipole moment is the fraction `assumed` of the weakest coil's dipole moment. To produce the same
+        torque without a dipole moment along the normal, the allocation adds a dipole moment along the
+        magnetic field, which causes no torque. Raises UsageError if all working coils are parallel.
         """
         if used.all():
             return self
@@ -170,7 +170,8 @@ class CoilMap:
 
         By duality, the currents are R^-1 D' y, clipped to the limits, for a vector y (3,) of Lagrange
         multipliers. The multipliers maximise a concave function, whose gradient is the difference between the
-        wanted and the produced dipole moment. They are found by Newton's method with a line search.
+        requested and the produced dipole moment. The multipliers are found by Newton's method with a line
+        search.
         """
         limits, resistance = self.current_limits, self.resistance
 
@@ -196,7 +197,7 @@ class CoilMap:
         return held
 
     def linear_shares(self, used: BoolArray) -> FloatArray:
-        """Return the matrix (n, n) that converts currents to those of least heat with the same dipole moment.
+        """Return the matrix (n, n) from any currents to the currents of least heat with equal dipole moment.
 
         Only the coils marked in `used` (n,) carry the currents of least heat, which depend linearly on the
         given currents because current limits are ignored.
@@ -212,7 +213,7 @@ class CoilMap:
         return np.asarray(self.dipoles @ currents)
 
     def per_dipole(self, matrix: FloatArray) -> FloatArray:
-        """Return derivatives (k, 3) with respect to the dipole from those with respect to currents (k, n)."""
+        """Convert derivatives (k, n) by currents to derivatives (k, 3) by the dipole moment."""
         if self._strength is not None:
             return np.asarray(matrix / self._strength)
         return np.asarray(matrix @ self._inverse)

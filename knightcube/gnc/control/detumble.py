@@ -33,7 +33,7 @@ _NO_CURRENT: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True)
 class WindowSchedule:
-    """Durations (ns) of the phases of a window: settle and measure (coils off), and act (coils driven)."""
+    """Durations (ns) of the phases of a window: settle and measure (coils off), act (coils on)."""
 
     settle_ns: int
     measure_ns: int
@@ -50,10 +50,10 @@ class WindowSchedule:
         return self.settle_ns + self.measure_ns + self.act_ns
 
     def calm(self, begin_ns: int, length_ns: int) -> int:
-        """Return the first time (ns) from `begin_ns` on after which the coils do not switch for `length_ns`.
+        """Return the first time (ns) from `begin_ns` after which no coil switches for `length_ns`.
 
-        Windows follow each other without gaps from time zero. If neither the pause nor the driven phase is
-        long enough, the result is `begin_ns`.
+        Windows follow each other without gaps from time zero. If neither the phase with coils off nor the
+        phase with coils on is long enough, the result is `begin_ns`.
         """
         phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
         later_ns = self.period_ns + pause_ns
@@ -156,7 +156,7 @@ class Detumbler:
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # the sample is too late: the mean field of its window is already computed
+            return  # the mean field of this window is already computed
         if window != self._window:
             self._samples.clear()
             self._window = window
@@ -199,5 +199,5 @@ class Detumbler:
         self._rate = None
         if self._before is not None:
             span_ns = time_ns - self._before[0]
-            if span_ns < 2 * self._schedule.period_ns:  # a window without samples gives no rate
+            if span_ns < 2 * self._schedule.period_ns:  # without samples, the rate is unknown
                 self._rate = rate_across(self._before[1], field, span_ns * _SECOND)

@@ -6,14 +6,14 @@ estimated rate is uncertain. The filter `knightcube.gnc.estimation.field_rate` u
 pauses to estimate all components of the body rate and the rotation of the field in inertial axes. A gyro
 sample shows the rate along the field immediately.
 
-The momentum plan uses a predicted field: along the orbit, if it is known, and rotated so that direction and
-change agree with the measured field if the attitude is unknown. Without a known orbit, the measured field is
-assumed to continue to rotate at the present rate. In an orbit near the equator, however, the field's
-direction only oscillates by some 20 deg. In contrast to B-dot control, this detumbler also removes a spin
-along the field as soon as the field has rotated. The coils stay off until `TRUSTED` consecutive samples, also
-from outside the pauses, agree with the prediction of the filter and the standard deviation of the rate across
-the field is below `BOUNDED`. The coils are switched off again if no sample was accepted for `SILENT_PERIODS`
-periods, because a restarted sensor may give only unusable fields.
+The momentum plan uses the field predicted along the orbit, if the orbit is known. If the attitude is unknown,
+the predicted field is rotated so that its direction and change agree with the measured field. Without a known
+orbit, the measured field is assumed to continue to rotate at the present rate. In an orbit near the equator,
+however, the field's direction only oscillates by some 20 deg. In contrast to B-dot control, this detumbler
+also removes a spin along the field as soon as the field has rotated. The coils stay off until `TRUSTED`
+consecutive samples, also from outside the pauses, agree with the prediction of the filter and the standard
+deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no sample was
+accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
 
 The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
 obeys h' = m x B, where m is the dipole moment and B the field, with neither inertia nor attitude. By
@@ -25,22 +25,22 @@ and only if every vector y satisfies the inequality
 
 The minimum time is the smallest T for which every vector y satisfies this inequality, and the planned costate
 is the vector y for which both sides are equal. For this costate, A(y) y is parallel to h, where A is the
-integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. It is found by iteratively reweighted least squares: in
-each iteration, A is computed with the last costate, and the next costate from A. Momentum along the field can
-be removed only after the field has rotated, so the plan may first add momentum across the field. The plan
-leaves a residual momentum r, because the removal of the last momentum along a slowly rotating field would
-take most of the time.
+integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The costate is found by iteratively reweighted least
+squares: in each iteration, A is computed with the last costate, and the next costate from A. Momentum along
+the field can be removed only after the field has rotated, so the plan may first add momentum across the
+field. The plan leaves a residual momentum r, because the removal of the last momentum along a slowly rotating
+field would take most of the time.
 
 If a body spins along the field, the minimum-time plan first accelerates the body about an axis across the
-field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy,
-at which the commanded dipole moment does not increase them. If the bounds equal the initial values,
-detumbling takes longer, because a spin along the field is then stopped only after the field has rotated by a
-right angle.
+field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy.
+At a bound, the commanded dipole moment does not increase the rate or the energy. If the bounds equal the
+initial rate and energy, detumbling takes longer, because a spin along the field is then stopped only after
+the field has rotated by a right angle.
 
 The magnetometer alone shows the rate along the field only after the field has rotated. Until all components
-of the rate are known, the coils therefore do no positive work. The work depends on the rate across the field,
-but neither on the rate along the field nor on the inertia tensor. Without a torque, the rate of a body with
-unequal moments of inertia changes, but its kinetic energy does not.
+of the rate are known, the coils therefore do no positive work. The work of the coils depends on the rate
+across the field, but neither on the rate along the field nor on the inertia tensor. Without a torque, the
+rate of a body with unequal moments of inertia changes, but its kinetic energy does not.
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ LIMIT_GAIN = 1.5
 """Mean dipole moment of three saturated coils along a direction, averaged over all directions and relative to
 the mean limit of the body axes."""
 STEEP = 12.0
-"""Gain of the dipole moment: a coil reaches the dipole limit where |B x y| (field B, costate y) exceeds its
-mean divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then
-reverse the coil currents wherever B x y is small."""
+"""Gain of the dipole moment: a coil reaches the dipole limit if |B x y| (field B, costate y) exceeds the mean
+of |B x y| divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would
+then reverse the coil currents wherever B x y is small."""
 FLAT = 0.02
 """Lower bound of |B x y| (field B, costate y), relative to its largest value, which keeps the weights of the
 iteration finite."""
 FINENESS = 60
-"""Resolution of the search for the minimum time, as the number of steps into which that time is divided."""
+"""Number of steps into which the search for the minimum time divides the minimum time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +79,7 @@ class MomentumPlan:
 
     Attributes:
         costate: scaled costate y (3,), inertial axes, A m^2/T, which is zero for a body at rest. The
-            commanded dipole moment is -B x costate, clipped at the limit of each coil.
+            commanded dipole moment in the field B is -B x y, clipped at the limit of each coil.
         horizon: time until the body is at rest, s.
     """
 
@@ -192,11 +192,11 @@ def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
 def aligned_to_change(
     fields: FloatArray, times: FloatArray, field: FloatArray, change: FloatArray
 ) -> FloatArray:
-    """Return `fields` (n, 3) in the axes in which the present field and its change are known.
+    """Return `fields` (n, 3), rotated to the direction and the change of the present field.
 
-    The fields are predicted after `times` (n,), s, in any inertial axes. The first field of the result has
-    the direction of `field` (3,), and the following fields rotate in the direction of the time derivative
-    `change` (3,).
+    The fields are predictions for `times` (n,), s from now, in any inertial axes. The first field of the
+    result has the direction of `field` (3,), and the following fields rotate in the direction of the time
+    derivative `change` (3,).
     """
     soon = min(int(np.searchsorted(times, CHANGED)), len(times) - 1)
     predicted = _axes(fields[0], fields[soon] - fields[0])
@@ -243,7 +243,7 @@ class _FieldPreview:
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return the matrix A(y) (3, 3) that gives the next costate, for the first `count` instants."""
+        """Return A(y) (3, 3), from which the next costate follows, for the first `count` instants."""
         weight = self.reach / self.across(y, count)
         return np.asarray((weight @ self.effect[:count]).reshape(3, 3) + self.rest * _IDENTITY)
 
@@ -271,13 +271,14 @@ SHORTEST = 9
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 CHANGED = 30.0
-"""Time (s) over which the change of a predicted field is compared with that of the measured field."""
+"""Time (s) over which the change of a predicted field is compared with the change of the measured field."""
 STRENGTH = 0.2
-"""Relative difference between predicted and measured field strength above which the orbit counts as wrong."""
+"""Difference between predicted and measured field strength above which the orbit counts as wrong, as a
+fraction of the measured strength."""
 INSTANTS = 150
 DENSER = 1.5
 """Exponent of the power law that makes the times of the field prediction denser at the start. For a
-prediction over 1,500 s, the first time step is 1 s and the last 15 s."""
+prediction over 1,500 s, the first time step is 1 s and the last time step 15 s."""
 LEFT = 0.9
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
@@ -387,7 +388,8 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,), T, measured at `time_ns`, or ignore it if the coils disturbed the measurement.
 
-        A gyro measured the rate (3,), rad/s, with the field. The sample may be older than the last command.
+        The argument `rate` (3,), rad/s, is the gyro rate measured at the same time, or None. The sample may
+        be older than the last command.
         """
         age_ns = self._time_ns - time_ns
         if not self.listens(time_ns) or age_ns > OLDEST_NS:
@@ -416,7 +418,7 @@ class FieldDetumbler:
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole moment (3,), A m^2: zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
-        if self._filter.started:  # before the filter starts, only samples advance its time
+        if self._filter.started:  # before its start, only samples advance the filter's time
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
@@ -496,7 +498,7 @@ class FieldDetumbler:
             self._initial_known = True
             multiple = braking.spin_up if speed > braking.gentle else 1.0
             self._fastest, self._most_energy = multiple * speed, multiple * multiple * energy
-        # Each bound is compared with a value that is one standard deviation of the rate above the estimate.
+        # Each bound is compared with the estimate plus one standard deviation of the rate.
         upper = speed + sigma
         grows = [works] if energy * upper**2 >= self._most_energy * speed**2 else []
         if upper >= self._fastest:

@@ -2,8 +2,8 @@
 
 The tracker applies feedback linearisation to the attitude error and then a linear-quadratic regulator (Sease
 2013, eqs. (5.16) to (5.32)). The error is e = sin(d), d = theta_p - theta (Sease, eq. (5.21)), where theta_p
-is the angle of the path and theta the angle of the body. Its derivatives (Sease, eqs. (5.24) to (5.27),
-corrected) are
+is the angle of the path and theta the angle of the body. The derivatives of the error (Sease, eqs. (5.24) to
+(5.27), corrected) are
 
     e'  = cos(d) (theta_p' - w)
     e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2.
@@ -13,12 +13,12 @@ solved for the angular acceleration w', and the plant model converts w' into the
 
 The tracker extends the controller of Sease's thesis by two features, which the option `as_in_thesis` switches
 off. The first feature is a feedforward of the estimated disturbance, so that a constant torque causes no
-offset. The estimator integrates the acceleration that the plant model did not predict, without windup,
-because it uses the limited current. The second feature limits the rate at which an angle error is reduced, so
-that the coil can decelerate the body in time and the angle does not overshoot. Small errors are reduced at
-the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is
-the available deceleration. The rate limit is that of the proximate time-optimal servomechanism (Workman
-1987), but with a continuous slope.
+offset. The estimator integrates the difference between actual and modelled acceleration. The model uses the
+limited current, so the integral does not wind up. The second feature limits the rate at which an angle error
+is reduced, so that the coil can decelerate the body in time and the angle does not overshoot. Small errors e
+are reduced at the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate sqrt(2 A |e| - (A /
+s)^2), where A is the available deceleration. The rate limit is that of the proximate time-optimal
+servomechanism (Workman 1987), but with a continuous slope.
 
 The error e = sin(d) is monotonic in d only up to 90 degrees. The angle error d is therefore clamped to
 `largest_error`, so that the demanded acceleration stays bounded and does not decrease for larger errors.
@@ -28,7 +28,7 @@ and back, and the torque constant and the delay are identified from the response
 body, which then oscillates with the coils off, and stiffness and damping are identified from the oscillation.
 All pulses are repeated with the opposite sign. Before and between manoeuvres, the tracker brings the body to
 rest. The tracker also replaces a manoeuvre if the body could otherwise not be stopped within the allowed
-angle. If it cannot bring the body to rest, the current stays zero.
+angle. If the tracker cannot bring the body to rest, the current stays zero.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class CurrentCommand:
 
 
 class AngleController(Protocol):
-    """Controller interface: computes a coil current from commanded and estimated motion in each cycle."""
+    """Interface of a controller, which computes a coil current from commanded and estimated motion."""
 
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
@@ -205,7 +205,7 @@ _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
 _TIMEOUT = 60.0
-_REACH = 0.45  # modelled amplitude relative to the angle bound; the true amplitude may be 1.4 times as large
+_REACH = 0.45  # modelled amplitude divided by the angle bound; the true amplitude may be 1.4 times as large
 _WEAK = 0.7  # fraction of the modelled torque that is assumed to be available for braking
 _SHORT_PULSE = 1.0
 

@@ -2,7 +2,7 @@
 
 Field and torques are predicted along the orbit for a revolution and a quarter, because the gains at the end
 of the table depend on the following revolution. The pointing table covers a third of a revolution of the
-orbit. A passing object is near only for some minutes, so pointing tables for an object are short, have short
+orbit. A passing object is near for only a few minutes, so pointing tables for an object are short, have short
 time steps, and are recomputed after each sighting.
 
 From a distant attitude, the body can approach the commanded attitude by a slew of minimum heat. The module
@@ -72,7 +72,7 @@ PlanNear = Callable[[SlewTask, SlewPath], SlewPlan | None]
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Ratio of a dipole moment during a slew to the dipole moment that has the same cost at other times."""
+"""Factor by which a dipole moment during a slew must be larger to have the same cost as at other times."""
 LONGEST = 1_500.0
 """Longest duration of a slew, s. A slew must be shorter than a table, which also includes some time after the
 slew."""
@@ -92,8 +92,8 @@ _INSIDE = 1e-6
 """Additional reduction (rad) of the half angle of a violated exclusion cone, so that the path is outside the
 cone."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""If a slew rotates too fast, its duration is multiplied by the ratio of the rates and the first factor, but
-at most by the second factor. The third value is the largest number of trials."""
+"""If a slew rotates too fast, its duration is multiplied by the ratio of its rate to the permitted rate and
+by the first factor, but at most by the second factor. The third value is the largest number of trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,9 +153,9 @@ class SlewStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunningSlew:
-    """A slew, as last planned, that the body follows while the remaining part is replanned.
+    """The present path of a slew, which the body follows while the remaining part is replanned.
 
-    The job's time `origin_ns` is `since` s after the start of the path.
+    The time `origin_ns` of the planning job is `since` s after the start of the path.
     """
 
     path: SlewPath
@@ -172,7 +172,7 @@ def slew(
 ) -> SlewPath | None:
     """Return a slew, slower than `fastest` rad/s, to the attitude law of a target, or None if none is found.
 
-    If possible, the slew avoids the exclusion cones that do not contain the camera at the start.
+    If possible, the slew avoids the exclusion cones that do not contain the camera axis at the start.
     """
     first = float(begin.times[0])
     start = begin.quaternion[None]
@@ -188,7 +188,7 @@ def slew(
         found = _slow_enough(wish, task, fastest)
     if found is None or not begin.sizes.any():
         return found
-    # The areas exposed to air and sunlight depend on the path, so the slew is planned again.
+    # The areas exposed to air and sunlight depend on the path, so the slew is planned again with new areas.
     pressed = along(ahead, first, begin.areas, found)
     again = replace(task, along=pressed, horizon=found.horizon)
     return _slow_enough(wish, again, fastest, found) or found
@@ -342,7 +342,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
     The remaining slew is planned from the newest estimate, with the arrival time of the present plan. The new
     path is the optimal path to which the search converges from the present path. The present plan is kept if
     no such path is found, or if the new path rotates too fast or causes more than `HOTTER` times the heat of
-    the present path. The table ends TAIL s after the slew.
+    the present path. The table ends `TAIL` s after the end of the slew.
     """
     near = running.path.since(running.since + LEAD, NODES)
     ahead = predict(job.orbit, LEAD + near.horizon + TAIL + 4.0 * STEADY.step)
@@ -379,7 +379,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
 
 
 def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, FloatArray]:
-    """Return attitude (4,) and rate (3,) after LEAD s, if the errors relative to the path do not change."""
+    """Return attitude (4,) and rate (3,) after `LEAD` s, for a constant rate error relative to the path."""
     now, then = running.since, running.since + LEAD
     path = running.path.references(np.array([now, then]))
     error = multiply(job.quaternion, conjugate(path.quaternion[0]))
@@ -399,7 +399,7 @@ def _narrowed(cone: Cone, path: SlewPath, start: FloatArray) -> Cone:
 
 @dataclass(frozen=True, slots=True)
 class TableSpan:
-    """Shortest duration of the prediction (`preview`), duration of the table (`kept`), and its step, s."""
+    """Shortest duration of the prediction (`preview`), duration of the table (`kept`), and table step, s."""
 
     preview: float
     kept: float
@@ -425,7 +425,7 @@ does not depend on the duration of the initial guess."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectDirection:
-    """The direction (3,) of an object, ICRS, at the time `since`, in s after the time `origin_ns` of the job.
+    """The direction (3,) of an object, ICRS, `since` s after the time `origin_ns` of the planning job.
 
     The vector `velocity` (3,), 1/s, is the object's relative velocity divided by its distance, or zero.
     """

@@ -120,7 +120,7 @@ DAMPING = 0.01
 
 
 class PathRecovery:
-    """The decision between path following and damping.
+    """The decision whether the body follows the planned path or is damped.
 
     Attributes:
         since: start time of the damping, s, or None while the body follows the path.
@@ -133,7 +133,7 @@ class PathRecovery:
         self.ready = self.leaving = False
 
     def update(self, off: float, speed: float, now: float) -> None:
-        """Update the decision with the deviation from the path (rad), the rate (rad/s) and the time (s)."""
+        """Update the decision by deviation from the path (rad), body rate (rad/s) and time (s)."""
         if self.since is None and off > FAR:
             self.since = now
         self.leaving = self.since is None and off > LEAVING

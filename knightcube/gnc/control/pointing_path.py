@@ -78,7 +78,7 @@ class SweepCost:
         state: quadratic weights (n, 6, 6) of the errors.
         control: quadratic weights (n, controls) of the controls.
         state_slope, control_slope: linear weights of the errors (n, 6, columns) and of the controls (n,
-            controls, columns). Each column belongs to one source of errors.
+            controls, columns). Each of the columns of the linear weights belongs to one source of errors.
     """
 
     state: FloatArray
@@ -201,13 +201,13 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Factors by which the cost of a torque along the field is increased from stage to stage. The factors are
-tried in turn until a path settles, because different factors lead to different optima."""
+"""Factors by which the cost of a torque along the field is increased from stage to stage. Each factor is
+tried until a path settles on the attitude law, because different factors lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
 """Costs of a torque along the field, relative to the cost of the same torque across the field. The cost of a
 torque along the field is increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Largest angle (rad) from the attitude law in the second half of a path that counts as settled."""
+"""Largest rotation error (rad), in the second half of a path, of a path that counts as settled."""
 SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even if the sweeps have not converged."""
@@ -219,9 +219,9 @@ NEAR = math.radians(10.0)
 """Angle (rad) between the first motion and the attitude law, up to which the linear-quadratic sweeps converge
 without an auxiliary torque along the field."""
 EXCESS = 3e-5
-"""Amount (rad/s) by which the body rate exceeds the rate limit at a cost of one."""
+"""Excess (rad/s) of the body rate over the rate limit that has a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
-"""Fractions of the change computed by a sweep, which are tried in this order."""
+"""Fractions of the change computed by a sweep, in the order in which the line search tries them."""
 RUN_AWAY = 100.0
 """Rate (rad/s) above which a diverging motion is not propagated further."""
 
@@ -250,7 +250,7 @@ class PathConditions:
 
     @cached_property
     def around(self) -> FloatArray:
-        """Field, position, air pressure and sunlight pressure as rows of an array (n + 1, 4, 3)."""
+        """Field, position, and pressure vectors of air and sunlight as an array (n + 1, 4, 3)."""
         around = np.empty((len(self.field), 4, 3))
         around[:, 0], around[:, 1] = self.field, self.position
         around[:, 2], around[:, 3] = self.pressures.air, self.pressures.light
@@ -358,8 +358,8 @@ class PlannedMotion:
 class MotionGains:
     """Feedback gains K (n, 4, 6) about a motion, and affine parts k (n, 4, columns) of the control law.
 
-    The first column of k, subtracted from the controls of the motion, improves the motion. Each further
-    column of k compensates a unit of one component of the disturbance torques.
+    Subtracting the first column of k from the controls of the motion reduces the cost of the motion. Each
+    further column of k compensates a unit of one component of the disturbance torques.
     """
 
     gain: FloatArray
@@ -394,7 +394,7 @@ def best_path(
 
 
 def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
-    """Return the motion from which the first linear-quadratic sweep starts.
+    """Return the initial motion of the first linear-quadratic sweep.
 
     The motion is propagated with the given gains, or without control if the motion diverges with the gains.
     Far from the motion `rest`, the gains may rotate the body by several revolutions in a step, because the

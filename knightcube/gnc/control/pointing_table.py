@@ -5,12 +5,12 @@ improves a merit function, the cost plus the weighted defects (Nocedal & Wright 
 algorithm 18.3). In contrast to the sweeps of `pointing_path`, the intermediate motions of multiple shooting
 need not obey the equations of motion. The defect of a time step is the difference between the propagated
 state at the end of the step and the state at the next instant. The defects of all steps converge to zero
-during the iterations (Bock & Plitt 1984, IFAC 9th World Congress). Multiple shooting prevents the growth of
-errors along a revolution. Without multiple shooting, errors could grow, because coils cause no torque about
-the field and the body may rotate by a large angle about the pointing axis. An iteration of multiple shooting
-takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and the derivatives are those of
-this discrete rule. With derivatives of the continuous motion, the iteration would stall for bodies that
-rotate by degrees per time step.
+during the iterations (Bock & Plitt 1984, IFAC 9th World Congress). Multiple shooting prevents that errors
+grow along a revolution of the orbit. Propagating one motion over a revolution could let errors grow, because
+coils cause no torque about the field and the body may rotate by a large angle about the pointing axis. An
+iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and
+the derivatives are those of this discrete rule. With derivatives of the continuous motion, the iteration
+would stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of the path is computed by a backward
@@ -134,10 +134,10 @@ DEARER = 1.2
 a defect."""
 DONE = math.radians(0.05)
 """Multiple shooting ends if an iteration rotates all attitudes by less than this angle (rad). Multiple
-shooting also ends if an iteration improves the merit by less than the fraction SAVED."""
+shooting also ends if an iteration reduces the merit function by less than the fraction `SAVED`."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Largest accepted ratio of the sum of the weighted defects of a motion to 1 + cost of the motion."""
+"""Largest accepted sum of a motion's weighted defects, divided by one plus the cost of the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,8 +200,8 @@ def best_course(
 class _Merit:
     """The merit function for the comparison of motions: the cost plus the weighted defects.
 
-    The errors of a step have the weights `state` (6, 6), and the dipole moment has the weight `dipole`. The
-    defects of a step have the weights `dear` (6,).
+    The weights of a step are `state` (6, 6) for the errors, `dipole` for the dipole moment and `dear` (6,)
+    for the defects.
     """
 
     expected: PathConditions
@@ -251,7 +251,7 @@ def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
 def _better(
     criterion: _Merit, motion: PlannedMotion, step: _ShootingStep, before: float
 ) -> PlannedMotion | None:
-    """Return the motion after the largest fraction of a step that improves the merit, or None."""
+    """Return the motion after the largest tried fraction of a step that reduces the merit, or None."""
     share = min(1.0, FARTHEST / max(step.rotated, DONE))
     for _ in range(HALVES):
         moved = _moved(motion, share * step.change, share * step.control)
@@ -284,7 +284,7 @@ new table is shorter than this fraction, the previous table is kept."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointingWeights:
-    """Weights of the errors. Each weight is given as the magnitude of an error that has a cost of one.
+    """Weights of errors and dipole moment, each given as the magnitude that has a cost of one.
 
     Attributes:
         turn: rotation error about one axis that has a cost of one, rad.
@@ -427,7 +427,7 @@ def _beyond(
 ) -> CostToGo:
     """Return the cost-to-go of following the attitude law from the instant with index `begin` on.
 
-    The first column of the linear part is for the attitude law and the expected torques.
+    The first column of the linear part belongs to the attitude law and the expected torques.
     """
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]

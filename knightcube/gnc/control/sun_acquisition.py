@@ -116,7 +116,7 @@ class ResidualDipole:
         """Residual dipole moment (3,) in body axes, A m^2."""
 
     def restart(self) -> None:
-        """Restart the predicted rate at the next measured rate, but keep the estimated dipole moment."""
+        """Set the predicted rate to the next measured rate, and keep the estimated dipole moment."""
         self._rate = None
 
     def follow(self, seconds: float, rate: FloatArray, field: FloatArray, coils: FloatArray) -> None:
@@ -147,7 +147,7 @@ FASTEST, FASTEST_ACROSS = 0.0165, 0.010
 body is only damped. The two rate limits are below the rates at which the flight software starts
 detumbling."""
 FASTEST_ROLL = 0.0105
-"""Roll rate (rad/s) about the Sun direction above which a torque about that direction is not preferred."""
+"""Roll rate (rad/s) about the Sun direction at which the lower cost of torques about it is reduced to 1/e."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
 """Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the pointing
 law demands at most the fraction `SHARE` of the torque that the coils can produce."""
@@ -214,7 +214,7 @@ class SunAcquisition:
         self._sun.measure(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the actual dipole moment (3,), A m^2, until the next command, if it is not as commanded."""
+        """Set the actual dipole moment (3,), A m^2, until the next command, if not as commanded."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:

@@ -12,13 +12,14 @@ depend on the angle and the rate.
 
 The class `CommandCheck` compares the gyro samples with the commands to check whether the coils carry the
 commanded currents. With a broken coil, the innovations of the gyro become inconsistent with their covariance
-within a few samples. The filter then treats the coil currents, also those of the last half second, as unknown
-and follows the gyro. A change of the rate that no coil current can cause is not evidence of wrong coil
-currents, because the gyro may be faulty. The commands are trusted again when the rate follows the commands.
-The model z = b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate
-that the commands should cause. The commands are confirmed if the response g is well determined and is 1
-within its uncertainty, and if the residuals are white. While the coils are not driven, the response is not
-determined. If the gyro is noisier than assumed, the check increases its limits and does not raise an alarm.
+within a few samples. The filter then treats the coil currents, including the currents of the last half
+second, as unknown and follows the gyro. A change of the rate that no coil current can cause is not evidence
+of wrong coil currents, because the gyro may be faulty. The filter uses the commanded currents again when the
+rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the last second, where c
+is the change of the rate that the commands should cause. The commands are confirmed if the response g is well
+determined and is 1 within its uncertainty, and if the residuals are white. While the coils are not driven,
+the response is not determined. If the gyro is noisier than assumed, the check increases its limits and does
+not raise an alarm.
 """
 
 from __future__ import annotations
@@ -60,18 +61,18 @@ from knightcube.gnc.estimation.rigid_body import LONGEST_STEP, ProcessNoise, Rig
 
 _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
 """Largest accepted mean innovation of the gyro, in standard deviations, by the number of averaged samples. A
-strong fault is detected in one sample, a weak fault only in the mean of many samples. In flights without a
-fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
+strong coil fault is detected in one gyro sample, a weak coil fault only in the mean of many samples. In
+flights without a fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
 _BEFORE_NS = 500_000_000
-"""Time (ns) before the first contradictory sample from which the currents are treated as unknown. A weak
-fault affects the other states of the filter before it is detected. The time before the sample is included to
-correct these effects."""
+"""Time (ns), before the first contradictory sample, during which the currents are also treated as unknown. A
+weak fault affects the other states of the filter before it is detected. These effects are corrected by
+treating the currents before the sample as unknown, too."""
 _MAXIMUM_CHANGE = 3.0
 """Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
 coils. A reversed coil causes an innovation of twice the commanded change, and the uncertain age of a sample
 increases the innovation further."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
-"""Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. If wrong
+"""Minimum and maximum time (s) between gyro samples during which wrong coil currents may have acted. If wrong
 currents were assumed to act for a longer time, they could explain any innovation after a long gap."""
 _PROOF = 1.0
 """Time span (s) of the gyro samples that must confirm the commands before the commands are trusted again."""
@@ -90,8 +91,8 @@ _SHARE_ERROR = 0.15
 class CommandCheck:
     """Check of the commanded coil currents against the gyro samples.
 
-    It is `active` while the coil currents are suspected to differ from the commanded currents. The commands
-    last became trusted again at the time `ended_ns`.
+    The check is `active` while the coil currents are suspected to differ from the commanded currents. The
+    last such suspicion ended at the time `ended_ns`.
     """
 
     def __init__(self, model: PropagationModel) -> None:
@@ -108,7 +109,7 @@ class CommandCheck:
     def judge(self, newest: Checkpoint) -> int | None:
         """Return the time (ns) from which the currents are unknown, if the newest checkpoint raises an alarm.
 
-        Return None without an alarm. Only a checkpoint of a gyro rate raises an alarm.
+        The result is None without an alarm. Only a checkpoint of a gyro rate can raise an alarm.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
@@ -116,7 +117,7 @@ class CommandCheck:
         if self.active:
             self._test_recovery(newest.state, rate)
             return None
-        assert newest.variance is not None  # only the first checkpoint, which is not checked, has no variance
+        assert newest.variance is not None  # only the first checkpoint has no variance
         spreads = [math.sqrt(variance) for variance in newest.variance.diagonal().tolist()]
         departure = [value / spread for value, spread in zip(newest.innovation, spreads, strict=True)]
         largest = _DEPARTURES[1] * self._scale
@@ -136,7 +137,7 @@ class CommandCheck:
         return None
 
     def _explains(self, newest: Checkpoint) -> bool:
-        """Return whether wrong coil currents together with the noise can explain the newest innovation."""
+        """Return whether wrong coil currents and noise together can explain the newest innovation."""
         assert newest.variance is not None
         gap = (newest.time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
         # The variable `change` is the largest change of the rate (rad/s) that unknown currents can cause.
@@ -212,7 +213,8 @@ class FilterSettings:
         disturbance_start: initial standard deviation of the unmodelled angular acceleration, rad/s^2.
         bias_walk: random walk of the gyro bias, rad/s per sqrt(s).
         bias_start: initial standard deviation of the gyro bias, rad/s.
-        torsion_start: initial standard deviation of the thread's torsion, 1/s^2; zero if it is known.
+        torsion_start: initial standard deviation of the thread's torsion, 1/s^2; zero if the torsion is
+            known.
         damping_start: initial standard deviation of the thread's damping, 1/s; zero if the damping is known.
         gain_start: initial standard deviation of the coils' gain; zero if the gain is known.
         latency_start: initial standard deviation of the age that the inertial unit's samples have at their
@@ -249,7 +251,7 @@ class FilterSettings:
 
 
 def free_axes(body: RigidBody) -> FloatArray:
-    """Return an array (3,): 1 for an axis about which the body can rotate, 0 for another axis."""
+    """Return an array (3,) with 1 for the axes about which the body can rotate, and 0 for the other axes."""
     return np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
 
 
@@ -329,7 +331,7 @@ OnApplied = Callable[[list[bool]], None]
 
 @dataclass(slots=True, eq=False)
 class _Branch:
-    """A replay from the checkpoint `base` that includes late measurements and calls `applied` at its end."""
+    """A replay from the checkpoint `base` that includes late measurements and calls `applied` at the end."""
 
     base: Checkpoint
     replay: Replay
@@ -344,7 +346,7 @@ class AttitudeFilter:
         refused: number of measurements that did not pass the gate.
         late: number of measurements that were too late to be inserted.
         restarts: number of times that the filter discarded its estimate.
-        nis: normalised innovation squared of the last measurement; NaN if it was not applied.
+        nis: normalised innovation squared of the last measurement, or NaN if the measurement was not applied.
     """
 
     REJECTIONS_TO_RESTART = 40

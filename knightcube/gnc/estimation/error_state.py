@@ -92,8 +92,8 @@ class ErrorState:
 class Weighed(NamedTuple):
     """The optimal gain (n, k) for an innovation of k components and n states, with intermediate results.
 
-    These are the normalised square y' S^-1 y of the innovation y, the covariance `cross` (n, k) of states and
-    innovation, and the covariance S (k, k) of the innovation, `spread`.
+    The intermediate results are `square`, the normalised square y' S^-1 y of the innovation y, `cross`, the
+    covariance (n, k) of states and innovation, and `spread`, the covariance S (k, k) of the innovation.
     """
 
     square: float
@@ -156,7 +156,7 @@ def propagated(
 
 
 def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
-    """Transform, in place, the covariance of an attitude error to the axes after the correction.
+    """Transform the covariance of an attitude error in place to the axes after the correction.
 
     The slice `at` of the error state is the attitude error, which was corrected by `rotation` (3,), rad. To
     first order, the remaining error rotates by half the correction (Markley and Crassidis 2014, 6.2.4).
@@ -170,13 +170,13 @@ def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
 
 
 def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: FloatArray) -> None:
-    """Preserve, in place, the uncertainty of the common scale of some states when these are corrected.
+    """Preserve, in place, the uncertainty of the common scale of some states after their correction.
 
     If no measurement depends on the common scale, the vector of the scaled states is itself the unobservable
     direction in state space. The correction `change` (n,) of the error state changes this direction, so the
     covariance is adjusted to the new direction. Without this adjustment, each correction would reduce the
-    uncertainty of the scale. The scaled states are the slice `at` of the error state, and had the `values`
-    (m,) before the correction.
+    uncertainty of the scale. The states with the common scale are the slice `at` of the error state, and had
+    the `values` (m,) before the correction.
     """
     along = values / (values @ values)
     covariance += np.outer(change, along @ covariance[at])
@@ -214,12 +214,12 @@ CONTRADICTED, PAUSE = 60.0, 600.0
 """Time (s) over which innovations are evaluated, and time (s) after a contradiction during which innovations
 are ignored."""
 _LARGEST, _MEAN, _LEAST = chi_square.bound(0.001, 3), 5.0, 40
-"""Upper limit to which squared innovations are clipped, largest mean of consistent squared innovations, and
-minimum number of innovations."""
+"""Value at which normalised squared innovations are clipped, largest mean of consistent innovations, and
+minimum number of innovations for a decision."""
 
 
 class PriorCheck:
-    """Detects that mutually consistent measurements contradict the estimated states.
+    """Test whether mutually consistent measurements contradict the estimated states.
 
     The states are contradicted if the normalised squared innovations in `CONTRADICTED` seconds have a mean
     above 5; the expected mean is 3. Each squared innovation is clipped at a value that is exceeded once in a

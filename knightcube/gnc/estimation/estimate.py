@@ -2,7 +2,7 @@
 
 A measurement has a `latency` if it comes from an inertial unit whose samples are older than their time stamps
 and if the filter estimates the age of the samples. The latency is the assumed age (s) that was subtracted
-from the time stamp to give `time_ns`. The latency is None if the time of the sample is known.
+from the time stamp to give `time_ns`. The latency is None if the exact time of the sample is known.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class _AtOneTime:
 class AttitudeMeasurement(_AtOneTime):
     """A measured attitude (4,), reference to body axes, with covariance (3, 3), rad^2, in body axes.
 
-    The flag `by_stars` marks an attitude of the star camera. The covariance excludes its misalignment.
+    The flag `by_stars` marks an attitude of the star camera. The covariance excludes the misalignment of the
+    camera.
     """
 
     time_ns: int
@@ -76,8 +77,8 @@ class MeanRateMeasurement:
 class DirectionMeasurement(_AtOneTime):
     """A direction observed from the body, such as the direction of the Sun or nadir.
 
-    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The `covariance` (3,
-    3) of `observed`, rad^2, has no effect along the direction.
+    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The component along
+    the direction of the `covariance` (3, 3) of `observed`, rad^2, is ignored.
     """
 
     time_ns: int

@@ -45,8 +45,8 @@ LARGEST_ROTATION = 0.15
 COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
 """Longest time (s) and largest rotation (rad) of the body in one propagation step of the covariance."""
 _LINEARISED = 0.2
-"""Fraction of the standard deviation of the inertia that is added as noise while the rate is known, because
-the filter is linearised."""
+"""Fraction of the standard deviation of the inertia that is added as noise while the rate is known. The noise
+represents products of errors, which the linearised filter neglects."""
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)
@@ -59,7 +59,7 @@ class FieldRateSettings:
 
     Attributes:
         inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
-        field_sigma: standard deviation of a field measurement per axis, with constant errors, T.
+        field_sigma: standard deviation of a field measurement per axis, including constant errors, T.
         rate_start: initial standard deviation of the rate along the field, rad/s.
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
@@ -71,7 +71,8 @@ class FieldRateSettings:
         refusals: number of consecutively rejected measurements after which the filter restarts (field
             measurements) or the gyro is excluded (gyro measurements).
         gyro_sigma: assumed bound of the gyro bias per axis, rad/s.
-        longest_gap: longest time between the samples that start the filter, s, without a hidden fast spin.
+        longest_gap: longest time, s, between the samples that start the filter, during which no fast spin can
+            remain undetected.
     """
 
     inertia: FloatArray
@@ -103,7 +104,7 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 
 
 class FieldRate:
-    """The filter of the rate. The attribute `restarts` counts the restarts after failed predictions."""
+    """The filter of the body rate. The attribute `restarts` counts the restarts after failed predictions."""
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings
@@ -116,7 +117,7 @@ class FieldRate:
         self.restart()
 
     def restart(self) -> None:
-        """Reset the filter, but keep the count of restarts."""
+        """Reset the filter without resetting the count of restarts."""
         if self._is_reset:
             return
         self._is_reset = True
@@ -129,7 +130,7 @@ class FieldRate:
         self._field = self._change = _NONE
         self._set_inertia(np.zeros(6))
         self._covariance = np.zeros((SIZE, SIZE))
-        self._pending = 0.0  # age (s) of the covariance relative to the state
+        self._pending = 0.0  # time (s) from the covariance to the state
         # Integral of the dipole since the time of the covariance, A m^2 s.
         self._pending_impulse = np.zeros(3)
         # Rate, field and field derivative at the time of the covariance.
@@ -227,8 +228,8 @@ class FieldRate:
 
         The error of the gyro is mostly a bias, and frequent use of the gyro would reduce the standard
         deviation of the rate below that bias. A gyro that contradicts the filter several times in a row is
-        excluded until `restart`. The gyro is also excluded if the field predictions fail after its rate was
-        used. If the gyro contradicts an estimate that used the gyro, the filter restarts.
+        excluded until `restart`. The gyro is also excluded if the field predictions fail after a gyro rate
+        was used. If the gyro contradicts an estimate that used the gyro, the filter restarts.
         """
         settings = self._settings
         self._is_reset = False

@@ -3,9 +3,9 @@
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
 gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. In
 contrast to `attitude_filter`, which replays each late sample at its time, a late attitude is propagated to
-the present with the present rate, whose error is included in the innovation. This is accurate for some
-seconds if the body rotates slowly enough for star images. Besides attitude and rate, the error state (see
-`error_state`) contains these blocks:
+the present with the present rate, whose error is included in the innovation. The propagated attitude is
+accurate for some seconds if the body rotates slowly enough for star images. Besides attitude and rate, the
+error state (see `error_state`) contains these blocks:
 
 - `inertia`: errors of the inertia tensor, relative to the trace, in which Euler's equation is linear. In a
   tumble about more than one axis, the ratios of the moments of inertia and the principal axes are observable
@@ -212,7 +212,8 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s) of doubted dipoles and of field errors at rest, for the equivalent white noise."""
+"""Correlation time (s), for the equivalent white noise, of uncertain coil dipoles and of field errors of a
+body at rest."""
 CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
@@ -239,16 +240,18 @@ class FreeFilterSettings:
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
         coil_error: relative standard deviation of each coil's dipole, which varies over tens of seconds.
         coil_noise: density of the white noise of each coil's dipole while it is driven, A m^2 sqrt(s).
-        coil_walk: random walk of the elements of the coils' matrix per sqrt(s), such as by temperature.
+        coil_walk: random walk per sqrt(s) of the elements of the coils' matrix, for example due to
+            temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
-            rate in rad/s. It represents flexible parts, which are loaded only while the body rotates, and
-            prevents the uncertainty of the inertia from becoming too small.
+            rate in rad/s. The random walk represents flexible parts, which are loaded only while the body
+            rotates, and prevents the uncertainty of the inertia from becoming too small.
         errors: largest errors of the description of body and sensors.
         coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; None for
             coils along the body axes, because their covariance follows from `errors`.
         roles: roles of the blocks whose role differs from the default, by name of the block.
         rate_start: initial standard deviation of the rate, rad/s.
-        fine, coarse: largest standard deviation about the least certain axis if FINE and if COARSE, rad.
+        fine, coarse: largest standard deviation, rad, of an attitude of the accuracy class FINE and COARSE,
+            about the least certain axis.
         gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
             component by this many standard deviations.
     """
@@ -323,7 +326,7 @@ MINIMUM_FIELD_ERROR = 1e-8
 of the magnetometer's errors."""
 CURRENTS = 1e-7
 """Standard deviation (T per axis) of the magnetic field of auroral currents. This deviation is added to the
-measurement noise, so that measurements in auroral zones pass the gate."""
+measurement noise, so that field measurements in auroral zones pass the gate."""
 AIR_WALK = 6e-3
 """Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
@@ -341,7 +344,7 @@ class SlowStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
-    """A copy of those attributes of the filter that form the estimate."""
+    """A copy of the attributes of the filter that form the estimate."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -414,9 +417,10 @@ class FreeFilter:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
         If the rate was not measured by the gyro, its covariance is `spread` (3, 3), rad^2/s^2. If `by_stars`
-        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slow
-        states keep their estimated values. If the previous estimate was contradicted (`doubted`), their
-        covariance is reset to that of the settings, and implausible values are set to zero.
+        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slowly
+        varying states keep their estimated values. If measurements contradicted the previous estimate
+        (`doubted`), the covariance of the slow states is reset to the prior of the settings, and implausible
+        values are set to zero.
         """
         self.changes += 1
         if doubted:
@@ -534,7 +538,7 @@ class FreeFilter:
             covariance[np.ix_(at, at)] = prior
 
     def _with(self, memories: Sequence[FreeMemory]) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield constants and covariance, first of the present estimate and then of each of its copies."""
+        """Yield constants and covariance of the present estimate, and then of each copy of the estimate."""
         yield self._constants, self.covariance
         for memory in memories:
             yield memory.constants, memory.covariance
@@ -614,7 +618,7 @@ class FreeFilter:
 
         The value `doubt` (A m^2) is the standard deviation per axis of a dipole that may differ from the
         command. If the dipole changes during `seconds`, `uneven` (3,), A m^2 s^2, is the double time integral
-        of the dipole minus that of the mean dipole.
+        of the dipole minus the double time integral of the mean dipole.
         """
         before = self.rate
         steps = max(1, math.ceil(math.sqrt(float(before @ before)) * seconds / LARGEST_ROTATION))
@@ -744,7 +748,7 @@ class FreeFilter:
         self._decay(FIELD, dt / self._settings.field_memory, max(self.field_error, least) ** 2 * _EYE)
 
     def _decay(self, at: slice, part: float, prior: FloatArray) -> None:
-        """Propagate a Gauss-Markov process of covariance `prior` (3, 3) by a `part` of its memory."""
+        """Propagate a Gauss-Markov process of covariance `prior` (3, 3) by `part` of its correlation time."""
         kept = math.exp(-part)
         self._constants[at] *= kept
         self.covariance[at] *= kept
@@ -858,8 +862,8 @@ class FreeFilter:
 
 BODY: IntArray = np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA]
 LEARNED = {"body": BODY, "coils and body": np.r_[BODY, COILS]}
-"""Indices of the estimated states that the motion can contradict: `body` without coil currents, and `coils
-and body` with coil currents."""
+"""Indices of the estimated states that the motion can contradict: the entry `body` applies without coil
+currents, and the entry `coils and body` with coil currents."""
 # If all these states are doubled, the motion is the same, because inertia, dipoles and torques have a common
 # scale.
 _SCALED: FloatArray = np.zeros(STATES)

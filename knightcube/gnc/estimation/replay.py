@@ -84,7 +84,7 @@ class CommandHistory:
         return self._torquings[index] if self._torquings else self.idle
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
-        """Yield each coil command between two times with its duration (ns), in order of time."""
+        """Yield each coil command between two times, and the command's duration (ns), in order of time."""
         time_ns = from_ns
         index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
         while time_ns < to_ns:
@@ -98,18 +98,19 @@ class CommandHistory:
 
 
 _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
-"""Limit of the normalised squared innovation, by the number of axes; above it, a gyro sample corrects only
-the rate. Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with
-the rate. Before a broken coil is detected, the correlations with the rate cause wrong corrections of these
-states. Without this limit, the angle error reached 40 standard deviations although the rate was correct. In a
-consistent filter, one gyro sample in forty exceeds this limit of the squared innovation."""
+"""Normalised squared innovation, by number of axes, above which a gyro sample corrects only the rate.
+Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with the rate.
+Before a broken coil is detected, the correlations with the rate cause wrong corrections of angle, disturbance
+and coil gain. Without this limit, the angle error reached 40 standard deviations although the rate was
+correct. In a consistent filter, one gyro sample in forty exceeds the limit."""
 
 
 @dataclass(slots=True, eq=False)
 class Checkpoint:
     """A measurement, whether it passed the gate, and the state of the filter after its application.
 
-    The innovation, in the unit of the measurement, is empty for the first checkpoint, and its variance None.
+    For the first checkpoint, the innovation (in the unit of the measurement) is empty, and the variance of
+    the innovation is None.
     """
 
     measurement: Measurement
@@ -213,7 +214,7 @@ class Replay:
         self._model = model
         self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
         self._pending = deque(measurements)
-        # The list contains the exposures that have not begun yet; the next exposure is the last element.
+        # The list contains the exposures that have not begun yet, with the next exposure as last element.
         self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
         self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
         self.checkpoints: list[Checkpoint] = []
@@ -280,8 +281,8 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Excess (ns) of the age of the oldest checkpoint over the length of the history, above which all checkpoints
-older than the history are dropped."""
+"""Time (ns) by which the oldest checkpoint may exceed the length of the history before all checkpoints older
+than the history are dropped."""
 _TIME = attrgetter("time_ns")
 
 
@@ -316,7 +317,7 @@ class CheckpointHistory:
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
         """Return times (n,) ns and rates (n, 3) rad/s of the checkpoints that enclose an interval.
 
-        Without a checkpoint at or after `end_ns` the rates end with the newest checkpoint. Return None if no
+        Without a checkpoint at or after `end_ns`, the rates end with the newest checkpoint. Return None if no
         checkpoint is as old as `begin_ns`.
         """
         first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)

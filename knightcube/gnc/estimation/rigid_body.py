@@ -69,7 +69,7 @@ class Torquing:
 class Accelerated(NamedTuple):
     """Angular acceleration w' (rad/s^2) and its derivatives (3, 3).
 
-    The derivatives are with respect to torsion, damping and coil gain.
+    The derivatives `by_parameters` are with respect to torsion, damping and coil gain.
     """
 
     acceleration: Vector
@@ -81,7 +81,7 @@ class Linearised(NamedTuple):
 
     `by_attitude`, `by_rate` and `by_current` (3, 3) are the derivatives of the angular acceleration with
     respect to a small rotation about the body axes, to the rate and to the coil currents (A). `by_parameters`
-    (3, 3) are its derivatives with respect to torsion, damping and gain.
+    (3, 3) are the derivatives with respect to torsion, damping and coil gain.
     """
 
     acceleration: Vector
@@ -223,8 +223,8 @@ control loop."""
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise, and the assumed magnitude of an unknown coil current.
 
-    `current` is the spectral density of the current noise of one driven coil, A^2 s. `rate` (3, 3),
-    rad^2/s^3, is the spectral density of the unmodelled angular acceleration. The array `walks` (19,)
+    The attribute `current` is the spectral density of the current noise of one driven coil, A^2 s. `rate` (3,
+    3), rad^2/s^3, is the spectral density of the unmodelled angular acceleration. The array `walks` (19,)
     contains the variances that the components of the error state gain per second by random walks.
     `unknown_current` (A) is the current assumed for each coil while its current is unknown.
     """
@@ -358,7 +358,7 @@ def tensor(elements: FloatArray) -> FloatArray:
 def by_inertia(vector: FloatArray) -> FloatArray:
     """Return the derivative (3, 6) of J v for a vector v (3,).
 
-    The derivative is that with respect to the elements xx, yy, zz, yz, zx and xy of J.
+    The derivative is with respect to the elements xx, yy, zz, yz, zx and xy of J.
     """
     x, y, z = vector.tolist()
     return np.array(((x, 0.0, 0.0, 0.0, z, y), (0.0, y, 0.0, z, 0.0, x), (0.0, 0.0, z, y, x, 0.0)))

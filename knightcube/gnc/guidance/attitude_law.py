@@ -108,7 +108,7 @@ class AttitudeReferences:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeLaw:
-    """A law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
+    """An attitude law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
 
     The alignment with `first` is exact, and the alignment with `second` is as close as possible.
     """
