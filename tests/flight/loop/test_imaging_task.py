@@ -50,7 +50,9 @@ class Bench:
         self.jobs: list[FrameJob] = []
         self.records: list[tuple[Any, dict[str, Any]]] = []
         self.reports: list[Any] = []
+        self.texts: list[str] = []
         self.facts: dict[Any, list[bool]] = {}
+        self.fact_texts: dict[Any, str] = {}
         self.notes: list[tuple[str, int]] = []
         self.late: list[list[Any]] = []
         self.accepts = True
@@ -71,9 +73,12 @@ class Bench:
             recorder=SimpleNamespace(
                 epoch_ns=EPOCH, record=lambda packet, _, **values: self.records.append((packet, values))
             ),
-            events=SimpleNamespace(report=lambda kind, *_: self.reports.append(kind)),
+            events=SimpleNamespace(report=self._report),
             facts=SimpleNamespace(
-                update=lambda fact, is_so, *_: self.facts.setdefault(fact, []).append(is_so)
+                update=lambda fact, is_so, _, text: (
+                    self.facts.setdefault(fact, []).append(is_so),
+                    self.fact_texts.__setitem__(fact, text),
+                )
             ),
             streams=SimpleNamespace(note=lambda name, at: self.notes.append((name, at))),
             jobs=SimpleNamespace(submit=self._submit),
@@ -116,6 +121,10 @@ class Bench:
         """Return the past estimate of a body that rotates about x at 0.01 rad/s."""
         quaternion = from_rotation_vector(np.array([0.01 * at * 1e-9, 0.0, 0.0]))
         return SimpleNamespace(quaternion=quaternion, rate=np.array([0.01, 0.0, 0.0]), covariance=COVARIANCE)
+
+    def _report(self, kind: Any, _: int, text: str) -> None:
+        self.reports.append(kind)
+        self.texts.append(text)
 
     def _trigger(self, exposure_ns: int) -> None:
         if self.broken:
