@@ -152,7 +152,7 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices, None or empty if not configured; the first monitor in `supply` is the battery's."""
+    """The open devices, None or empty if not configured; `supply` begins with the battery's monitor."""
 
     unit: InertialUnit
     magnetometer: InertialUnit | None

@@ -122,8 +122,8 @@ def open_flight(
         use_numpy_forms()
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
-    # The stored state counts the boots. It is opened last, so that a boot in which the start fails is not
-    # counted. The outer exit stack closes it after the devices.
+    # The stored state is opened last, so that a boot in which the start fails is not counted.
+    # The outer exit stack closes the stored state after the devices.
     after_coils = stack.enter_context(ExitStack())
     guardian = start_guardian(rig, stack)
     devices = open_devices(config, rig, stack, patient)
@@ -181,7 +181,7 @@ def next_whole_second(clock: Clock) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A valid configuration of a request, read from `chosen`; `merged` includes the extended files."""
+    """A valid configuration, read from `chosen`; `merged` includes the text of the files that it extends."""
 
     request: RunRequest
     chosen: Chosen
@@ -429,7 +429,7 @@ def _saturation(camera: Camera) -> float:
 
 
 def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
-    """Return the estimator of rates from streaks that a camera selects. Raises ConfigError without one."""
+    """Return a camera's estimator of rates from streaks. Raises ConfigError if the body does not have it."""
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))
     if body.streak_estimator is None:

@@ -134,7 +134,8 @@ def retried_start(
 ) -> T:
     """Return the result of the first `attempt` that succeeds, whose resources `stack` closes.
 
-    Each attempt opens a configuration of `judge`. Raises UsageError, and StoppedError after a signal.
+    Each attempt opens the configuration that `judge` returns. Raises UsageError, and StoppedError after a
+    signal.
     """
     for pause in pauses():
         try:
@@ -185,7 +186,7 @@ class SeparationInhibit:
         self._elapsed: float | None = None
 
     def check(self, folder: Path, seconds: float) -> None:
-        """Store the time with power in `folder`. Raises InhibitedError until it is `seconds` s."""
+        """Store the time with power in `folder`. Raises InhibitedError while it is below `seconds` s."""
         if seconds == 0.0:
             return
         path = folder / "powered"
@@ -269,7 +270,7 @@ _KEPT = 4
 
 
 def renewal_note(environment: Mapping[str, str]) -> str:
-    """Return why the flight computer returned to an earlier version, or "" (deploy/renewal.py)."""
+    """Return why the flight computer uses an earlier release again, or "" (deploy/renewal.py)."""
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
         status = read_regular(Path(environment[RENEWAL]), LARGEST_FILE) or b""
         return str(json.loads(line_of(status) or b"")["note"])
@@ -510,16 +511,16 @@ def kept_configs(folder: Path) -> list[KeptConfig]:
 
 
 class FlownConfig:
-    """Stores the configuration of a flight that has started well."""
+    """Stores the configuration of a flight that has run for `GOOD_START_NS`."""
 
     def __init__(self, text: str, folder: Path) -> None:
-        """Prepare to store `text`, the configuration as it was read, in a state folder."""
+        """Prepare to store the text of a configuration in a state folder."""
         self._data = text.encode()
         self._folder = folder
         self._kept = False
 
     def serve(self, clock: Clock) -> Ticker:
-        """Return the ticker that stores the configuration, outside the loop, after `GOOD_START_NS`."""
+        """Return the ticker (periodic task outside the loop) that stores the configuration."""
         return clock.ticker("configuration", GOOD_START_NS, self.keep)
 
     def keep(self) -> None:
@@ -610,7 +611,7 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
 
 
 def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes | None, str, bool]:
-    """Return a file's bytes, its problem or an empty text, and whether a checksum confirms the bytes."""
+    """Return a file's bytes, why they are unusable or "", and whether a checksum confirms the bytes."""
     try:
         data = _persistently(read, path)
         expected = _persistently(LinuxFiles().read, sum_file(path))
@@ -653,7 +654,8 @@ def _text(path: Path, data: bytes) -> str:
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
     """Return the configuration as text (`text`, or that of the file) and as values.
 
-    Only the values include the changes of the request. Raises ConfigError and UsageError.
+    Changes that the request makes to a configuration affect only the values. Raises ConfigError and
+    UsageError.
     """
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))

@@ -308,7 +308,7 @@ class CltuStream:
         return found
 
     def _frame(self, coded: bytes) -> tuple[bytes, int] | None:
-        """Return the frame (b"" if invalid) and the bytes of valid codeblocks, or None for want of bytes."""
+        """Return the frame (b"" if invalid) and the bytes of valid codeblocks, or None if incomplete."""
         data, corrected, length = b"", 0, _BLOCK_DATA
         for end in range(_BLOCK, len(coded) + 1, _BLOCK):
             block = coded[end - _BLOCK : end]
@@ -331,7 +331,7 @@ class CltuStream:
 
 
 class CommandCode:
-    """Code of telecommands: CLTUs, randomised or not, or no code; `corrected` is the number of wrong bits."""
+    """Code of telecommands: CLTUs, randomised or not, or no code; `corrected` counts corrected bits."""
 
     def __init__(self, cltu_kind: str | None) -> None:
         """Encode frames in CLTUs of the kind "plain" or "randomised", or not at all for None."""

@@ -202,7 +202,7 @@ class Vault:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Lock the folder against a second link process. Raises UsageError if another one uses it."""
+        """Lock the folder against a second link process. Raises UsageError if it is locked."""
         with locked(self._folder / _OWNER, f"{self._folder}: another link process uses these counters"):
             yield
 
@@ -399,7 +399,7 @@ class Gate:
         return self._open[spi]
 
     def admit(self, frame: bytes) -> Admitted:
-        """Return the content of a frame, which is accepted once. Raises RefusedError."""
+        """Return the content of a frame. Raises RefusedError, also for a frame that was accepted before."""
         try:
             admitted = self._admit(frame)
         except RefusedError as error:

@@ -66,7 +66,7 @@ class TargetLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target; its number in packets is that of a step, at least COMMANDED for a command, or KEPT."""
+    """A target; `index` is the number of a configured step, at least COMMANDED for a command, or KEPT."""
 
     index: int
     law: TargetLaw
@@ -294,7 +294,7 @@ class BodyTargets(Protocol):
         """Return the angle (rad) between body and target."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle (rad) between body and attitude required now, or None while none is required."""
+        """Return the angle (rad) from the presently required attitude, or None if none is required."""
 
 
 class BodyView(Protocol):
@@ -363,18 +363,19 @@ class BodyEstimation(Protocol):
         return learned_of(estimate)
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Adapt to coil dipoles that were multiplied by `change` (n,), with the relative `deviations` (n,).
+        """Adapt to coil dipoles that were multiplied by `change` (n,).
 
-        The default method does nothing, for a filter that does not estimate the coils separately.
+        The standard deviations of the dipoles, relative to the dipoles, are `deviations` (n,). The default
+        method does nothing, for a filter that does not estimate the coils separately.
         """
         del change, deviations
 
     def coils_used(self, used: BoolArray) -> None:
-        """Adapt to the coils that are `used` (n,) and not isolated; by default, nothing depends on them."""
+        """Adapt to the coils that are `used` (n,) and not isolated; by default, do nothing."""
         del used
 
     def magnetometer_changed(self) -> None:
-        """Adapt to another magnetometer; by default, no errors of the magnetometer are estimated."""
+        """Discard the estimated errors of the previous magnetometer; by default, do nothing."""
         return
 
     def is_accurate(self, estimate: Estimate) -> bool:
@@ -382,11 +383,11 @@ class BodyEstimation(Protocol):
         return True
 
     def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
-        """Return the rate (3,), rad/s, that replaces the gyro's, or None, as by default."""
+        """Return the rate (3,), rad/s, that replaces the gyro's rate, or None, which is the default."""
         return None
 
     def fastest_by_field(self) -> float:
-        """Return the largest likely body rate (rad/s) from the magnetometer, by default infinity."""
+        """Return the largest likely body rate (rad/s), from the magnetometer; the default is infinity."""
         return math.inf
 
     def knowledge(self) -> Knowledge:

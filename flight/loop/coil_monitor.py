@@ -145,7 +145,7 @@ class SelfTest:
         self._tested.clear()
 
     def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
-        """Return the currents (n,), A, of a test of a `usable` coil instead of `wanted` ones, or None."""
+        """Return test currents (n,), A, of a `usable` coil instead of the `wanted` currents, or None."""
         if (np.abs(wanted) > _QUIET * self._settings.limits).any():
             self._loud_ns, self._running = now_ns, None
         for axis, shown_ns in enumerate(self._shown_ns):
@@ -235,7 +235,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
-        """Drive the next untried axis, `prime` first; return the end time (ns), or None if all were tried."""
+        """Drive the next untried axis, `prime` first; return the end time (ns), or None after all axes."""
         candidates = axes - self._tried
         if not candidates:
             self._tried.clear()
@@ -306,7 +306,7 @@ class CoilMonitor:
         self._suspected_ns: int | None = None
         self._judge_ns = 0  # time (ns) after which a diagnosis may leave the kind of fault open
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
-        self._unmixed_ns = 0  # time (ns) from which readings show one circuit state
+        self._unmixed_ns = 0  # time (ns) since which the circuit has not changed
         self._evidence = Evidence(self._bounds)
         coils = len(settings.full_current)
         self._probe = Probe(_PROBE_CURRENT, _PROBE_HALF_NS, coils)
@@ -336,7 +336,7 @@ class CoilMonitor:
 
     @property
     def verdicts(self) -> tuple[CoilVerdict, ...]:
-        """The diagnoses of broken axes, at most one per axis, in order of time; they last until `forget`."""
+        """The diagnoses of broken axes, at most one per axis, in order of time; `forget` discards them."""
         return tuple(self._verdicts.values())
 
     @property
@@ -413,7 +413,11 @@ class CoilMonitor:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NO_AXES, written_ns: int | None = None
     ) -> None:
-        """Record the actual currents (n,), A, and brakes in force at `time_ns`, written at `written_ns`."""
+        """Record the actual coil currents (n,), A, and the braked bridges in force at `time_ns`.
+
+        The evaluation of the motion uses the time `written_ns`, at which the command was sent, if it is
+        given.
+        """
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
         # Without readings of the current monitor, the search for a stuck leg cannot succeed, and is ended.
@@ -551,7 +555,7 @@ class CoilMonitor:
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     def test_wave(self, wanted: FloatArray) -> FloatArray | None:
-        """Return the actual currents (n,), A, of a self-test instead of `wanted` ones, or None."""
+        """Return the actual currents (n,), A, of a self-test that replace the `wanted` currents, or None."""
         if self._self_test is None or not self._commands:
             return None
         if self.suspicion or self._leg.is_searching:
@@ -599,7 +603,7 @@ class CoilMonitor:
             self.interrupted(reading.time_ns)
 
     def _predictions(self, reading: PowerReading) -> list[Predicted]:
-        """Predict the newest ADC sample and, if the circuit did not change in the window, its mean."""
+        """Predict the newest ADC sample, and the window's mean unless the circuit changed in the window."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
         begin_ns, commands = reading.time_ns - _WINDOW_NS, self._commands
         if begin_ns >= self._unmixed_ns:
@@ -633,7 +637,7 @@ class CoilMonitor:
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
-        """Diagnose a fault if all evidence concerns one axis, or suspect no fault if readings are normal."""
+        """Diagnose a fault if all evidence concerns one axis, or end the suspicion if readings are normal."""
         evidence = self._evidence
         if len(evidence) < _EVIDENCE:
             return
@@ -647,8 +651,7 @@ class CoilMonitor:
             if waited:
                 self._conclude(*self._compared, now_ns)
             return
-        # The only remaining axis may be healthy if the fault has ended, or if only the motion indicated a
-        # fault.
+        # The only suspected axis may be healthy: the fault may have ended, or only the motion indicated it.
         certain = len(axes) == 1 and evidence.rejects_healthy_now(self._known)
         if certain and (len(left) == 1 or waited):
             axis, fault = left[0]

@@ -59,7 +59,7 @@ _NOTED_LATE_NS = 25_000_000
 
 
 class CoilCommands:
-    """A record of the commanded currents and of the braking; `braked` are the bridges braked now."""
+    """A record of the commanded currents and of the braking; `braked` lists the presently braked bridges."""
 
     def __init__(self, reach_ns: int) -> None:
         """Store commands for `reach_ns` ns."""
@@ -164,9 +164,10 @@ class ResponseSettings:
 
 
 _PERSISTENCE = 3
-"""Number of consecutive fits that must agree."""
+"""Number of consecutive fits that must agree on a finding about a coil."""
 _LOWEST_SOUND, _HIGHEST_FEEBLE, _HIGHEST_REVERSED = 0.6, 0.4, -0.5
-"""Smallest gain of a healthy coil, largest gain of a coil without torque, and of a reversed coil."""
+"""Gain thresholds: minimum of a healthy coil, maximum of a coil without torque, maximum of a reversed
+coil."""
 _MEMORY_NS = 20_000_000_000
 """Time (ns) for which residual accelerations are stored."""
 _STALE_NS = 200_000_000
@@ -266,9 +267,8 @@ class CoilResponse:
         self._turned: FloatArray = np.zeros(3)
         self._spun: FloatArray = np.zeros(6)  # integrals of the rate products, rad^2/s
         self._quiet_field: FloatArray | None = None
-        # Each bin has a row (f, n + 3 + k) for f free axes, n coils and k inertia error modes. The first
-        # columns of a row are n coil accelerations and the observed acceleration. The other columns of a row
-        # are mean rate, angle, and the accelerations that the k error modes cause.
+        # Row (f, n + 3 + k) of each bin, for f free axes, n coils and k inertia error modes.
+        # Columns of a row: n coil accelerations, observed acceleration, rate, angle, k error accelerations.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = self._walk = 0.0
@@ -609,8 +609,8 @@ def _solved_gains(
     covariance = np.linalg.inv(normal)
     rights = right + weights * expected
     gains = (covariance @ rights[:, :, None])[:, :, 0]
-    # The prior adds weight * (gain - expected)^2 to the cost for each gain. The term weight * expected^2 of
-    # this square equals the weight, because expected gains are 1 or -1.
+    # The prior adds weight * (gain - expected)^2 to the cost for each gain.
+    # Expected gains are 1 or -1, so the term weight * expected^2 equals the weight.
     costs = constant + weights.sum(axis=1) - (rights * gains).sum(axis=1)
     return gains, np.asarray(covariance.diagonal(axis1=1, axis2=2), dtype=np.float64), costs
 
@@ -681,7 +681,7 @@ class CoilCorrection:
     def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
         """Start from factors (n,) of an earlier boot, with relative deviations (n,).
 
-        Return why they were rejected, or "".
+        Return why the factors were rejected, or "".
         """
         sizes = np.abs(factors)
         if factors.shape != self.factors.shape or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
@@ -745,14 +745,13 @@ class MotionWitness:
         if observed is None:
             return fault not in _DRIVEN and self._response.is_healthy(axis)
         if math.isnan(observed):
-            # Without data from before the fault, only the present torque of the coil shows whether it is
-            # healthy.
+            # Without residuals from before the fault, only the present torque shows a healthy coil.
             return fault in _DRIVEN or self._response.is_healthy(axis)
         return observed < _LITTLE_RESPONSE
 
 
 _MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
-"""Maximum number of predictions in a segment, and of segments."""
+"""Maximum number of predictions in a segment, and maximum number of segments."""
 
 
 class Evidence:
@@ -801,7 +800,7 @@ class Evidence:
         ]
 
     def shows_working_monitor(self, known: Mapping[int, CoilFault]) -> bool:
-        """Return whether a healthy coil's current was measured in a probe, which is the clearest proof."""
+        """Return whether a probe showed a healthy coil's current, which proves that the monitor works."""
         return any(
             fits(segment, self._bounds, known) and any(one.mean[:, 0].any() for one in segment)
             for segment in list(self._segments)[1:]

@@ -88,7 +88,7 @@ class OnboardParameters:
             self._keep(msgspec.structs.replace(self._table, proven=True))
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Load a table instead of the one with the CRC `replaced`; return why it is rejected, or ""."""
+        """Replace the table with the CRC `replaced` by another; return why it is rejected, or ""."""
         if replaced != self._crc:
             return f"the table in use has CRC {self._crc:08x}, not {replaced:08x}: dump and check it again"
         before = self._table.values if self._table.proven else self._table.before
@@ -143,7 +143,7 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a section with the values of a table instead of its own. Raises ValidationError."""
+    """Return a configuration section with values replaced by a table. Raises ValidationError."""
     changes = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
     return msgspec.convert({**msgspec.to_builtins(section), **changes}, type(section))
 

@@ -21,8 +21,8 @@ several megabytes are not sent through a pipe. Each unexpected exit is reported 
 A worker that exits or exceeds its time limit is restarted, unless its budget of restarts is used up. The
 first restart is immediate, the second is delayed by half a second, and each later delay is twice as long as
 the previous one. The budget of restarts is reset when a worker has run for a minute. After `BUDGET`
-consecutive exits, the worker is not restarted for ten minutes. Then the worker's budget of restarts is reset,
-so that it recovers on a long flight once the cause has disappeared. A worker is therefore started at most
+consecutive exits, the worker is not restarted for ten minutes. After this pause, the budget is reset, so that
+a worker recovers on a long flight once the cause has disappeared. A worker is therefore started at most
 `BUDGET` times in 12 minutes.
 """
 
@@ -121,7 +121,10 @@ class JobRunner(Protocol):
 
 
 class LockStepRunner:
-    """Runs jobs in simulated time, for `borrowed_ns` ns of the calling thread; implements JobRunner."""
+    """Runs jobs in lock-step with simulated time; implements JobRunner.
+
+    The attribute `borrowed_ns` is the total real time (ns) of the jobs, which run in the calling thread.
+    """
 
     def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
         self._clock = clock
@@ -367,9 +370,8 @@ class WorkerProcess:
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
             # A separate process group protects the worker from Ctrl-C; the control process ends its worker.
-            # The group stays in the session of the control process. If the control process dies while a
-            # worker is stopped, the group is orphaned. The kernel then sends SIGHUP and SIGCONT to the group,
-            # which ends the stopped worker.
+            # The group is in the session of the control process, and is orphaned if the control process dies.
+            # The kernel ends a stopped worker in an orphaned group by sending SIGHUP and SIGCONT.
             process_group=0,
         )
 
@@ -390,7 +392,7 @@ class WorkerProcess:
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
-        """Submit a job. Raises FlightError if it cannot be sent, and EOFError if the process has ended."""
+        """Submit a job. Raises FlightError if the job is too large, and EOFError if the process has ended."""
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
@@ -402,7 +404,10 @@ class WorkerProcess:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
 
     def receive(self) -> JobAnswer | None:
-        """Return an answer, or None. Raises EOFError if the process has ended, and FlightError for damage."""
+        """Return an answer, or None if no answer has arrived.
+
+        Raises EOFError if the process has ended, and FlightError for a damaged answer.
+        """
         try:
             while chunk := self._socket.recv(1 << 16):
                 self._received += chunk
@@ -430,7 +435,7 @@ class WorkerProcess:
             with suppress(subprocess.TimeoutExpired):  # the process may still be writing while it ends
                 status = self._process.wait(0.05)
         self._process.kill()
-        with suppress(subprocess.TimeoutExpired):  # one that hangs in the kernel is reaped at a later start
+        with suppress(subprocess.TimeoutExpired):  # a process that hangs in the kernel is reaped later
             self._process.wait(_REAPED_WITHIN_S)
         self._socket.close()
         self._slab.close()

@@ -43,7 +43,8 @@ Reactor = Callable[[EventKind, int, str], None]
 class EventLog:
     """Passes events to a sink, and limits the number of written events of each kind.
 
-    The attributes `count` and `counts` include held back events; `first_texts` are texts of first events.
+    The attributes `count` and `counts` include events held back. The attribute `first_texts` contains the
+    text of the first event of each kind.
     """
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
@@ -57,7 +58,7 @@ class EventLog:
         self.first_texts: dict[EventKind, str] = {}
 
     def react_by(self, react: Reactor) -> None:
-        """Call `react` for every event whose reaction is more than a record, including events held back."""
+        """Call `react` for every event with a reaction besides recording, including events held back."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
@@ -211,7 +212,7 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update a condition, which `holds` or is unknown (None); report a change as an event with `text`."""
+        """Update a condition (`holds` is None if unknown); report a change as an event with `text`."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -372,7 +373,7 @@ class StreamWatch:
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the readings are poor (None if unknown or reported otherwise), and why."""
+        """Return whether the readings are poor, and why; None if unknown or reported by other conditions."""
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"

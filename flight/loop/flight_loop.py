@@ -63,7 +63,10 @@ _NAN4 = np.full(4, np.nan)
 
 @dataclass(frozen=True, slots=True)
 class LoopTasks:
-    """The tasks of the loop, in the order of the data flow; None without a device or command channel."""
+    """The tasks of the loop, in the order of the data flow.
+
+    A task is None if its device or command channel is not configured.
+    """
 
     navigation: Navigation
     imaging: Imaging | None
@@ -345,8 +348,7 @@ class FlightLoop:
         self._output: ControlOutput | None = None
         self._groups = self._rate_groups()
         tasks.health.watch(self._groups)
-        # In a lock-step simulation, this thread also executes the jobs. Their time does not count as
-        # execution time of the rate groups.
+        # Execution times exclude the jobs, which this thread also executes in a lock-step simulation.
         jobs = services.jobs
         self._executive = CyclicExecutive(
             services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns

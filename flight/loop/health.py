@@ -190,7 +190,7 @@ class Board:
         self._thermal = thermal or Path("/sys/class/thermal")
 
     def __call__(self, now_ns: int) -> ResourceSample:
-        """Return the board's resources now."""
+        """Return the present use of the board's resources."""
         process = os.getpid()
         # The process name in brackets may itself contain brackets and blanks.
         # User and system time are fields 14 and 15 of the line (proc(5)).
@@ -243,7 +243,7 @@ _SHORTEST_LIMIT_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class WorkerWatch:
-    """A worker to watch; `busy_since_ns` returns when its job began (ns), or None while it is idle."""
+    """A worker to watch; `busy_since_ns` returns when the worker's job began (ns), or None without a job."""
 
     name: str
     busy_since_ns: Callable[[], int | None]
@@ -312,7 +312,7 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report skipped slots of the control group; only then do other groups skip slots."""
+        """Report skipped slots of the control group; other groups skip slots only when it does."""
         if group.name != CONTROL:
             return
         self.lost += slots
@@ -656,7 +656,7 @@ class Shedding:
         frames: Callable[[], tuple[int, int]],
         services: Services,
     ) -> None:
-        """Start without reductions; `apply` applies a level, and `frames` counts untaken and late frames."""
+        """Start without reductions; `apply` applies a level, `frames` counts omitted and late frames."""
         self._signs, self._plans, self._apply, self._frames = tuple(signs), plans, apply, frames
         self._recorder, self._events = services.recorder, services.events
         self._level = 0

@@ -436,9 +436,9 @@ class ObjectTracks:
         attitude: CameraAttitude | None,
         now_ns: int,
     ) -> None:
-        """Accept the points of light `seen` in a frame without identified stars.
+        """Accept the point sources `seen` in a frame without identified stars.
 
-        The `attitude` of the camera at mid-exposure is estimated, or None if unknown.
+        The argument `attitude` is the camera's estimated attitude at mid-exposure, or None if unknown.
         """
         predicted = self._predicted(middle_ns, motion, attitude)
         pixel = float(seen.sigma.min(initial=1.0)) / FLOOR_PX
@@ -453,8 +453,7 @@ class ObjectTracks:
         unknown = np.full(len(directions), np.nan)
         common = turn @ place.covariance @ turn.T
         sighted = MeasuredObjects(seen.points[kept], directions, covariance, unknown, common)
-        # Without an attitude, the directions are recorded in the axes of the star field, whose orientation is
-        # unknown.
+        # Without an attitude, directions are in axes of the star field, whose orientation is unknown.
         known = CameraAttitude(place.quaternion, np.eye(3)) if attitude is None else attitude
         to_estimate = attitude_matrix(known.quaternion).T @ turn.T
         self._track(sequence, middle_ns, sighted, now_ns, to_estimate)
@@ -483,7 +482,10 @@ class ObjectTracks:
     def _track(
         self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int, to_estimate: FloatArray
     ) -> None:
-        """Record sightings, update the tracks, and report changes; `to_estimate` (3, 3) rotates the axes."""
+        """Record sightings, update the tracks, and report changes.
+
+        The matrix `to_estimate` (3, 3) rotates directions into the axes of the attitude estimate.
+        """
         x, y = np.reshape(sighted.points, (-1, 2)).T
         self._recorder.record(
             SIGHTINGS,
@@ -593,7 +595,7 @@ class Imaging:
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
         self._rest_ns = 0
-        self._ordered: tuple[int, int] | None = None  # start and duration (ns) of an ordered exposure
+        self._ordered: tuple[int, int] | None = None  # start and duration (ns) of a scheduled exposure
         self._due_ns: int | None = None  # time (ns) after which the oldest trigger's frame is late
         self._rows = RepeatedRows()
         self._busy_since_ns = self._frames = 0
@@ -640,7 +642,7 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Order the next exposure of the star camera, if one may be made now.
+        """Schedule the next exposure of the star camera, if an exposure is permitted now.
 
         No exposure is made while the body rotates faster than permitted, or too soon while the battery is
         low. Exposures are less frequent while the attitude estimate is accurate and the body rotates slowly.

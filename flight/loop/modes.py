@@ -111,7 +111,7 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
     },
-    Mode.SAFE: {  # SAFE is left by command, or if a low battery was its cause; pointing needs an acquisition
+    Mode.SAFE: {  # a command or the end of a low battery ends SAFE; pointing needs acquisition
         **_USUAL,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
@@ -185,7 +185,10 @@ class ModeChange:
 
 
 class ModeMachine:
-    """State machine that determines mode changes, without carrying them out; the last is at `since_ns`."""
+    """State machine that determines mode changes, but does not carry them out.
+
+    The last mode change was at `since_ns` (ns).
+    """
 
     def __init__(self, table: Table = TRANSITIONS) -> None:
         """Begin in BOOT. Raises FlightError for an invalid transition table."""
@@ -447,7 +450,8 @@ class ModeControl:
         Args:
             estimate: state estimate of this cycle, or None while the attitude is not known.
             rate: magnitude (rad/s) of the newest body rate measured in this cycle, or None without a reading.
-            overdue: angle (rad) between body and attitude required now, or None while none is required.
+            overdue: angle (rad) between the body and the presently required attitude, or None if no attitude
+                is required.
             coils_answer: whether the PWM chip acknowledges commands.
             now_ns: time (ns) of the cycle.
             accurate: whether the estimate is accurate enough for driving the coils.

@@ -295,7 +295,10 @@ class Navigation:
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of a frame over the next cycles; `report` gets flags of those accepted."""
+        """Apply measurements of a frame over the next cycles.
+
+        The function `report` receives one flag for each measurement: whether the measurement was accepted.
+        """
         if self._filter.started:
             self._filter.measure_late(late, report)
         else:
@@ -349,7 +352,7 @@ class Navigation:
 GPS_DELAY_NS = 100_000_000
 """Delay (ns) from the time of a GPS fix to the first byte of the receiver's report; at most 0.2 s."""
 FIX_PERIOD_NS = 10 * SECOND_NS
-"""Shortest time (ns) between two recorded fixes, and between two records of the line's counters."""
+"""Shortest time (ns) between two recorded fixes, and between two records of the serial line's counters."""
 _COUNTERS = tuple(field.name for field in GPS_LINK.fields)
 _RECORDED = ("utc_ns", "position", "velocity", "sigma", "velocity_sigma", "satellites")
 
@@ -520,8 +523,7 @@ class HorizonCameraTask:
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
         self._pictures = [b""] * len(cameras)
-        # The tuple of a job holds the time (ns) at which its exposures began, the bit mask of its cameras,
-        # and the time (ns) of its submission.
+        # The present job: start time of exposures (ns), bit mask of cameras, submission time (ns).
         self._job: tuple[int, int, int] | None = None
 
     def begin(self, time_ns: int) -> None:

@@ -32,7 +32,7 @@ LONGEST_STEP = 5.0
 STUCK_FOR, STUCK_RANGE = 10.0, 0.02
 """A monitor counts as stuck if its reading does not change for `STUCK_FOR` s, while the voltage of the other
 monitor changes by `STUCK_RANGE` V. Both monitors measure the same voltage, and 0.02 V are five steps of the
-converter."""
+analogue-to-digital converter."""
 CELL_RANGE = (1.0, 4.6)
 """Range (V) of the voltage of a cell, outside which a reading is wrong."""
 DIFFERENCE = 0.1
@@ -160,7 +160,7 @@ class PowerTask:
         )
 
     def summary(self) -> str:
-        """Return charge and energies as text, for the end of a flight."""
+        """Return state of charge and energies as text, for the end of a flight."""
         if math.isnan(self._estimate.charge):
             return "state of charge unknown"
         gained, used = self._energy

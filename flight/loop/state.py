@@ -193,7 +193,7 @@ class Noted:
 def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
     """Return the state of the next boot, marked as running; a crash of the last boot is recorded in it.
 
-    Parameters of other `devices` are discarded. After a crash, the previous table replaces an unproven one.
+    Parameters of other `devices` are discarded. After a crash, the previous table replaces an unproven table.
     """
     unclean = state.unclean
     if state.running:
@@ -274,7 +274,8 @@ def start_from(
 ) -> tuple[SlowPrior, list[str]]:
     """Return the filter's prior, and the reasons why learned parameters were rejected.
 
-    Without learned parameters, the prior is `configured`. Values may have changed by `changed` of its sigmas.
+    Without learned parameters, the prior is `configured`. Each learned value may have changed by `changed`
+    times its standard deviation in `configured`.
     """
     problems: list[str] = []
 
@@ -551,7 +552,7 @@ class StateKeeper:
         self.learned: Mapping[str, Learned] = self._begun.learned
         self.table = self._begun.table
         self._noted = Noted(self._begun.mode, {}, self.table)
-        self._writing = threading.Lock()  # held while writing, never acquired by note()
+        self._writing = threading.Lock()  # lock held while writing, not acquired by note()
         self._closed = False
         self._report_changes(loaded)
         self.counted = store.store(self._begun)
@@ -589,7 +590,7 @@ class StateKeeper:
         return self._notices.drain()
 
     def close(self, clean: bool) -> None:
-        """Write the final state with the kind of end, waiting at most 5 s. May be called twice."""
+        """Write the final state and whether the end is `clean`, waiting at most 5 s. May be called twice."""
         self._ticker.stop()
         if self._closed or not self._writing.acquire(timeout=_HUNG_DISK_S):
             self._closed = True
@@ -625,7 +626,7 @@ class StateKeeper:
 
 
 def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
-    """Return the configured folder of the state, or that of systemd, or None if there is no folder."""
+    """Return the configured folder of the state, or systemd's state folder, or None without either."""
     if config.state.folder is not None:
         return Path(config.state.folder)
     if config.simulation is not None:

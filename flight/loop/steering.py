@@ -159,7 +159,11 @@ class CoilDrive:
     def send(
         self, currents: FloatArray, field: Callable[[], FloatArray | None], *, testable: bool = False
     ) -> None:
-        """Command the currents (3,), A, which a self-test may replace, reallocated in the `field` (3,), T."""
+        """Command effective currents (n,), A, which a self-test may replace if `testable`.
+
+        Unless all coils are usable and within their limits, the current is reallocated among the usable coils
+        by the magnetic field (3,), T, that `field` returns.
+        """
         watch, settings = self._watch, self._settings
         sizes = watch.correction.sizes
         # A weak coil reaches its limit at a smaller effective current.

@@ -207,7 +207,7 @@ def pack_values(value: Any, slab: mmap.mmap) -> bytes:
 
 
 def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
-    """Return the value of a message of `pack_values`. Raises FlightError for a damaged message."""
+    """Return the value in a message from `pack_values`. Raises FlightError for a damaged message."""
     try:
         return decode_values(*_parts(message, slab))
     except FlightError:

@@ -609,9 +609,10 @@ def camera_model(camera: Camera | WideCamera) -> CameraModel:
 
 
 def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
-    """Return the mask (rows, columns) of the pixels that show the spacecraft, without `of_file` by polygons.
+    """Return the mask (rows, columns) of the pixels that show the spacecraft.
 
-    Raises UsageError for a wrong file, and if more than half of the image is hidden.
+    The image file is ignored if `of_file` is false. Raises UsageError for a wrong file, and if more than half
+    of the image is hidden.
     """
     mask = polygon_mask(camera.rows, camera.columns, camera.structure)
     if of_file and camera.structure_file is not None:
@@ -686,15 +687,15 @@ class Driver:
         open: function that takes the rig and the section, and returns the driver (`hal.interfaces.devices`).
             A driver of coils must be passive until its method `start` is called.
         probe: function that takes a rig and the section, queries the device without changing its state, and
-            returns its answer as text. This function raises DeviceError if the device does not answer.
+            returns its answer as text, or raises DeviceError without an answer.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
-            device to the emulated wires, and returns the device. A camera driver needs no such function,
+            device to the emulated wires, and returns the device. A camera driver needs no function `emulate`,
             because the simulator emulates the cameras of all drivers. A device of another package without an
             emulator can only be used on hardware.
         files: function that returns the device files that the section names.
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils
-            off in any state of the chips. The guardian executes these writes if the flight process fails.
+            off in any state of the chips; the guardian executes these writes if the flight process fails.
     """
 
     kind: str

@@ -83,7 +83,7 @@ configuration may import, in addition to the known objects."""
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
-    """Return the object `module:object`, or that of a key of `known`. Raises ConfigError.
+    """Return the object `module:object`; `known` maps short names to such objects. Raises ConfigError.
 
     A flight computer imports only known objects and those in the file of the variable `KNIGHTCUBE_MODULES`.
     """
@@ -205,7 +205,7 @@ def read_text(path: Path) -> str:
 
 
 def names() -> list[str]:
-    """Return the bare names of the packaged configurations."""
+    """Return the names of the packaged configurations, without `.yaml`."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 

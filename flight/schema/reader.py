@@ -385,9 +385,9 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
 
 
 def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
-    """Return the networks from which the link accepts frames, as its sandbox does. Raises ValueError.
+    """Return the networks from which link and service sandbox accept frames. Raises ValueError.
 
-    Without UDP, TCP and KISS there are none.
+    The result is empty without UDP, TCP and KISS.
     """
     lines = (link.udp, link.tcp, link.kiss) if link.peers is None else (link.kiss,)
     hosts = [address.rpartition(":")[0] for address in lines if address is not None]

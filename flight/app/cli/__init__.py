@@ -42,7 +42,7 @@ class _Outlet(io.FileIO):
 
 
 def outlast_readers() -> None:
-    """Let the process outlast the readers of its output; streams that a caller replaced stay unchanged."""
+    """Let the process continue if its output is closed; streams that a caller replaced stay unchanged."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
@@ -122,7 +122,7 @@ def _obey(words: Sequence[str]) -> int:
     try:
         try:
             parser = _parser(_typed() or words)
-        except OSError as error:  # an unreadable module is a failure, not a mistake of the user
+        except OSError as error:  # a module that cannot be imported is not a mistake of the user
             raise FlightError(str(error)) from error
         _complete(parser)
         options = parser.parse_args(words)

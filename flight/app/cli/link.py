@@ -85,7 +85,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def link(options: argparse.Namespace) -> int:
-    """Run the link until a signal arrives. Raises ConfigError; any other error ends with a restart."""
+    """Run the link until a signal arrives. Raises ConfigError, and FlightError for other errors."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -103,7 +103,7 @@ def link(options: argparse.Namespace) -> int:
 
 
 def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
-    """Start the link as soon as this is possible, and run it until `ended` returns true."""
+    """Retry the start of the link until it succeeds, and run the link until `ended` returns true."""
     with ExitStack() as stack:
         retry = StartRetry(ended)
         stack.callback(retry.close)
@@ -125,7 +125,7 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
 
 
 def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
-    """Return a valid configuration, and why it replaces the requested one. Raises ConfigError."""
+    """Return a valid configuration, and why it replaces the requested configuration. Raises ConfigError."""
     # A service stores the flown configurations in the folder that also contains its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
@@ -137,7 +137,7 @@ def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
 def _open(
     log: Path, inhibit: SeparationInhibit, judged: tuple[Config, str], stack: ExitStack
 ) -> tuple[Station, str]:
-    """Open the station after the separation inhibit, and return it with the names of its lines."""
+    """Open the station after the separation inhibit; return it with the names of its communication lines."""
     (config, problem), clock = judged, SystemClock()
     section, commands = config.link, config.commands.socket
     assert section is not None
@@ -174,13 +174,13 @@ def _open(
 
 
 def _witness(keys: Path) -> Path:
-    """Return the second state folder of a service, or else a folder beside the keys, for the reference."""
+    """Return the path of the reference folder: a service's second state folder, or one beside the keys."""
     folders = os.environ.get("STATE_DIRECTORY", "").split(":")
     return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"
 
 
 def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: ExitStack) -> list[Line]:
-    """Open the configured lines, which `stack` closes. Raises UsageError and DeviceError."""
+    """Open the configured communication lines, which `stack` closes. Raises UsageError and DeviceError."""
     peers, lines = peer_networks(section), list[Line]()
 
     def add(line: Line) -> None:

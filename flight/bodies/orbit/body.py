@@ -218,7 +218,7 @@ class OrbitFeed:
 
 
 SUNLIT_SHARE = 0.5
-"""Fraction of the peak current of a solar string above which the string is in sunlight."""
+"""Fraction of its peak current above which a string of solar cells is in sunlight."""
 _BELOW = 0.8
 """Largest rate of a planned path, as a fraction of the rate at which detumbling starts."""
 
@@ -327,7 +327,7 @@ class SatelliteEstimation(BodyEstimation):
         return estimate.rate
 
     def fastest_by_field(self) -> float:
-        """Return the magnetometer's body rate (rad/s) plus one sigma, or infinity without a rate."""
+        """Return the body rate from the magnetometer plus its standard deviation, rad/s, or infinity."""
         found = self.orbit_filter.rate_by_field()
         if found is None:
             return math.inf
@@ -482,7 +482,7 @@ _UNIFORM = 1.0 / math.sqrt(3.0)
 
 
 def description_errors(config: OrbitConfig) -> BodyErrors:
-    """Return the configured accuracies of the satellite's description."""
+    """Return the configured errors of the satellite's properties."""
     craft, unit = config.craft.accuracy, config.inertial_unit.accuracy
     camera = 0.0 if config.camera is None else math.radians(config.camera.accuracy.mounting_deg)
     return BodyErrors(
@@ -601,13 +601,12 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
     air, dipole = np.array(config.largest_torques()) / float(np.linalg.eigvalsh(inertia)[0])
 
     def disturbance(time_ns: int) -> float:
-        """Return the largest expected disturbance (rad/s^2), without air drag while the orbit is unknown."""
+        """Return the largest acceleration (rad/s^2) by disturbances, without drag for an unknown orbit."""
         state = environment.state(time_ns)
         density = 0.0 if state is None else mean_density(float(np.linalg.norm(state.position)))
         return float(dipole + air * density)
 
-    # The Earth's magnetic field is 16 times weaker than the testbed's field, so a coil's torque takes longer
-    # to detect.
+    # A coil's torque is detected more slowly than on the testbed, whose magnetic field is 16 times stronger.
     response = ResponseSettings(
         inertia,
         config.coils.map().dipoles,

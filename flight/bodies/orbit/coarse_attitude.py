@@ -199,7 +199,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether horizon frames can improve the attitude; in eclipse, they improve only a lost attitude."""
+        """Whether horizon frames are needed; in eclipse, they are used only while the attitude is lost."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)
@@ -346,7 +346,7 @@ def horizon_camera_feed(
 def _spread(
     sight: VectorObservation, turn: FloatArray, claim: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return deviation (2,) and covariance (2, 2) of a direction, and the attitude's covariance (2, 2)."""
+    """Return deviation (2,) of a direction, its covariance (2, 2), and that of its prediction (2, 2)."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
     # A small rotation e changes a direction d by the cross product d x e.

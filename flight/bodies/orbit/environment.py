@@ -91,7 +91,7 @@ class Witness:
 
 
 class FixSequence:
-    """GPS fixes of one orbit and one offset of the receiver's time; `joined` fixes agree with `first`."""
+    """GPS fixes with consistent orbit and receiver time; `joined` is the number that agree with `first`."""
 
     def __init__(self, fix: GpsFix, offset_ns: int) -> None:
         """`offset_ns` is the receiver's UTC minus the time of the host's clock."""
@@ -99,7 +99,7 @@ class FixSequence:
         self.joined = 1
         self._offset_ns = offset_ns
         self._offered = 1
-        self._strength = np.zeros(3)  # sum of squared field deviations from each orbit; their number
+        self._strength = np.zeros(3)  # sum of squared field deviations from two orbits; number of fields
         self._is_refuted = False
         self._shadowed = np.zeros(2)  # sunlit fixes at which each orbit predicts shadow
 
@@ -193,8 +193,7 @@ class EstimatedEnvironment:
         self._fixed_ns = 0
         self._near: Ephemeris | None = None
         self._near_sigma = 0.0
-        # Magnetic field, air and solar radiation pressures, and visible fraction of the Sun at the predicted
-        # times.
+        # Predicted magnetic field, air and solar radiation pressures, and visible fraction of the Sun.
         self._near_table: FloatArray = np.zeros((0, 10))
         self.refused = 0
         self.refusal = ""
@@ -211,7 +210,10 @@ class EstimatedEnvironment:
 
     @property
     def clock_doubt(self) -> str:
-        """Why the host's clock is doubted: it precedes the elements by `EARLIEST` days; or an empty text."""
+        """The reason why the host's clock is considered wrong, or an empty text.
+
+        The clock is wrong if it precedes the epoch of the elements by more than `EARLIEST` days.
+        """
         if self._utc_offset_ns is not None or self._elements is None:
             return ""
         early = self._elements.epoch - UNIX_EPOCH - self._clock.utc_ns() / (DAY * SECOND_NS)
@@ -220,7 +222,7 @@ class EstimatedEnvironment:
         return f"the wall clock is {early:.1f} days before the epoch of the elements: the orbit is unknown"
 
     def julian_date(self, now_ns: int) -> float:
-        """Return the Julian date (UTC) at a time, by the GPS receiver or, before a fix, the host's clock."""
+        """Return the Julian date (UTC) at a time, by GPS or, before a GPS fix, by the host's clock."""
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
@@ -349,7 +351,7 @@ class EstimatedEnvironment:
         return near, np.array([seconds])
 
     def _impossibility(self, fix: GpsFix) -> str:
-        """Return why a fix is impossible in itself, or an empty text if the fix is possible."""
+        """Return why a fix is physically impossible, or an empty text if the fix is possible."""
         perigee, radius = fix.at(fix.julian_date).perigee_radius, float(np.linalg.norm(fix.position))
         if not (perigee >= LOWEST_ORBIT and radius >= LOWEST_ORBIT):
             return f"radius {1e-3 * radius:.0f} km, perigee radius {1e-3 * perigee:.0f} km is not an orbit"
@@ -416,7 +418,7 @@ class EstimatedEnvironment:
         return self._sequences[-1]
 
     def _is_in_time(self, offset_ns: int, time_ns: int) -> bool:
-        """Return whether the receiver's time continues the time of the fixes that were used."""
+        """Return whether the receiver's time is consistent with that of the used fixes."""
         known = self._utc_offset_ns
         gate = TIME_GATE_NS + CLOCK_DRIFT * abs(time_ns - self._fixed_ns)
         return known is None or abs(offset_ns - known) <= gate
@@ -429,7 +431,7 @@ class EstimatedEnvironment:
         return False
 
     def _agrees_with_elements(self, fix: GpsFix) -> bool:
-        """Return whether a fix agrees with the elements, or these are missing or contradicted."""
+        """Return whether a fix agrees with the elements; true for missing or contradicted elements."""
         elements = self._elements
         return elements is None or self._enlarged > 1.0 or _agree(elements, fix, LEAST_GATE)
 
@@ -455,8 +457,8 @@ class EstimatedEnvironment:
 
 
 STUCK, FIELDS_CONTRADICTED = 20, 4
-"""Number of consecutive equal field measurements, and of consecutive contradicting ones, that show a
-fault."""
+"""Numbers of consecutive measurements that indicate a fault: equal fields, and contradictions of the
+model."""
 
 
 class StuckFieldCheck:
@@ -472,7 +474,7 @@ class StuckFieldCheck:
         return self._same >= STUCK
 
     def accept(self, field: FloatArray) -> bool:
-        """Accept the field (3,) of a reading, and return whether the magnetometer is working, not stuck."""
+        """Accept the field (3,) of a reading, and return whether the magnetometer is not stuck."""
         values = field.tolist()
         self._same, self._last = (self._same + 1 if values == self._last else 0), values
         return not self.stuck

@@ -81,7 +81,7 @@ UNKNOWN_AGE = 86_400.0
 
 
 def _places(*parts: slice) -> IntArray:
-    """Return the indices, counted within the slow states, of slices of the filter's state vector."""
+    """Return the indices, among the slow states, of slices of the filter's state vector."""
     return np.asarray(np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start)
 
 
@@ -109,7 +109,8 @@ def start_from(
 ) -> tuple[SlowStates, list[str]]:
     """Return the prior of the slow states at a time (UTC, s), and why learned states were rejected.
 
-    The expected residual dipole is `dipole` (3,), A m^2. States change by `changed` initial sigmas at a boot.
+    The expected residual dipole is `dipole` (3,), A m^2. A boot changes each state by `changed` times its
+    initial standard deviation (one sigma).
     """
     initial, walks = layout.prior[SLOW, SLOW], layout.walks[SLOW]
     prior = SlowStates(np.zeros(len(initial)), initial.copy())
@@ -213,7 +214,7 @@ class StepReplay:
         self.refused_gyros = self.refused_fields = self.contradicted = 0
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
-        self._innovation = "body", 0.0  # states that the newest gyro innovation tests; its normalised square
+        self._innovation = "body", 0.0  # states that the newest gyro innovation tests, and its square
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
@@ -312,7 +313,7 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in step `place`; if `doubted`, earlier estimates were contradicted."""
+        """Start from an attitude in step number `place`; `doubted` if earlier estimates were contradicted."""
         first = self.steps[place]
         self.free.start(
             attitude.quaternion,
@@ -339,7 +340,7 @@ class StepReplay:
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
         """Return the newest field with the mean gyro rate (3,), rad/s, of its step, or None without a field.
 
-        Its covariance includes the unknown magnetometer bias.
+        The field's covariance includes the unknown magnetometer bias.
         """
         step = next((step for step in reversed(self.steps) if step.field is not None), None)
         if step is None or step.field is None:
@@ -401,7 +402,7 @@ class StepReplay:
         for begin_ns, end_ns in itertools.pairwise(times_ns):
             part = (end_ns - begin_ns) / SECOND_NS
             dipole, impulse = self._dipoles.mean(begin_ns, end_ns), self._dipoles.impulse(begin_ns, end_ns)
-            # Double time integral of the dipole minus that of a constant dipole with the same mean.
+            # Double time integral (A m^2 s^2) of the dipole's deviation from its mean.
             uneven = part * (0.5 * part * dipole - impulse)
             self.free.advance(part, dipole, step.around, step.doubt, uneven)
 
@@ -524,7 +525,7 @@ class OrbitFilter:
 
     @property
     def measured_ns(self) -> int:
-        """The time of the newest reading."""
+        """The time (ns) of the newest reading."""
         return self._open.end_ns if self._open is not None else 0
 
     @property
@@ -655,7 +656,8 @@ class OrbitFilter:
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
         """Start from a finite attitude within the history, and return whether the attitude was used.
 
-        The previous estimate was contradicted if `doubted`, which makes its learned states less accurate.
+        If `doubted`, the previous estimate was contradicted, and its learned states are considered less
+        accurate.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)
@@ -686,8 +688,7 @@ class OrbitFilter:
             for m in late:
                 if not isinstance(m, AttitudeMeasurement) or id(m) not in known - used:
                     continue
-                # If an attitude that is more accurate than the estimate is rejected, the learned dipoles are
-                # wrong.
+                # Learned dipoles are wrong if an attitude more accurate than the estimate is rejected.
                 sigma = math.sqrt(float(m.covariance.diagonal().max()))
                 if self.knowledge is Knowledge.FINE and sigma < self._free.worst_sigma:
                     used = self._replay.make_room(m, self._placed_ns)
@@ -699,8 +700,7 @@ class OrbitFilter:
             self._refused_attitudes = 0 if was else self._refused_attitudes + 1
             if was:
                 self._placed_ns = m.time_ns
-            # An accurate (fine) estimate restarts after several contradicting attitudes, a coarse one after
-            # the first.
+            # One contradicting attitude restarts a coarse estimate; a fine estimate needs several.
             patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
             if self._refused_attitudes >= patience:
                 self.begin(m, doubted=True)

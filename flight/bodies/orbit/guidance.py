@@ -89,12 +89,12 @@ class _Followed:
 class PointingPaths:
     """The path that the satellite follows; implements `flight.loop.body.FlownPaths`.
 
-    The angle (rad) between body and path at the last command is `off`. The attribute `astray` holds damping
-    and replanning of a body far off its path.
+    The angle (rad) between body and path at the last command is `off`. The attribute `astray` controls
+    damping and replanning of a body far off its path.
     """
 
     def __init__(self, limit: float | FloatArray, fastest: float) -> None:
-        """Start without a path; `limit` is the largest mean dipole, `fastest` the largest rate (rad/s)."""
+        """Start without a path; mean dipoles are limited to `limit` (A m^2), rates to `fastest` (rad/s)."""
         self._limit, self._fastest = limit, fastest
         self._followed: _Followed | None = None
         self._next: _Followed | None = None
@@ -167,7 +167,7 @@ class PointingPaths:
         return over
 
     def sample(self, now_ns: int) -> PathPoint | None:
-        """Return the planned motion now, or None without a path or after its end."""
+        """Return the planned motion at this time, or None without a path or after its end."""
         if self._next is not None and now_ns >= self._next.begin_ns:
             self._followed, self._next, self.off = self._next, None, 0.0
         followed = self._followed
@@ -238,7 +238,7 @@ class PointingTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError for a q2, as for the testbed."""
+        """Return the target of command `number`. Raises UsageError for a q2, a target of the testbed."""
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite needs a pointing goal; a target q2 is for the testbed")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
@@ -251,7 +251,7 @@ class PointingTargets:
         return Target(KEPT, PointingTargetLaw(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return True, because every attitude can be held on average over a revolution."""
+        """Return True, because the coils can hold every attitude on average over one orbital revolution."""
         return True
 
     def speed(self, estimate: Estimate) -> float:
@@ -289,10 +289,14 @@ class Sensor:
 
 
 class ObjectAim:
-    """Adapts the planner's jobs to an object it `seeks`, whose track has `moved` since the last plan."""
+    """Adapts the planner's jobs to an object that the satellite searches for or follows.
+
+    The flag `seeks` states whether the target is an object, and `moved` whether its track has changed since
+    the last plan.
+    """
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """Start without an object; without a search, `sensor` is None. `limit` is the mean dipole limit."""
+        """Start without an object; without a search, `sensor` is None. `limit` (A m^2) limits dipoles."""
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
         self._place: FloatArray | None = None
@@ -350,7 +354,7 @@ class ObjectAim:
         return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
-        """Report an event if the object will leave the field of view on the path that `table` holds."""
+        """Report an event if the object will leave the field of view on the path in `table`."""
         sensor, sight = self._sensor, job.sight
         if sensor is None or sight is None or not sight.velocity.any():
             return
@@ -381,7 +385,7 @@ class ObjectAim:
         return next((track for track in self._tracks if track.number == self._followed > 0), None)
 
     def _searched(self, quaternion: FloatArray) -> FloatArray:
-        """Return the commanded search direction (3,), or that of the camera when the search began."""
+        """Return the commanded search direction (3,), or the camera's direction when the search began."""
         if self._place is None:
             assert self._target is not None
             assert self._sensor is not None
@@ -420,8 +424,8 @@ class LearnedBody:
 
 ACROSS = 0.03
 """Largest dipole moment normal to the plane of two usable coils in a slew, as a fraction of the weakest
-coil's. The limit reduces the torque little, because a dipole moment in the plane of the two coils can produce
-nearly every possible torque."""
+coil's dipole moment. The limit reduces the torque little, because a dipole moment in the plane of the two
+coils can produce nearly every possible torque."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -452,7 +456,7 @@ class PointingPlanner:
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """Start without a plan; `learned` returns the estimated body, `usable` flags of coils in use."""
+        """Start without a plan; `learned` returns body properties, and `usable` the flags of coils in use."""
         self._craft, self._paths, self._environment = craft, paths, environment
         self._learned, self._usable, self._objects = learned, usable, objects
         self._areas = box_areas(craft.inertia)
@@ -514,7 +518,7 @@ class PointingPlanner:
         if job is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
-        # Disturbance torques along the field may temporarily move the body off its target, without a slew.
+        # Disturbance torques along the field move the body off its target temporarily, which needs no slew.
         if self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None:
             job = replace(job, slew=None)
         job = self._objects.directed(job)

@@ -186,7 +186,7 @@ class OpenStep:
     def close(
         self, dipole: FloatArray, doubt: float, around: FilterEnvironment, by_field: RateByField
     ) -> FilterStep:
-        """Return the finished step; without a gyro reading, its rate is that of the magnetometer."""
+        """Return the finished step; without a gyro reading, its rate is estimated from the magnetometer."""
         samples, fields = len(self._rates), len(self._fields)
         rate, spread = (np.mean(self._rates, axis=0), None) if samples else by_field
         return FilterStep(
@@ -293,7 +293,7 @@ class PropagatedEstimate(Estimate):
 
 
 class EstimatePropagation:
-    """Propagates estimates to times within a step; covariances, which are slow, only if they are read."""
+    """Propagates estimates to times within a step; covariances are computed only if they are read."""
 
     def __init__(self, free: FreeFilter) -> None:
         self._free = free

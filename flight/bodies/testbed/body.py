@@ -89,13 +89,13 @@ _VACUUM_PERMEABILITY = 4e-7 * math.pi  # T m/A
 
 
 class UnitFeed:
-    """Starts and updates the filter from the unit's attitude and rate; implements `ReadingFeed`.
+    """Starts and updates the filter from attitude and rate of the inertial unit; implements `ReadingFeed`.
 
-    The unit's own attitude filter depends on its gyro. While the rate is invalid, the angle about the thread
-    therefore follows from the horizontal magnetic field, and the rate from the plant model. The field of the
-    body's own coils at the magnetometer is not known. The unknown field is treated as an error that stays
-    constant for `_CONSTANT_FOR` seconds and is as large as the field at the centre of a coil. While the coils
-    are driven, star attitudes and streak rates therefore outweigh the magnetometer.
+    The inertial unit's own attitude filter depends on its gyro. While the rate is invalid, the angle about
+    the thread therefore follows from the horizontal magnetic field, and the rate from the plant model. The
+    field of the body's own coils at the magnetometer is not known. The unknown field is treated as an error
+    that stays constant for `_CONSTANT_FOR` seconds and is as large as the field at the centre of a coil.
+    While the coils are driven, star attitudes and streak rates therefore outweigh the magnetometer.
     """
 
     def __init__(
@@ -252,7 +252,8 @@ class TestbedEstimation(BodyEstimation):
     def is_accurate(self, estimate: Estimate) -> bool:
         """Return whether an estimate is accurate enough to verify an arrival at the target.
 
-        Three sigmas of the angle, but one of the rate are compared, because rate noise averages out soon.
+        Three standard deviations of the angle, but only one of the rate, must be within the limits, because
+        the noise of the rate averages out soon.
         """
         variances = estimate.covariance.diagonal()
         largest = np.array([variances[ATTITUDE].max(), variances[RATE].max()])

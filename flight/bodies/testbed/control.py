@@ -168,7 +168,7 @@ class ThreadLaw:
 
 
 def law_of(target: Target) -> ThreadLaw:
-    """Return the law of a target, which must be a target of the testbed."""
+    """Return the law (angle as a function of time) of a target, which must be a target of the testbed."""
     law = target.law
     assert isinstance(law, ThreadLaw), "the planner accepts only targets of the testbed"
     return law
@@ -417,7 +417,7 @@ class Planning:
 
 
 def _moved(law: ThreadLaw, since: float) -> float:
-    """Return the angle (rad) of a target `since` s after it was due, clipped where the coil has no torque."""
+    """Return the angle (rad) of a target `since` s after it was due, clipped to the coil's working range."""
     return min(max(angle_of(law.q2) + law.rate * since, -FARTHEST), FARTHEST)
 
 

@@ -96,7 +96,10 @@ def overwrite(path: Path, data: bytes) -> bool:
 
 @contextmanager
 def locked(path: Path, problem: str) -> Iterator[None]:
-    """Hold the lock of a file. Raises UsageError with the text `problem` if it is held elsewhere."""
+    """Hold the lock of a file.
+
+    Raises UsageError with the text `problem` if the file is already locked.
+    """
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         try:
@@ -130,7 +133,7 @@ class FileError(FlightError):
 
 
 class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """State of an outgoing transfer of the file `path` as `name`, for the command with the `origin`."""
+    """State of an outgoing transfer of file `path`, sent as `name`; `origin` identifies its command."""
 
     number: _Long
     destination: _Entity

@@ -215,7 +215,7 @@ class Sender:
         fresh: bool,
         segment_bytes: int = SEGMENT_BYTES,
     ) -> None:
-        """Begin a `fresh` or continue a stored transfer, with PDUs of at most `segment_bytes` file bytes."""
+        """Begin a transfer if `fresh`, or continue it; PDUs contain at most `segment_bytes` file bytes."""
         self._segment_bytes, self.record = segment_bytes, record
         self.transaction = Transaction(source, record.number, record.destination)
         self.condition: int | None = None
@@ -373,7 +373,7 @@ class Receiver:
         now_ns: int,
         most_requests: int = MOST_REQUESTS,
     ) -> None:
-        """Begin or continue a transfer of at most `most` bytes; NAKs request `most_requests` ranges."""
+        """Begin or continue a transfer of at most `most` bytes; a NAK has up to `most_requests` ranges."""
         self._most_requests, self.record = most_requests, record
         self.closed = False
         self.said = ""
@@ -566,7 +566,7 @@ class Receiver:
 
 
 SATELLITE, GROUND, FOREIGN = 1, 2, 3
-"""CFDP entity numbers of the satellite, the project's ground station and an external one (Yamcs)."""
+"""CFDP entity numbers of the satellite, the project's ground station and an external station (Yamcs)."""
 MOST_OPEN = 8
 """Maximum number of open transfers in each direction."""
 LONGEST_FILE = (1 << 32) - 1
@@ -637,7 +637,8 @@ class Entity:
     ) -> Progress:
         """Begin to send a file with a checksum of type `kind`. Raises FileError.
 
-        An open transfer of this file is resumed by metadata and EOF, for requests of the missing ranges.
+        An open transfer of this file is resumed by sending metadata and EOF, so that the receiver requests
+        the missing ranges.
         """
         try:
             facts = path.stat()
@@ -759,7 +760,7 @@ class Entity:
         return receiver.take(content, now_ns)
 
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
-        """Open an incoming transfer, instead of the stalest one if too many are open."""
+        """Open an incoming transfer; if too many are open, end the least recently active transfer."""
         if len(self._in) >= MOST_OPEN:
             stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
             stalest.stop(Condition.CANCELLED, "given up for a newer one")

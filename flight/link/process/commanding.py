@@ -120,8 +120,7 @@ class Verification:
     """Tracker of the stages of commands that were sent to the control process."""
 
     def __init__(self) -> None:
-        # The command whose completion is awaited, the mode that completes it, and the mission time (ns) of
-        # its answer.
+        # The command being executed, the mode that completes it, and the mission time (ns) of its answer.
         self._open: tuple[Sent, Mode, int] | None = None
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
@@ -260,7 +259,7 @@ class TimetableError(FlightError):
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Schedule entry, with the numbers from 1: a command in words, due at `at_ns`, UTC in ns since 1970.
+    """Schedule entry, numbered from 1: a command in words, due at the UTC `at_ns` (ns since 1970).
 
     The values `spi` and `counter` are those of the frame that contained the scheduling command.
     """
@@ -273,7 +272,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Stored copy of the schedule with the last entry number; the copy with the higher version counts."""
+    """Stored copy of the schedule with the last entry number; the copy with the higher version is used."""
 
     version: _Count = 0
     last: _Count = 0
@@ -319,7 +318,7 @@ class Timetable:
         return entry
 
     def remove(self, number: int) -> None:
-        """Remove an entry, or all for 0, from the stored schedule. Raises TimetableError."""
+        """Remove one entry, or all entries for number 0, from the schedule. Raises TimetableError."""
         left = tuple(entry for entry in self._now.entries if number and entry.number != number)
         if number and len(left) == len(self._now.entries):
             raise TimetableError(f"no command is scheduled with the number {number}")

@@ -43,7 +43,10 @@ _RESTARTS = "restarts flight and link with another configuration or release"
 
 
 class _Directive:
-    """Directive with the attributes of its packet's fields; in the text `says`, `{0}` is the directive."""
+    """A directive, whose attributes have the names of the packet's fields.
+
+    The template `says` yields the directive's text; the placeholder `{0}` stands for the directive.
+    """
 
     __slots__ = ()
     packet: ClassVar[Packet]
@@ -382,7 +385,7 @@ _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
-    """Return a directive encoded as a packet. Raises CommandError for values that do not fit."""
+    """Return a directive encoded as a packet. Raises CommandError for values out of range."""
     packet, values = directive.packet, dict[str, Any]()
     for one in packet.fields:
         value = getattr(directive, one.name)

@@ -34,7 +34,7 @@ _UNORDERED_NS = 5_000_000_000
 """Maximum time (ns) by which packets of different rate groups can be out of order in the log."""
 _TIME = struct.Struct(">q")
 _LABEL = LAYOUTS[RUN.name].identifier.to_bytes(2, "big")
-"""First bytes of each packet `run`."""
+"""First bytes of each packet of type `run`."""
 
 
 def time_of(packet: bytes) -> int:
@@ -291,7 +291,7 @@ class Downlink:
         self._queue.add(packet)
 
     def play(self, source: Iterator[bytes] | None) -> None:
-        """Play back the packets of `source` at the free data rate; each b"" ends a call of `frames`."""
+        """Play back the packets of `source` at the unused data rate; each b"" ends a call of `frames`."""
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:

@@ -6,8 +6,8 @@ the file's SHA-256 selects the file. The selected file becomes `chosen/KIND/NAME
 of the same kind (docs/fly/files.md).
 
 Updates of release or configuration in orbit (docs/fly/renewal.md) are executed by the privileged program
-`deploy/renewal.py`. It reads the requests and the record `contact` in the folder of `Renewal`, and writes the
-status file that `Renewal` reads.
+`deploy/renewal.py`. The program reads the requests and the record `contact` in the folder of `Renewal`, and
+writes the status file that `Renewal` reads.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ class Filing:
         return [replace(done, stage=Stage.STARTED, text=text)]
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file. Raises FileError if it is missing or outside of the two folders."""
+        """Return the path of a file. Raises FileError unless it is in `log/` or `received/`."""
         root, _, rest = name.partition("/")
         if (problem := problem_of_name(name)) or root not in self._roots:
             raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
@@ -368,7 +368,7 @@ class Renewal:
                 self._utc_offset_ns = int(row["utc_ns"]) - now_ns
 
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
-        """Record the contact of `admitted` authentic frames so far, and return new reports of the program."""
+        """Record the number `admitted` of authentic frames so far, and return new reports of the program."""
         contact = (str(admitted), self._fault)
         if contact != self._recorded and now_ns >= self._due_ns and self._status.parent.exists():
             self._due_ns = now_ns + CONTACT_NS

@@ -322,7 +322,7 @@ class TncLine(Line):
         return [(frame, None) for frame in self._stream.add(data)]
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send each frame as the data of one KISS frame, or discard it without a connection or if slow."""
+        """Send each frame as the data of one KISS frame, or discard it if the TNC cannot accept it."""
         if self._socket is None and now_ns >= self._next_ns:
             self._next_ns = now_ns + _RECONNECT_NS
             self._stream = self._framing.stream()
@@ -605,7 +605,10 @@ class Station:
         self._hand_over(sent, admitted.data, now_ns)
 
     def _joined(self, admitted: Admitted) -> Admitted:
-        """Return the content of a frame, or the whole packet of its last segment. Raises CommandError."""
+        """Return the content of a frame. Raises CommandError.
+
+        For the last segment of a packet, the content is the whole packet.
+        """
         if is_unit(admitted.data, UP) or not isinstance(portion := directives.unpack(admitted.data), Portion):
             return admitted
         whole = self._joiner.add(portion)

@@ -89,7 +89,7 @@ class Packet:
 
 
 def _packet(name: str, apid: int, rate: str, meaning: str, version: int = 1) -> Callable[..., Packet]:
-    """Return a function that returns the packet whose fields are its arguments."""
+    """Return a function that takes fields and returns the packet with these fields."""
     return lambda *fields: Packet(name, apid, rate, meaning, fields, version)
 
 

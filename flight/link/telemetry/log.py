@@ -306,7 +306,7 @@ _RECENT_NS = 2_000_000_000
 
 
 class FlightLog:
-    """Log with a bounded queue for one thread, which a ticker writes; contents do not depend on timing."""
+    """Log of one thread; a ticker writes its bounded queue to disk. The content does not depend on timing."""
 
     def __init__(
         self,
@@ -345,7 +345,7 @@ class FlightLog:
         self._retry_ns = 0
         self._busy_since_ns: int | None = None
         self._closed = False
-        self._draining = threading.Lock()  # held while the queue is written to disk, never taken by write()
+        self._draining = threading.Lock()  # lock held while the queue is written to disk, not by write()
         self._store: SegmentStore | None = None
 
         def begin() -> SegmentStore:
