@@ -138,7 +138,7 @@ def _devices_of(config: Config) -> list[tuple[str, Any]]:
 
 
 def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the files of the configured devices, each with the driver classes of such a device."""
+    """Return the device files of the configured devices, each with its permitted driver classes."""
     nodes: dict[str, tuple[str, ...]] = {}
     for kind, section in _devices_of(config):
         driver = driver_of(kind, section.device if kind == "camera" else section)

@@ -45,7 +45,7 @@ class Build:
         self._options = options
 
     def make(self) -> int:
-        """Build a release, unless the current one has the same sources, and print its name."""
+        """Build a release, unless the current release has the same sources, and print its name."""
         current = linked(self._prefix, "current")
         wanted = self._digest()
         if current is not None and _text(current / SOURCE) == wanted:

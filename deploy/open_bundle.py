@@ -120,7 +120,7 @@ def verified(
 def replaced(text: str, path: Sequence[str], value: str) -> str:
     """Return a configuration text in which the value at `path` is replaced by the YAML text `value`.
 
-    Raises Refused if the configuration has no such value.
+    Raises Refused if the configuration has no value at `path`.
     """
     node = yaml.compose(text, Loader=yaml.SafeLoader)
     for name in path:

@@ -2,8 +2,8 @@
 
 The releases are folders in /opt/knightcube/releases, and the links `current` and `previous` select two of
 them. The current release is chosen unless it is damaged, or was started `UNCLEAN` times without being proven.
-Otherwise the previous release is chosen if it is intact, and the program prints why the current release was
-not chosen. A release is proven after its flight software has run for a minute. The script `fly` runs this
+If the current release is not chosen, the program prints the reason, and chooses the previous release if it is
+intact. A release is proven after its flight software has run for a minute. The script `fly` runs this
 program, and chooses a release itself if this program fails.
 
 The command `releases.py verify` checks every file of both releases. Any Python interpreter can run this

@@ -5,7 +5,7 @@ An update is called a renewal (docs/fly/renewal.md). The timer knightcube-renewa
 root every ten seconds. Each run reads the state, executes at most one request of the link, checks the trial
 in progress, advances the command-loss timer, stores the state and ends. The state is stored before a step is
 executed, and each step may be executed again. If the program is killed at any moment, either the old or the
-new version is therefore installed, and the next run continues.
+new version is installed, and the next run continues.
 
 The link is not trusted. The requests of the link must be regular files of limited size, and symbolic links
 are not followed. The program `open_bundle.py` checks signatures and content of an artefact before anything is
@@ -376,13 +376,7 @@ class Renewal:
     """One run of the renewal program: requests, trial and command-loss timer."""
 
     def __init__(self, board: Board, now: float, boot: str) -> None:
-        """Read the state.
-
-        Args:
-            board: files and services of the board.
-            now: time since boot, s.
-            boot: the kernel's identifier of this boot.
-        """
+        """Read the state of `board` at `now` (s since boot); `boot` is the kernel's boot identifier."""
         self._board = board
         self._state = self._read()
         state = self._state
@@ -447,8 +441,7 @@ class Renewal:
 
     def step(self) -> None:
         """Continue an interrupted step, execute one request and check the trial. Raises OSError."""
-        # A trial whose installation ends in this step is not checked, because the units still have to
-        # restart.
+        # A trial whose installation ends in this step is not checked, because the units must first restart.
         trial = self._state.trial
         judged = trial if trial is not None and trial.stage == "fly" else None
         if trial is not None:
@@ -505,10 +498,7 @@ class Renewal:
             self._report(name, "failed", word or "request", str(error) or type(error).__name__)
 
     def _restart(self, name: str, part: str) -> None:
-        """Restart flight, link or board.
-
-        The request is stored as executed before the restart, so that it is never executed again.
-        """
+        """Store the request as executed, so that it is never repeated, and restart flight, link or board."""
         if part not in RESTARTS:
             raise Refused("the request is damaged")
         self._report(name, "completed", "restart", f"{part} is restarted")
@@ -556,10 +546,7 @@ class Renewal:
         self._continue()
 
     def _copy_bundle(self, kind: str, name: str, expected: str, path: Path) -> None:
-        """Copy the selected bundle from the link's files.
-
-        Raises Refused if the SHA-256 of the bundle is not `expected`.
-        """
+        """Copy the selected bundle from the link's files. Raises Refused if its SHA-256 is not `expected`."""
         if not _NAME.fullmatch(name):
             raise Refused(f"{name[:64]!r} is not the name of a bundle")
         digest = hashlib.sha256()
@@ -618,10 +605,7 @@ class Renewal:
         self._tidy()
 
     def _withdraw(self, name: str, kind: str) -> None:
-        """End the trial and return to the old version; without a trial, return to the previous version.
-
-        Raises Refused.
-        """
+        """End the trial with the old version, or return to the previous version. Raises Refused."""
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
@@ -672,10 +656,7 @@ class Renewal:
         self._save()
 
     def _built(self) -> str:
-        """Build the release of the bundle, and return its name.
-
-        Raises Refused if the build fails, and OSError.
-        """
+        """Build the release of the bundle, and return its name. Raises Refused if it fails, and OSError."""
         board, staging = self._board, self._board.own / "staging"
         source = staging / "source"
         shutil.rmtree(source, ignore_errors=True)
@@ -702,10 +683,7 @@ class Renewal:
         self._continue()
 
     def _revert(self, trial: Trial) -> None:
-        """Install the version that preceded the trial, request a restart and end the trial.
-
-        Raises Refused or OSError if the installation fails.
-        """
+        """Install the version before the trial, restart and end the trial. Raises Refused or OSError."""
         state, board = self._state, self._board
         if trial.what == "configuration":
             try:
@@ -747,7 +725,7 @@ class Renewal:
             self._begin_revert("the ground did not confirm the trial")
 
     def _other_release(self, trial: Trial) -> str:
-        """Return the release that flight or link run instead of the one on trial, or an empty text."""
+        """Return the release that flight or link run instead of the release on trial, or an empty text."""
         units = (FLIGHT, LINK) if trial.what == "release" else ()
         return min({*map(self._board.flown_release, units)} - {"", trial.new}, default="")
 
@@ -852,7 +830,10 @@ class Renewal:
 
 
 def extract(archive: Path, folder: Path) -> None:
-    """Unpack the regular files and folders of a release. Raises Refused for other members, and OSError."""
+    """Unpack the regular files and folders of a release.
+
+    Raises Refused for members of any other type, and OSError.
+    """
     folder.mkdir()
     try:
         with tarfile.open(archive, "r:*") as files:

@@ -199,7 +199,7 @@ _LIMITED_BY: Mapping[str, tuple[tuple[str, str, str], ...]] = {
     "health.disk_free": (("health_disk_free", "below", "warning"),),
     "health.temperature": (("health_temperature", "above", "warning"), ("health_hottest", "above", "fault")),
 }
-"""Limits of telemetry fields: parameter that holds the limit, side (above or below), and severity."""
+"""Limits of telemetry fields: parameter that contains the limit, side (above or below), and severity."""
 _OWN_FORM = frozenset({LOAD_PARAMETERS.name, DUMP_PARAMETERS.name})
 
 

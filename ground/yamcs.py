@@ -1,11 +1,12 @@
 """Writer of a Yamcs 5.12 configuration, started by `python -m ground.yamcs FOLDER [--epoch UTC]`.
 
-Yamcs connects to `knightcube gateway`, which holds the keys and exchanges unprotected packets with Yamcs
+Yamcs connects to `knightcube gateway`, which has the keys and exchanges unprotected packets with Yamcs
 (`ground.link.gateway`). Yamcs and the gateway listen on the loopback interface only. Yamcs's own data links
-cannot send the gateway's token when they connect. The folder therefore contains `GatewayLink.java`, the
-source of a data link that sends the token. This source must be compiled once. Packets are archived by mission
-time and sequence count. A command is verified by `verification` packets that contain the packet identifier
-and the sequence count of the command. Files are transferred by Yamcs's own CFDP service.
+cannot send the gateway's token when they connect. The configuration folder therefore contains
+`GatewayLink.java`, the source of a data link that sends the token. The Java source must be compiled once.
+Packets are archived by mission time and sequence count. A command is verified by `verification` packets that
+contain the packet identifier and the sequence count of the command. Files are transferred by Yamcs's own CFDP
+service.
 
 Yamcs requires a password, because otherwise any web page in a browser on the same machine could send requests
 to Yamcs.

@@ -209,7 +209,7 @@ def main(arguments: list[str]) -> int:
     switch = CoilSwitch(opened, where, [int(number, 0) for number in numbers])
     if not switch.off():
         sys.stderr.write(f"guardian: the coils' chip at {numbers[0]} on {where} does not answer\n")
-    # The guardian works without real-time priority, locked memory and protection from the OOM killer too.
+    # The guardian also works without real-time priority, locked memory and protection from the OOM killer.
     system.prioritise(0, PRIORITY)
     system.lock_memory()
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:

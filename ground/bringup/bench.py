@@ -54,7 +54,7 @@ class Outcome:
     """The result of a step.
 
     Attributes:
-        findings: faults of the parts.
+        findings: diagnosed faults of the devices.
         values: measured values for the report and for JSON.
         changes: configuration values derived from the measurements, by section.
         arrays: measured arrays for the plots.
@@ -350,7 +350,7 @@ def _missing(
     kind: str, section: Any, rig: Rig, serial: dict[str, Any], taken: set[Any], error: DeviceError
 ) -> Finding:
     finding = None
-    with suppress(DeviceError):  # if the bus or the line itself is missing, `error` already states this
+    with suppress(DeviceError):  # `error` already states that the bus or serial line is missing
         if kind in serial:
             finding = _serial_finding(kind, section, rig, serial)
         elif getattr(section, "driver", "") in {"pca9685", "ina219"}:

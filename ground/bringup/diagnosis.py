@@ -4,9 +4,9 @@ The coils are compared by the field that each coil produces at the magnetometer 
 of the current, and by the current that the supply delivers. The measured response of each coil is compared
 with the expected response of every coil, so that swapped, reversed and weak coils are distinguished. The axes
 of gyro, accelerometer and magnetometer are determined from right-handed rotations of 90 deg by hand about
-each body axis. Before each rotation the z axis points up. Angle and axis of a rotation by hand are accurate
-to about 15 deg, so that only swapped and reversed axes and large misalignments are found. Rotations do not
-determine the common sign of the magnetometer's axes; the coils determine this sign.
+each body axis. Before each rotation by hand the body z axis points up. Angle and axis of a rotation by hand
+are accurate to about 15 deg, so that only swapped and reversed axes and large misalignments are found.
+Rotations do not determine the common sign of the magnetometer's axes; the coils determine this sign.
 """
 
 from __future__ import annotations
@@ -652,7 +652,7 @@ def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> t
 def _match(
     response: FloatArray, expected: FloatArray, live: BoolArray
 ) -> tuple[list[int], FloatArray, FloatArray]:
-    """Return coil (n,), relative field strength (n,) and angle error (n,), rad, of each command."""
+    """Return coil, ratio of measured to expected field, and angle error (rad), (n,), of each command."""
     count = len(response)
     unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     length = np.linalg.norm(response, axis=1, keepdims=True)

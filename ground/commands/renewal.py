@@ -280,7 +280,7 @@ def _packed(source: Path) -> bytes:
 
 
 def _write_bundle(path: Path, metadata: Path, kind: str, data: bytes) -> None:
-    """Write a compressed tar archive of all root metadata, the newest other metadata and the artefact."""
+    """Write a compressed tar archive of all root metadata, newest metadata of other roles, and artefact."""
     content = io.BytesIO()
     with tarfile.open(fileobj=content, mode="w:xz") as archive:
         for file in sorted(metadata.glob("*.json")):

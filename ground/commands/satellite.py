@@ -140,7 +140,7 @@ def _add_commands(words: _Words, packets: Sequence[Packet] = commands.COMMANDS) 
 
 
 def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
-    """Return the options of a command to schedule another command, with the latter as one line of text.
+    """Return the options of the scheduling command, with the scheduled command as one line of text.
 
     Options that the user entered after the scheduled command are included. A table of parameters cannot be
     scheduled, because it is too long for a scheduled command.

@@ -77,7 +77,7 @@ class CommandForms:
     def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = commands.LAYOUTS) -> None:
         """Accept the commands of `layouts`; the console is read-only if `send` is None.
 
-        The attribute `body` is the kind of body, or None if unknown. Only commands for this kind are
+        The attribute `body` is the kind of body, or None if unknown. Only commands for this kind of body are
         accepted.
         """
         self._send = send
@@ -152,7 +152,7 @@ def _text_of(data: bytes) -> str:
 
 
 def _value(name: str, field: Field, given: Any) -> Any:
-    """Return a field's value. An empty input is NaN in a field that can hold NaN. Raises UsageError."""
+    """Return a field's value. An empty input is NaN in a field that permits NaN. Raises UsageError."""
     if field.count > 1 and isinstance(given, str):
         return _bytes(name, field, given)
     if field.count > 1:
@@ -239,7 +239,7 @@ class LinkFeed:
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
             if reports and reports[-1].stage is not Stage.ACCEPTED:
-                # The lines of a list command arrive as reports after the report of acceptance.
+                # A list command is answered by reports, one per line, after the report of acceptance.
                 listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
                 text = "; ".join(explained(report) for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}

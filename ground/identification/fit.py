@@ -17,8 +17,8 @@ noise cannot explain, such as the release, a jolt or an outlier, restart the fil
 
 The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
 The inertial unit's attitude filter or air currents can correlate the innovations, which are then not white.
-In that case, each standard deviation is at least the sandwich estimate (Huber 1967) over segments of the
-record.
+If the innovations are not white, each standard deviation is at least the sandwich estimate (Huber 1967) over
+segments of the record.
 
 Motion under a known current determines g = n A B / J, k / J and c / J, but not the inertia J itself. For
 example, a body with twice the inertia in twice the field on a thread of twice the stiffness has the same
@@ -374,7 +374,7 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return `restarts` and the samples beyond the gate. Raises IdentificationError if these are too many."""
+    """Return `restarts` and the samples that exceed the gate. Raises IdentificationError for too many."""
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(

@@ -3,8 +3,8 @@
 Attitude and rate are samples of the inertial unit with the times of the unit's own clock, because a busy host
 timestamps some samples late. The currents are the commanded currents after limiting and quantisation. Each
 current is assumed to flow from the cycle that requested it until the next cycle. A coil driver with its own
-thread reports a current one cycle later. The field is measured while all coils are off, because an active
-coil disturbs the magnetometer.
+thread reports a current one control cycle after the cycle that requested it. The field is measured while all
+coils are off, because an active coil disturbs the magnetometer.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ class Timeline:
     def of(cls, record: Record, delay: float) -> Timeline:
         """Return the events from the first to the last sample, with current changes delayed by `delay` s.
 
-        The current before the first switch is zero. Intervals longer than `MAX_STEP` are divided.
+        The current before the first switch time is zero. Intervals longer than `MAX_STEP` are divided.
         """
         switch = record.switch_time + delay
         inside = (switch > record.time[0]) & (switch < record.time[-1])

@@ -41,7 +41,7 @@ _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
 _MAX_UNSENT = 1 << 22  # number of unsent bytes above which a connection is closed
 _SPI, _BLOCK = 1, 64
-"""Key (SPI) of the gateway's commands, and number of frame counters that are reserved at once."""
+"""Security parameter index of the gateway's key, and number of frame counters that are reserved at once."""
 _READ_BYTES = 1 << 16
 _PING_PERIOD_S = 20.0
 """Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""

@@ -111,7 +111,8 @@ class Terminal:
     Attributes:
         gate: authentication of the telemetry frames, with the numbers of refused frames.
         lost_frames: number of telemetry frames that are missing according to their authenticated counters.
-            This number of frames includes the counters that the satellite's link process skips at a restart.
+            The number `lost_frames` includes the counters that the satellite's link process skips at a
+            restart.
         idle_frames: number of received frames of idle data.
         packet_bytes: longest packet that a telecommand frame can carry, bytes.
     """

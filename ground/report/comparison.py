@@ -166,7 +166,7 @@ def _difference(row: Object) -> str:
 def summarise_archive(archive: Path) -> Object:
     """Return configuration, duration, integrity and end of each run of an archive as JSON data.
 
-    Only one run at a time is held in memory.
+    Only one run at a time is in memory.
     """
     return {"archive": str(archive), "runs": [_archived(folder) for folder in find_runs(archive)]}
 

@@ -170,8 +170,8 @@ def stars_age(run: Run, times: FloatArray) -> FloatArray:
 def camera_errors(run: Run) -> AttitudeErrors:
     """Return the errors of the estimated attitude of the star camera, about the body axes.
 
-    These errors do not contain the misalignment of the star camera, which is part of the errors of the body's
-    attitude. The result is empty without description packets of the estimate and of the truth.
+    The star camera's attitude errors do not contain its misalignment, which is part of the errors of the
+    body's attitude. The result is empty without description packets of the estimate and of the truth.
     """
     errors, packets, true = attitude_errors(run), run["description"], run["true_description"]
     if not len(packets) or not len(true) or not len(errors.times):
@@ -206,7 +206,8 @@ def learned_description(run: Run) -> list[Object]:
     The rms error of the first estimate is `first_error`, and that of the last estimate is `error`.
 
     The elements of the inertia are divided by the trace, because the scale of the inertia is observable only
-    against the coils. The result is empty without description packets of the estimate and of the truth.
+    relative to the coils' dipole. The result is empty without description packets of the estimate and of the
+    truth.
     """
     packets, true = run["description"], run["true_description"]
     if not len(packets) or not len(true):
@@ -225,7 +226,7 @@ def learned_description(run: Run) -> list[Object]:
 
 
 def dipole_errors(run: Run) -> dict[str, float]:
-    """Return the relative rms error of the residual dipole, in sunlight and in shadow.
+    """Return the rms error of the residual dipole relative to the true dipole, in sunlight and in shadow.
 
     Only the last ten minutes in sunlight and in shadow are evaluated. The two values are NaN without an
     estimate or a truth log.

@@ -99,8 +99,8 @@ def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray,
 def _streak_rates(run: Run) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return mid-exposure times (n,), s, and the rates (n,), rad/s, about the suspension thread.
 
-    The rates are measured from streaks of stars in frames. The third array holds the standard deviations (0
-    if unknown), and the fourth array the differences from the true mean rates (NaN if unknown).
+    The rates are measured from streaks of stars in frames. The third array contains the standard deviations
+    (0 if unknown), and the fourth array the differences from the true mean rates (NaN if unknown).
     """
     rated = with_rate(run["streak"])
     start = rated["exposure_start_ns"] / 1e9

@@ -55,7 +55,8 @@ class PowerHistory:
         time: start times (n,) of the intervals, s.
         end: end of the last interval, s.
         supply: mean of V |I| (n,), W, which the coils draw from their supply.
-        heat: mean of R I^2 (n,), W, the ohmic heat of constant currents. The planner minimises this heat.
+        heat: mean of R I^2 (n,), W, the ohmic heat of constant currents. The planner minimises the ohmic
+            heat.
         source: "truth" if computed from the simulated coils, "written" if computed from the commanded
             currents.
     """
@@ -213,8 +214,8 @@ def streaks(run: Run) -> Object:
 
     The errors are those of the camera's rate, so the true misalignment of a simulated camera does not count.
     A rate of unknown sign (status `ambiguous`) is counted, but has no error. `normalised` is the mean of e'
-    P^-1 e / 3 over the rates with a positive definite covariance P. This mean is 1 if the covariances P are
-    correct.
+    P^-1 e / 3 over the rates with a positive definite covariance P. The mean `normalised` is 1 if the
+    covariances are correct.
     """
     packets = run["streak"]
     rated = with_rate(packets)
@@ -282,8 +283,8 @@ def failed_frames(run: Run) -> list[Object]:
 def estimate_errors(run: Run) -> Object | None:
     """Return the rms errors of the estimated angle and rate about the thread, or None without a truth.
 
-    A name that ends with `_normalised` is the rms of the error divided by the estimated standard deviation.
-    This rms value is 1 if the standard deviations are correct.
+    A name that ends with `_normalised` is the rms of the error divided by the estimated standard deviation. A
+    normalised value is 1 if the standard deviations are correct.
     """
     control, truth = run["control"], run["truth"]
     control = control[np.isfinite(control["angle"]) & np.isfinite(control["rate"])]

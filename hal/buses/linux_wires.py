@@ -3,11 +3,11 @@
 The receiving thread of a serial port records the arrival times of the data, and reopens a lost port. A udev
 rule keeps the device name when an adapter is unplugged and plugged in again.
 
-A call on an I2C bus waits until the previous transaction has ended. The transaction of the call then takes at
-most the timeout of the I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are
-disabled (I2C_RETRIES 0), so that the drivers count each failure. An advisory lock on the device file reserves
-the bus for one flight process. The kernel releases the lock when the process ends. The guardian and
-`deploy/coils-off` ignore the lock, because they may switch the coils off at any time.
+A call on an I2C bus waits until the previous transaction has ended. A transaction takes at most the timeout
+of the I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES
+0), so that the drivers count each failure. An advisory lock on the device file reserves the bus for one
+flight process. The kernel releases the lock when the process ends. The guardian and `deploy/coils-off` ignore
+the lock, because they may switch the coils off at any time.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class PySerialPort:
 
     def set_baud_rate(self, baud_rate: int) -> None:
         """Change the baud rate. Raises NotResponding if the port rejects the baud rate."""
-        # The value is stored even if the port is lost, because the port is reopened at this baud rate.
+        # The baud rate is stored even if the port is lost, because the port is reopened at this rate.
         self.baud_rate = baud_rate
         try:
             with self._port_lock:

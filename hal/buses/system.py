@@ -3,9 +3,9 @@
 The clock sleeps until absolute monotonic deadlines, and runs each periodic job in a separate thread.
 
 Real-time priority and locked memory are privileges (RLIMIT_RTPRIO, RLIMIT_MEMLOCK, capabilities) that the
-operating system may refuse. Without these privileges the flight process continues with more jitter under
-load. The functions `prioritise` and `lock_memory` never raise; they return the reason for a refusal, or an
-empty text on success.
+operating system may refuse. Without real-time priority and locked memory the flight process continues with
+more jitter under load. The functions `prioritise` and `lock_memory` never raise; they return the reason for a
+refusal, or an empty text on success.
 
 `ServiceManager` sends notifications to systemd over a socket (sd_notify(3)). Notifications are dropped if the
 environment variable NOTIFY_SOCKET is missing or the delivery fails, because a notification must never delay

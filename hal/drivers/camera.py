@@ -5,15 +5,15 @@ USB control transfer takes five seconds. A periodic job executes all slow camera
 `trigger` and `poll`, which the control loop calls, only pass requests to the job and take frames from it.
 
 `PixelCoding` converts the pixel formats of V4L2 cameras, named as in kernel drivers and libcamera, to grey
-images. The layouts are those of the kernel's documentation (Linux Media userspace API, chapter "Image
-Formats"). The MIPI formats pack four pixels of 10 bits into five bytes, or two pixels of 12 bits into three
-bytes. The last byte of such a group holds the low bits of all its pixels, with the first pixel in the lowest
-bits.
+images. The layouts of the pixel formats are those of the kernel's documentation (Linux Media userspace API,
+chapter "Image Formats"). The MIPI formats pack four pixels of 10 bits into five bytes, or two pixels of 12
+bits into three bytes. The last byte of such a group of pixels contains the low bits of its pixels, with the
+first pixel in the lowest bits.
 
-A Bayer mosaic is convolved with the kernel (1, 2, 1) / 4 along rows and columns. Red, green and blue then
-contribute a quarter, a half and a quarter to each pixel, at every position in the mosaic. All four colour
-orders therefore give the same image, and the centroid of a star is not displaced. Motion JPEG is decoded by
-Pillow, and its luma is used.
+A Bayer mosaic is convolved with the kernel (1, 2, 1) / 4 along rows and columns. After the convolution of the
+mosaic, red, green and blue contribute a quarter, a half and a quarter to each pixel, at every position in the
+mosaic. All four colour orders of a mosaic therefore give the same grey image, and the centroid of a star is
+not displaced. Motion JPEG is decoded by Pillow, and its luma is used.
 """
 
 from __future__ import annotations
@@ -332,7 +332,10 @@ _UNPACK = {"mipi10": _mipi10, "mipi12": _mipi12, "bits10": _bits10}
 
 
 def _luma(mosaic: Pixels) -> Pixels:
-    """Return the grey image of a Bayer mosaic, of the same type. The edges are extended by reflection."""
+    """Return the grey image of a Bayer mosaic, with the type of the mosaic.
+
+    The edges are extended by reflection.
+    """
     wide = np.pad(mosaic, 1, mode="reflect").astype(np.uint32)
     rows = wide[:-2] + 2 * wide[1:-1] + wide[2:]
     total = rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:]

@@ -18,9 +18,9 @@ drive current through the coil, so this bridge is braked (both inputs high) imme
 
 Instead of a PWM chip with H-bridges, bridges DRV8830 (TI SLVSAB2) with an I2C interface and a regulated
 output voltage can drive the coils, one bridge for each coil. The output voltage has 58 steps of 0.08 V, and
-no values between zero and 0.48 V. To produce the voltages between these steps on average, a periodic job
-writes the step nearest to the sum of requested voltage and accumulated error. The bridges have the interface
-of a PWM chip, so that `PwmTorqueCoils` performs retries, checks and braking.
+no values between zero and 0.48 V. To produce voltages between the steps on average, a periodic job writes the
+step nearest to the sum of requested voltage and accumulated error. The DRV8830 bridges have the interface of
+a PWM chip, so that `PwmTorqueCoils` performs retries, checks and braking.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class CoilSettings:
             ("tries", self.tries, 1, 5, ""),
             ("retry_wait", self.retry_wait, 0.0, 0.01, "s"),
         ):
-            # This form of the condition also rejects NaN.
+            # The negated comparison also rejects NaN.
             if not low <= value <= high:
                 raise OutOfRange(DEVICE, quantity, value, low, high, unit)
         used = [channel for coil in self.coils for channel in coil.channels]

@@ -185,7 +185,7 @@ class Ina219(PolledMonitor[PowerReading]):
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]
         current, clipped = signed * SHUNT_STEP_V / self._ohm, abs(signed) >= round(full_scale / SHUNT_STEP_V)
-        if bus & OVERFLOW and not clipped:  # overflow flag, set only if other software has set Calibration
+        if bus & OVERFLOW and not clipped:  # set only if other software has written Calibration
             bound = full_scale / self._ohm
             raise OutOfRange(self.name, "overflow: coil current", current, -bound, bound, "A")
         return (bus >> 3) * BUS_STEP_V, current, clipped

@@ -49,7 +49,7 @@ def prescale_for(frequency_hz: float) -> int:
     Raises OutOfRange outside the frequency range of the chip, 24 Hz to 1526 Hz.
     """
     low, high = OSCILLATOR_HZ / (COUNTS * 256), OSCILLATOR_HZ / (COUNTS * 4)
-    # This form of the condition also rejects NaN.
+    # The negated comparison also rejects NaN.
     if not low <= frequency_hz <= high:
         raise OutOfRange("pca9685", "PWM frequency", frequency_hz, low, high, "Hz")
     return round(OSCILLATOR_HZ / (COUNTS * frequency_hz)) - 1

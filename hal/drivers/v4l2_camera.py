@@ -10,10 +10,10 @@ is set, however, uvcvideo stamps the arrival of the first packet of a frame (uvc
 after the end of the exposure. The setting `stamp` can override the meaning of the time stamps that the kernel
 driver flags.
 
-`VideoDevice` executes the system calls. A failed call raises OSError with the kernel's errno. The device is
-opened in non-blocking mode, so that no call waits for a frame. The structures and request numbers are those
-of linux/videodev2.h (Linux Media Infrastructure userspace API, part "Video for Linux"). A request number
-contains the size of its structure, which ctypes computes for the present platform.
+`VideoDevice` executes the system calls. A failed system call raises OSError with the kernel's errno. The
+device is opened in non-blocking mode, so that no call waits for a frame. The structures and request numbers
+are those of linux/videodev2.h (Linux Media Infrastructure userspace API, part "Video for Linux"). A request
+number contains the size of its structure, which ctypes computes for the present platform.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """VN-100 driver, which configures the unit, converts its output to readings and recovers a lost unit.
 
 The unit sends its attitude as a Hamilton quaternion (q0, q1, q2, q3), scalar last, which rotates the sensor
-frame into NED. In this project's quaternion convention the same four numbers describe the rotation of NED
-into the sensor frame. Constant linear maps in the settings convert the attitude and the measured vectors to
-the mission's reference frame and the body axes (`knightcube.astro.quaternion.attitude_map`). Readings that
-are not finite or physically impossible are rejected and counted.
+frame into NED. In this project's quaternion convention the four numbers that the unit sends describe the
+rotation of NED into the sensor frame. Constant linear maps in the settings convert the attitude and the
+measured vectors to the mission's reference frame and the body axes
+(`knightcube.astro.quaternion.attitude_map`). Readings that are not finite or physically impossible are
+rejected and counted.
 
 The generator `set_up` yields the commands that configure a unit, and receives the answers from its caller,
 which may wait or poll. `Recovery` advances by one step at each poll and never blocks. A unit that lost power
@@ -67,10 +68,10 @@ class Vn100Settings(UnitSettings):
         acceleration_range: largest accepted acceleration per axis, m/s^2.
         configure: whether the driver configures the unit; otherwise any output with a complete reading is
             accepted.
-        response_timeout_ns: timeout of an answer for each attempt, ns.
+        response_timeout_ns: timeout of the answer to each attempt, ns.
         tries: number of attempts to send a command before the unit is considered silent.
         stuck_after: number of consecutive identical samples after which samples are rejected as stuck; a
-            working sensor has noise. The value 0 disables the check.
+            working sensor has noise. The value 0 disables the check for stuck samples.
     """
 
     attitude_map: FloatArray

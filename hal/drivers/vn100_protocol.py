@@ -15,8 +15,8 @@ an invalid candidate. The computing time and memory of `StreamParser` are limite
 possible packet.
 
 The length of packets with unknown fields, for example of satellite navigation or firmware 3, is unknown.
-`StreamParser` counts such a packet if the bytes up to the next packet with the same header have a valid CRC.
-A packet with unknown fields shows that the baud rate is correct.
+`StreamParser` counts a packet with unknown fields if the bytes up to the next packet with the same header
+have a valid CRC. A packet with unknown fields shows that the baud rate is correct.
 """
 
 from __future__ import annotations

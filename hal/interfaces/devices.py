@@ -32,8 +32,8 @@ class ImuReading:
         arrival_ns: host time at which the last byte of the packet was received, ns.
         device_time_ns: time of the unit's own clock since the unit was started, ns.
         quaternion: (4,) rotation of the reference frame into the body frame, scalar last.
-        rate: (3,) body rate with respect to inertial space, in body axes, rad/s; NaN if the gyro's output is
-            invalid.
+        rate: (3,) body rate with respect to inertial space, in body axes, rad/s, or NaN if the gyro's output
+            is invalid.
         field: (3,) magnetic field in body axes, T.
         acceleration: (3,) specific force in body axes, m/s^2.
     """

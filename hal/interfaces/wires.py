@@ -1,7 +1,7 @@
 """Protocols of the connections to the hardware: clock, serial port, I2C bus, and the rig that contains them.
 
-The package hal implements these Protocols on Linux, and sim_hal implements them with emulated devices. Above
-these Protocols, flight and simulation use the same software, so that each simulated run executes the flight
+The package hal implements these Protocols on Linux, and sim_hal implements them with emulated devices. Flight
+and simulation use the same software on top of these Protocols, so that each simulated run executes the flight
 drivers.
 """
 
