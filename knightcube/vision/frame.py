@@ -9,8 +9,8 @@ A hot pixel is a bright pixel with dark neighbours. A point of light cannot caus
 neighbours, because the optics spread its light over several pixels. If a star's image has a standard
 deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the intensity
 of that pixel. Methods that need an image without gaps replace only those hot pixels that are detected with
-certainty. A fit to pixels excludes all suspected hot pixels. Excluding a pixel of a star by mistake does
-little harm.
+certainty. Fits of models to pixels exclude all suspected hot pixels. Excluding a pixel of a star by mistake
+does little harm.
 
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
 8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits.
@@ -41,7 +41,7 @@ _ROUNDING_VARIANCE = 1.0 / 12.0
 class Background:
     """Background level and noise (counts) of blocks of pixels on a regular grid over a frame of `shape`.
 
-    Under `stray_light`, the blocks have half of the usual side length.
+    If `stray_light` is true, the blocks have half of the usual side length.
     """
 
     level: FloatArray
@@ -64,15 +64,15 @@ class Background:
         return _interpolated(grid, self.shape)
 
     def level_at(self, column: FloatArray | IntArray, row: FloatArray | IntArray) -> FloatArray:
-        """Return the bilinearly interpolated level at pixels; the columns and rows are broadcast."""
+        """Return the background level at pixels, interpolated bilinearly; columns and rows are broadcast."""
         return among_blocks(self.level, self.shape, *np.broadcast_arrays(column, row))
 
     def subtracted(self, pixels: Image) -> tuple[Image, Image]:
-        """Return the counts of `pixels` (rows, columns) above the level, and the noise variances, float32."""
+        """Return `pixels` (rows, columns) minus background level, and their noise variances, as float32."""
         return _subtracted(pixels, self.level, np.square(self.noise))
 
     def subtracted_with_noise(self, pixels: Image) -> tuple[Image, Image]:
-        """Return the counts of `pixels` (rows, columns) above the level, and the noise (counts), float32."""
+        """Return `pixels` (rows, columns) minus background level, and their noise (counts), as float32."""
         return _subtracted(pixels, self.level, self.noise)
 
 
@@ -86,7 +86,7 @@ def _interpolated(grid: FloatArray, shape: tuple[int, int]) -> Image:
 
 
 def _subtracted_numpy(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple[Image, Image]:
-    """Return `pixels` minus the level, and the variance, both interpolated from the values of the blocks."""
+    """Return `pixels` minus the level, and the noise variance; both are interpolated from block values."""
     signal = _interpolated(level, (pixels.shape[0], pixels.shape[1]))
     # Arrays are changed in place, because allocating large arrays takes more time than the arithmetic.
     np.subtract(pixels, signal, out=signal)
@@ -109,8 +109,8 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
             of_row[0, block] = (1.0 - share) * level[top, of] + share * level[bottom, of]
             of_row[1, block] = (1.0 - share) * variance[top, of] + share * variance[bottom, of]
         for block in range(-1, across):
-            # Each pass covers the columns from the centre of one block to the next centre. The first pass
-            # covers the columns before the first centre.
+            # Each pass covers the columns from the centre of one block to the next centre.
+            # The first pass covers the columns before the first centre.
             first = max(math.ceil(block * width + 0.5 * (width - 1)), 0)
             last = columns if block == across - 1 else math.ceil((block + 1) * width + 0.5 * (width - 1))
             _fill_row(signal[row], floor[row], pixels[row], of_row, max(block, 0), width, first, last)
@@ -121,7 +121,7 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
 def _fill_row(
     signal: Image, floor: Image, pixels: Image, of_row: Image, block: int, width: int, first: int, last: int
 ) -> None:
-    """Write the columns `first` to `last` of a row of signal and variance from the block values `of_row`."""
+    """Write signal and variance of the columns `first` to `last` of a row from block values `of_row`."""
     centre, scale = np.float32(block * width + 0.5 * (width - 1)), np.float32(1.0 / width)
     level, slope = of_row[0, block], of_row[0, block + 1] - of_row[0, block]
     variance, rise = of_row[1, block], of_row[1, block + 1] - of_row[1, block]
@@ -131,10 +131,9 @@ def _fill_row(
         floor[column] = variance + share * rise
 
 
-# Minimum fraction of blocks with a smooth change of the level above the noise from which stray light is
-# assumed.
+# Minimum fraction of blocks with a smooth, significant change of the level if the frame has stray light.
 _LEAST_UNEVEN = 0.25
-# Largest ratio of the second to the first difference of the levels of neighbouring blocks in a smooth change.
+# Largest ratio of second to first difference of the levels of neighbouring blocks that counts as smooth.
 _SMOOTH = 0.5
 
 
@@ -147,10 +146,10 @@ def estimate_background(
     per block give the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block
     that is filled by a bright object gets the median noise of the surrounding 3 x 3 blocks.
 
-    Under stray light, the level varies within a block. For a frame with stray light, block size and stride
-    are therefore halved, and the moments are computed from the differences between the pixels and the level
-    interpolated between the centres of the larger blocks. Stray light is assumed if many neighbouring blocks
-    differ, unless `stray_light` states it.
+    Stray light makes the level vary within a block. For a frame with stray light, block size and stride are
+    therefore halved, and the moments are computed from the differences between the pixels and the level
+    interpolated between the centres of the larger blocks. If `stray_light` is None, stray light is assumed if
+    the levels of many neighbouring blocks differ.
     """
     coarse = _of_blocks(pixels, block, stride, None)
     if not (_is_uneven(coarse) if stray_light is None else stray_light):
@@ -203,8 +202,7 @@ def _clipped_moments_numpy(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     median = _median_of_blocks(values)
     apart = np.abs(values - median)
     spread = MAD_TO_SIGMA * _median_of_blocks(apart)
-    # Quantisation can make the median deviation zero. A minimum clipping limit of 1.5 counts keeps pixels
-    # that differ by one count from the median.
+    # The clipping limit is at least 1.5 counts, because quantisation can make the median deviation zero.
     kept = apart <= _CLIP * np.maximum(spread, 0.5)
     count = kept.sum(axis=-1)
     level = np.where(kept, values, 0.0).sum(axis=-1) / count
@@ -421,8 +419,7 @@ def _box_sum_numpy(image: Image) -> Image:
     columns, flat = image.shape[1], image.reshape(-1)
     total = np.empty(image.shape, dtype=image.dtype)
     sums = total.reshape(-1)
-    # In the flat array, the end of each row adjoins the start of the next row, so that only the sums at the
-    # border are wrong.
+    # Rows adjoin in the flat array, so that the sums at the border are wrong and are set to zero.
     for start in range(columns + 1, flat.size - columns - 1, _STRETCH):
         stop = min(start + _STRETCH, flat.size - columns - 1)
         down = flat[start - columns - 1 : stop - columns + 1] + flat[start - 1 : stop + 1]
@@ -450,7 +447,7 @@ def _box_sum(image: Image) -> Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
-    """The moments of the brightness of n regions.
+    """Brightness moments of n regions.
 
     Attributes:
         flux: sum of the counts above the background in each region (n,).
@@ -475,7 +472,7 @@ def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def _label_pixels_numpy(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
-    """Return the result of `label_pixels`.
+    """Numpy form of `label_pixels`.
 
     Each run of adjacent pixels is linked to an earlier run of the same region, and the links are shortened
     until all runs of a region share one root (Shiloach and Vishkin 1982). An implementation with scipy.sparse
@@ -535,8 +532,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
             above += 1
     count = 0
     for run in range(runs):
-        # The root of a region is its first run, and the number of this run is already the number of the
-        # region.
+        # The root of a region is its first run, which already has the number of the region.
         if root[run] == run:
             start[run] = count
             count += 1
@@ -551,7 +547,8 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
 def _root_of(root: IntArray, run: int) -> int:
     """Return the first run of the region that contains `run`, and shorten the links to the first run.
 
-    A run is a row's adjacent pixels. The array `root` links each run to an earlier run of its region.
+    A run is a sequence of adjacent pixels in one row. The array `root` links each run to an earlier run of
+    its region.
     """
     while root[run] != run:
         root[run] = root[root[run]]
@@ -565,8 +562,8 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
     The moments of a region with zero flux are zero.
     """
     flux, x, y, xx, yy, xy = _moment_sums(owner, column, row, light, count)
-    # The point spread increases both principal moments by the same amount.
-    # For a uniform line of length L and any point spread, the difference of the principal moments is L^2/12.
+    # The point spread function (PSF) increases both principal moments by the same amount.
+    # For a uniform line of length L and any round PSF, the difference of the principal moments is L^2/12.
     spread = np.hypot(xx - yy, 2.0 * xy)
     return Moments(
         flux,
@@ -580,7 +577,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 def _moment_sums_numpy(
     owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
 ) -> FloatArray:
-    """Return flux, centroid (x, y) and moments (xx, yy, xy) of regions (6, count); see `moments`."""
+    """Return flux, centroid (x, y) and second moments (xx, yy, xy) of regions (6, count); see `moments`."""
     flux = np.bincount(owner, light, count).astype(np.float64)
     whole = np.where(flux > 0.0, flux, np.inf)
     x, y = np.bincount(owner, light * column, count) / whole, np.bincount(owner, light * row, count) / whole
@@ -621,7 +618,8 @@ def _moment_sums(
 def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
     """Return the ends (2, 2), px, of the uniform line with a given `centre` (2,) and `covariance` (2, 2).
 
-    A line up to `least_length` px has both ends at its centre. The second moments `covariance` are in px^2.
+    If the line is not longer than `least_length`, px, both ends are at the centre. The second moments
+    `covariance` are in px^2.
     """
     (across, along), axes = np.linalg.eigh(covariance)
     length = float(np.sqrt(12.0 * max(along - across, 0.0)))
@@ -668,7 +666,7 @@ def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]
 
 
 def _hot_places_numpy(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
-    """See `find_hot_pixels`; `least` is the least variance."""
+    """See `find_hot_pixels`; `least` is the smallest noise variance of all pixels."""
     row, column = positions(signal > np.float32(HOT_SIGMAS * np.sqrt(least)))
     return _hot_among_numpy(signal, row, column, np.sqrt(variance[row, column]), np.zeros(len(row)))
 
@@ -828,7 +826,7 @@ def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None)
 
 
 def at_least(pixels: Image, level: float) -> BoolArray:
-    """Return which `pixels` reach a `level`, counts.
+    """Return the mask of the `pixels` with at least `level` counts.
 
     If the pixels are integers, the level is rounded up to an integer of the same type.
     """

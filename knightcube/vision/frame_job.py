@@ -58,12 +58,11 @@ from knightcube.vision.streaks.streak_result import (
 )
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
-# Relative correction of the assumed focal length above which the motion is fitted a second time.
+# Correction of the assumed focal length, as a fraction, above which the motion is fitted a second time.
 _SCALE_TOLERANCE = 0.01
 # Motion (px) of a star over the exposure below which the star is measured as a point.
 _POINT_PX = 1.0
-# Predicted streak length (px) below which stars are measured as points if no motion can be fitted. In a dense
-# star field, merged star images can look like streaks.
+# Predicted streak length (px) below which stars are measured as points if no motion can be fitted.
 _SHORT_PX = 4.0
 # Largest uncertainty (px) of the predicted motion of a star that is included in the model of its image.
 _KNOWN_PX = 0.3
@@ -85,7 +84,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Interface of an alternative estimator of the motion from streaks, with support for pickling."""
+    """Interface of an alternative estimator of the motion from streaks, which must support pickling."""
 
     def motion(
         self,
@@ -351,8 +350,7 @@ def found_in_image(
     `lens` are estimated from earlier images of the camera, or None if they are not estimated.
     """
     tracker = TrackerSettings(settings, scale)
-    # The attitude depends only on the positions of the stars, so that a rate with a large uncertainty is
-    # accepted.
+    # A rate with a large uncertainty is accepted, because the attitude depends only on the star positions.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
@@ -364,8 +362,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate from a frame by the decision tree in the module docstring."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    # If the streaks are few and short, a fit is uncertain, and the stars are searched near their predicted
-    # positions.
+    # A fit to a few short streaks is uncertain, so stars are searched near their predicted positions.
     trails, prior = _short_trails(job), job.attitude_prior
     if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, trails)
@@ -420,11 +417,10 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         return FrameFound(motion, solution)
     if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
         again = _motion(replace(job, camera=solution.camera))
-        assert isinstance(again, MotionResult)  # Both fits use the same estimator.
+        assert isinstance(again, MotionResult)  # The first and the second fit use the same estimator.
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
-        # For a single image, a second fit would increase the computing time by a half and the accuracy only
-        # slightly.
+        # A second fit to a single image would take 50 % more time and improve the accuracy only slightly.
         return FrameFound(motion, solution)
     from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 

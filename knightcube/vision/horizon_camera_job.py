@@ -1,17 +1,18 @@
 """Job of the worker process `wide`: Sun and nadir in body axes from the images of the horizon cameras.
 
-The solar strings determine which camera is read first. If no camera finds the Sun, the Sun direction is
-computed from the solar strings. The nadir direction is fitted to the limbs in all images at once. If no image
-shows a limb, the brightness of all images gives a coarse nadir direction, because the Earth may fill one
-camera while the others are dark. The modules of the estimators are imported at their first use, because the
-control process does not need them.
+The currents of the solar strings determine which camera is read first. If no camera finds the Sun, the Sun
+direction is computed from the currents of the solar strings (strings of solar cells). The nadir direction is
+fitted to the limbs in all images at once. If no image shows a limb, the brightness of all images gives a
+coarse nadir direction, because the Earth may fill one camera while the others are dark. The modules of the
+estimators are imported at their first use, because the control process does not need them.
 
 The spacecraft's own structure is masked in the images. A mask is configured (polygons or an image file), or
 is estimated from successive frames. While the limb moves over the image, the brightness of the scene changes
 repeatedly, whereas that of the structure stays constant. `StructureMap` compares the mean brightness of
 square blocks of pixels with that in the last counted frame. A frame is counted if a quarter of its blocks
-have changed. A block that did not change in `_QUIET_FRAMES` successive counted frames shows structure. A
-block whose brightness changes is at once removed from the mask, so that a wrong mask does not hide a limb.
+have changed. A block whose brightness did not change in `_QUIET_FRAMES` successive counted frames shows the
+spacecraft. A block whose brightness changes is at once removed from the mask, so that a wrong mask does not
+hide a limb.
 """
 
 from __future__ import annotations
@@ -38,16 +39,13 @@ JUDGING_SIGMA = 0.005
 _BLOCK = 8
 """Width and height of a block, px."""
 _CHANGE = 0.08
-"""Threshold for a change of a block's mean brightness, relative to the brightness range of the image."""
+"""Threshold for a change of a block's mean brightness, as a fraction of the brightness range of the image."""
 _MOVED = 0.25
 """Minimum fraction of changed blocks for a frame to be counted."""
 _QUIET_FRAMES = 12
-"""Number of successive counted frames in which a block must be unchanged to count as structure."""
+"""Number of successive counted frames without change after which a block counts as spacecraft structure."""
 _LARGEST = 0.4
-"""Largest fraction of the image that an estimated mask may cover.
-
-An estimated mask that covers a larger fraction is discarded.
-"""
+"""Largest fraction of the image that an estimated mask may cover; a larger mask is discarded."""
 
 
 def polygon_mask(rows: int, columns: int, polygons: Sequence[Sequence[tuple[float, float]]]) -> BoolArray:
@@ -71,7 +69,7 @@ def polygon_mask(rows: int, columns: int, polygons: Sequence[Sequence[tuple[floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StructureMap:
-    """Blocks of one camera's images that show structure, by configuration or by estimation from frames.
+    """Blocks of one camera's images that show the spacecraft, by configuration or by estimation from frames.
 
     Attributes:
         rows, columns: number of pixels of the images.
@@ -94,7 +92,7 @@ class StructureMap:
         return cls(rows, columns, blocks, np.zeros((0, 0)), np.zeros(blocks.shape, dtype=np.int64))
 
     def after(self, image: Image) -> StructureMap:
-        """Return the map after a frame (rows, columns)."""
+        """Return the map updated with a frame (rows, columns)."""
         level = _blocks(image)
         if not self.level.size:
             return replace(self, level=level)
@@ -126,7 +124,7 @@ class StructureMap:
 
 
 def _neighbours(blocks: BoolArray) -> IntArray:
-    """Return the number of set neighbours of each block (m, n), of at most eight."""
+    """Return how many of the eight neighbours of each block (m, n) are set."""
     padded = np.pad(blocks.astype(np.int64), 1)
     m, n = blocks.shape
     around = sum(padded[i : i + m, j : j + n] for i in range(3) for j in range(3))
@@ -169,7 +167,8 @@ class HorizonCameraJob:
 class MeasuredDirection:
     """A direction (3,) in body axes, its covariance (3, 3), rad^2, and the cameras that measured it.
 
-    If `cameras` is empty, it is the Sun from the solar strings, or the nadir from the brightness.
+    If `cameras` is empty, the Sun was estimated from the solar strings, or the nadir from the mean brightness
+    of the images.
     """
 
     direction: FloatArray
@@ -187,7 +186,7 @@ class HorizonCameraResult:
     """The result of a job.
 
     Attributes:
-        sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
+        sun, nadir: measured directions of Sun and nadir in body axes, each None if it was not found.
         false: reasons, by camera index, why an image contradicts an accurately known attitude, or None if the
             attitude is not known accurately enough to check the images.
         structure: maps of the spacecraft's own structure, updated with these images, by camera index.
@@ -253,7 +252,7 @@ def _nadir(
 
 
 def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
-    """Return, by camera index, why images contradict an accurately known attitude, or None without one."""
+    """Return, by camera index, why images contradict the attitude, or None if images cannot be checked."""
     from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
     from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
 
@@ -277,7 +276,7 @@ def _masks(job: HorizonCameraJob) -> dict[int, BoolArray]:
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the nadir (3,), body axes, from a rough attitude, or None if the attitude is too uncertain."""
+    """Return the nadir direction (3,) in body axes from the attitude, or None if it is too uncertain."""
     rough, position = knowledge.attitude, knowledge.position
     if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
         return None
@@ -285,7 +284,7 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
 
 
 def _expected_sun(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the Sun direction (3,), body axes, from a rough attitude, or None if it is too uncertain."""
+    """Return the Sun direction (3,) in body axes from the attitude, or None if it is too uncertain."""
     rough = knowledge.attitude
     if rough is None or rough.sigma > LIT_SIGMA or knowledge.sun is None:
         return None

@@ -57,7 +57,7 @@ _MAX_SELECTIONS = 10
 _CONVERGED = 1e-6
 """Predicted decrease of chi-square at which the fit is converged."""
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-"""Rounding error of a computed star position, relative to the distances in the frame."""
+"""Rounding error of a computed star position, as a fraction of focal length plus coordinates (px)."""
 _DETERMINED = 0.5
 """Ratio of posterior to prior standard deviation below which a lens parameter counts as determined."""
 _MAX_EXCESS = 3.0
@@ -68,7 +68,7 @@ _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 Lens terms are omitted in the order k2, k1, centre.
 """
 _USUAL_SHAPE = 0.02
-"""Prior standard deviation of aspect, of shear, and of the tangential displacement of an image corner."""
+"""Prior standard deviation of aspect, shear and, as a fraction at image corners, tangential distortion."""
 _SHOWN = 18.4
 """Chi-square (2 degrees of freedom, probability 1e-4) above which a pair of lens terms is significant."""
 _ROUNDS = 3
@@ -214,8 +214,7 @@ def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:
             quaternion = solve(in_camera, frame.directions, sigma / np.sqrt(weight)).quaternion
             fit = LensFit(parameters_of(lens), quaternion[None])
             (weight,) = cauchy_weights(residual_lengths([frame], fit))
-            # Weights stay positive, so that correct matches that do not fit a poor initial attitude can
-            # regain weight.
+            # Weights stay positive, so that a correct match can regain weight after a poor initial attitude.
             weight = np.maximum(weight, 1e-6)
     except AttitudeError as error:
         raise CalibrationError(f"frame {number}: {error}") from error
@@ -230,7 +229,7 @@ def _converged(
     expected: FloatArray,
 ) -> FitStep:
     """Return the last step of the converged fit to the accepted matches `used`."""
-    # chi-square of rounding errors, which limits the decrease of chi-square that shows convergence
+    # Chi-square of the rounding errors; the fit has converged if chi-square decreases by less.
     least = 0.0
     for frame, chosen in zip(frames, used, strict=True):
         length = fit.parameters[0] + np.linalg.norm(frame.points[chosen], axis=1)
@@ -316,10 +315,11 @@ class DeterminedLens:
     """A calibration that includes only the lens terms determined by the stars.
 
     Attributes:
-        calibration: calibration with assumed, nearly certain values of the omitted terms.
+        calibration: calibration in which small prior standard deviations fix the omitted terms at assumed
+            values.
         omitted: omitted lens terms by their names "k1", "k2" and "centre".
-        accuracy: standard deviations of the lens by the keys of `camera.accuracy` in a configuration. A key
-            of `accuracy` is missing if the stars do not determine its lens term.
+        accuracy: standard deviations of the lens parameters by the keys of `camera.accuracy` in a
+            configuration. A key of `accuracy` is missing if the stars do not determine its lens term.
     """
 
     calibration: Calibration
@@ -386,7 +386,7 @@ def _next_omitted(found: Calibration, omitted: dict[str, OmittedTerm]) -> str | 
 def lens_accuracy(
     whole: Calibration, found: Calibration, omitted: dict[str, OmittedTerm]
 ) -> dict[str, float]:
-    """Return the standard deviations of a lens by the keys of `camera.accuracy` in a configuration.
+    """Return the standard deviations of lens parameters by the keys of `camera.accuracy` in a configuration.
 
     The standard deviations of focal length and centre are taken from the fit `found`, which does not include
     the omitted terms. The standard deviation of the focal length includes its difference from the fit
@@ -414,10 +414,11 @@ def calibrate_one_lens(
 ) -> tuple[DeterminedLens, dict[int, str]]:
     """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    The focal length (m,) from each frame alone, px, has the standard deviation `sigmas` (m,). A frame is
-    excluded if it was taken with another focus or zoom, or if its solution is wrong: if its focal length
-    differs from the median by more than 5 standard deviations and by more than 1 %, or if a fit rejects more
-    than half of its matches. Raises CalibrationError for the same reasons as `calibrate`.
+    The arguments `focal_lengths` (m,) and `sigmas` (m,), px, are the focal length from each frame alone and
+    its standard deviation. A frame is excluded if it was taken with another focus or zoom, or if its solution
+    is wrong: if its focal length differs from the median by more than 5 standard deviations and by more than
+    1 %, or if a fit rejects more than half of its matches. Raises CalibrationError for the same reasons as
+    `calibrate`.
     """
     usual = float(np.median(focal_lengths))
     different = np.abs(focal_lengths - usual) > np.maximum(5.0 * sigmas, 0.01 * usual)
@@ -456,7 +457,7 @@ class CalibrationImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensCalibration:
-    """The outcome of `calibrate_lens`. A `LensCalibration` is true (`if found:`) if a lens was determined.
+    """Result of `calibrate_lens`. A `LensCalibration` is true (`if found:`) if a lens was determined.
 
     Attributes:
         determined: lens, standard deviations, omitted terms and accuracy, or None if no image was solved.
@@ -474,7 +475,7 @@ class LensCalibration:
         return self.determined is not None
 
     def __repr__(self) -> str:
-        """Return the lens and the number of images, in one line."""
+        """Return one line of text with the lens and the number of images."""
         return f"<LensCalibration of {len(self.images)} images: {self.lens or 'no lens was determined'}>"
 
     @property
@@ -494,7 +495,7 @@ def calibrate_lens(
     All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
     images are excluded. Ten images with stars in the corners give a better calibration than a hundred images
     without stars in the corners. Lens terms that the stars do not determine are omitted. If most images show
-    a mirrored sky, because of a mirror or a reversed order of the rows, they are mirrored back.
+    a mirrored sky, because of a mirror or a reversed order of the rows, all images are mirrored back.
 
     Args:
         images: arrays (rows, columns) of counts, or colour images (rows, columns, 3), all of one shape.

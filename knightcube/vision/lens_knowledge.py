@@ -52,7 +52,7 @@ _MIN_INDEPENDENCE = 1e-10
 _MIN_COSINE = 0.05
 """Minimum cosine of the angle between a star in the image and the optical axis."""
 NONE = 1e-7
-"""Prior standard deviation of a lens term that is held at zero."""
+"""Prior standard deviation of a lens term that is fixed at zero."""
 MIN_SIGMA_PX = 0.02
 """Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 
@@ -63,7 +63,7 @@ class CalibrationError(FlightError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFrame:
-    """The n stars identified in one frame, a few of them possibly wrong.
+    """The n stars identified in one frame, a few of which may be misidentified.
 
     Attributes:
         points: measured star positions (n, 2), px.
@@ -106,8 +106,8 @@ class LensFit:
 class FitStep:
     """Result of one Gauss-Newton step of the calibration.
 
-    The linear model predicts the `decrease` of chi-square. The information matrix (9, 9) of the lens
-    parameters comes from the stars, after elimination of the attitudes.
+    The attribute `decrease` is the decrease of chi-square that the linear model predicts. The information
+    matrix (9, 9) of the lens parameters comes from the stars, after elimination of the attitudes.
     """
 
     fit: LensFit
@@ -323,7 +323,7 @@ _LEAST_MATCHED = 6
 _PLAUSIBLE = 5.0
 """Largest deviation of stored values from the configuration, in configured standard deviations."""
 _ROBUST_ROUNDS, _MOST_ROUNDS, _SETTLED = 5, 8, 1e-4
-"""Number of fit steps with robust weights, maximum number without, and last decrease of chi-square."""
+"""Number of robust fit steps, maximum number of unweighted fit steps, and final decrease of chi-square."""
 
 
 def axes_turn(configured: CameraModel, learned: CameraModel) -> FloatArray:
@@ -489,7 +489,9 @@ class LensKnowledge:
     def update(
         self, solution: FrameSolution, sky: SkyIndex, velocity: FloatArray | None = None, elapsed: float = 0.0
     ) -> LensKnowledge:
-        """Return the estimate after a frame, `elapsed` s after the last one. Too few stars have no effect.
+        """Return the estimate after a frame that was taken `elapsed` s after the last frame.
+
+        A frame with too few stars does not change the estimate.
 
         The frame was solved with `camera` and `shutter` of this object and, if given, with the velocity (3,)
         of the camera, m/s. If the frame contradicts the estimated lens, the result is the configured lens,
@@ -499,12 +501,11 @@ class LensKnowledge:
         if solution.fix is None or solution.mirrored or len(solution.matched) < _LEAST_MATCHED:
             return self
         if motion is not None and motion.status is not StreakStatus.RATE and not line_time_known:
-            return self  # the sign of the line time's effect is unknown
+            return self  # a rate of unknown sign leaves the sign of the line time's effect unknown
         frame, attitude = matched_frame(solution, sky, velocity, self.shutter), solution.fix.quaternion
         focal = solution.camera.focal_length
         if motion is not None and motion.length > 0.0:
-            # A distortion error changes the curvature of a star's path and thus displaces the middle of the
-            # fitted path.
+            # A distortion error bends a star's path and thus displaces the middle of the fitted path.
             corner = math.hypot(*self.configured.ideal.centre)
             square = (corner / float(self.values[0])) ** 2
             distortion = (self.sigma if self.usable else self.spread)[3] * square
@@ -583,8 +584,7 @@ class _FrameFit:
         Raises CalibrationError if the frame does not determine its attitude, or if few stars agree.
         """
         expected = known.values[:_PSF]
-        # The covariance is scaled by its standard deviations before the inversion, because they differ by
-        # many orders of magnitude.
+        # The covariance is normalised for its inversion, because the parameters differ greatly in size.
         sigma = known.sigma[:_PSF]
         inverse = np.linalg.inv(known.covariance[:_PSF, :_PSF] / np.outer(sigma, sigma))
         prior = inverse / np.outer(sigma, sigma)
@@ -605,7 +605,7 @@ class _FrameFit:
         off, unit = fit.parameters - expected, np.sqrt(np.diag(last.information + prior))
         scaled = np.linalg.inv((last.information + prior) / np.outer(unit, unit))
         covariance = scaled / np.outer(unit, unit)
-        # effective number of parameters that the stars determine
+        # Effective number of lens parameters that the stars, and not the prior, determine.
         own = len(off) - float(np.sum(prior * covariance))
         freedom = max(2.0 * len(squares) - 3.0 - own, 1.0)
         excess = float(squares.sum()) / freedom
