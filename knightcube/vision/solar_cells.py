@@ -9,8 +9,8 @@ covariance of the Sun direction includes. The correlation can be computed if nad
 mean over all nadir directions is used.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if one
-string fails, in whatever way. The magnetic field does not determine the rotation about the field direction.
-The estimator therefore tries rotations by all angles about the field direction, and predicts for each the
+string fails in any way. The magnetic field does not determine the rotation about the field direction. The
+estimator therefore tries rotations by all angles about the field direction, and predicts for each the
 illumination of the strings by Sun and Earth. A trial rotation is possible if no string contradicts it, or if
 a single string contradicts it and this string is the same in all readings. Between readings, the possible
 rotations are propagated with the gyro. The covariance of the attitude includes all possible rotations
@@ -60,8 +60,9 @@ class SolarStringModel:
     Attributes:
         normals: outward unit vectors (n, 3) of the strings, in body axes.
         peaks: currents (n,) in full sunlight at normal incidence, A.
-        sigma: standard deviation of a reading relative to its peak, including departures from the cosine law.
-        albedo: mean illumination by an Earth that would fill half the sky, relative to the Sun.
+        sigma: standard deviation of a reading, as a fraction of the peak current, including departures from
+            the cosine law.
+        albedo: mean illumination by an Earth that would fill half the sky, as a fraction of the Sun's.
         albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
         dark: fraction of its peak current below which a string counts as dark.
 
@@ -96,7 +97,7 @@ class CoarseSun:
     """Sun direction from the solar strings.
 
     Attributes:
-        status: the outcome.
+        status: outcome of the estimation.
         direction: unit vector (3,) to the Sun in body axes, or None unless the status is FOUND.
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
         tangent_covariance: covariance (2, 2) of the direction error along `basis`, rad^2.
@@ -145,8 +146,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
         step = inverse @ (weighted @ (readings - modelled))
-        # Each step is limited to half a radian, because the linearisation is inaccurate far from the
-        # solution.
+        # Steps are limited to 0.5 rad, because the linearisation is inaccurate far from the solution.
         step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
         direction = direction + step @ basis
         direction = direction / np.linalg.norm(direction)
@@ -154,8 +154,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # The limit of chi-square, which correct currents exceed with a probability of 1 in 1,000, is computed by
-    # the approximation of Wilson and Hilferty (1931).
+    # Correct currents exceed this limit of chi-square (Wilson and Hilferty 1931) with a probability of 0.001.
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
@@ -164,17 +163,20 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
 
 
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the relative string currents at given cosines of the incidence angle, and their derivatives.
+    """Return the currents of strings, as fractions of the peak currents, and their derivatives.
 
-    `cosines` (...) are the cosines of the angles between the Sun and the normals of the strings. The current
-    is 0 if the Sun is behind the string.
+    The argument `cosines` (...) contains the cosines of the angles between the Sun and the normals of the
+    strings. The current is 0 if the Sun is behind the string.
     """
     root = np.sqrt(cosines**2 + _SOFT**2)
     return 0.5 * (cosines + root), 0.5 * (1.0 + cosines / root)
 
 
 def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Return the mean relative current (n,) from Earth light, and the covariance (n, n) of the readings."""
+    """Return the mean currents (n,) due to Earth albedo, and the covariance (n, n) of the readings.
+
+    Both are normalised to the peak currents.
+    """
     normals, square = strings.normals, strings.albedo_sigma**2
     own = strings.sigma**2 * np.eye(len(normals))
     if nadir is not None:
@@ -198,7 +200,7 @@ _MOST_VIOLATION = 3.0
 _CERTAIN = 5.0
 """Number of standard deviations from the estimated rotation angle to the farthest possible rotation angle."""
 _COMMON = 0.02
-"""Relative error common to all strings, for instance due to the distance of the Sun and the temperature."""
+"""Error common to all strings, as a fraction of their currents, due to Sun distance and temperature."""
 _STEP = 2.0 * math.pi / _TURNS
 _ANGLES = _STEP * np.arange(_TURNS)
 
@@ -210,7 +212,7 @@ class KnownDirections:
     Attributes:
         field: magnetic field vector (3,), T.
         sun, nadir: unit vectors (3,) to the Sun and to nadir.
-        light: illumination by an Earth that would fill half the sky, relative to the Sun.
+        light: illumination by an Earth that would fill half the sky, as a fraction of the Sun's.
         light_sigma: standard deviation of `light`.
     """
 
@@ -279,8 +281,7 @@ class FieldAndStrings:
             return None
         base = self._aligned(axis, sky.field / strength)
         whole, without = self._misfits(attitude_matrix(base), shares, axis, math.hypot(across, blur), sky)
-        # Excess chi-square is accumulated separately for each trial rotation and each assumption of a failed
-        # string.
+        # Excess chi-square is accumulated for each pair of a trial rotation and an assumed failed string.
         one, fewer, all_ = self._bounds
         least = without.min(axis=1)
         against = np.maximum(without / fewer, (without - least[:, None]) / one)
@@ -309,8 +310,7 @@ class FieldAndStrings:
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # If the two directions are nearly opposite, the base attitude is first rotated by 180 deg about
-            # an axis normal to `axis`.
+            # If the two directions are nearly opposite, the base attitude is first rotated by 180 deg.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))
@@ -320,7 +320,7 @@ class FieldAndStrings:
     def _misfits(
         self, base: FloatArray, shares: FloatArray, axis: FloatArray, tilt: float, sky: KnownDirections
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the chi-squares of the relative currents `shares` (n,) for t trial rotations.
+        """Return the chi-squares of currents `shares` (n,), in units of the peaks, for t trial rotations.
 
         The first returned array (t,) uses all strings, and each row of the second array (n, t) omits one.
         """

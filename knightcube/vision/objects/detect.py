@@ -78,8 +78,8 @@ class Indicators:
 
     Attributes:
         endpoints: start and end of each streak (n, 2, 2), px, in the direction of motion of the stars.
-        deviations: differences from the indicators of a star at the same position (n, 3), in sigmas.
-        fired: which of the three indicators of each streak exceed their thresholds (n, 3).
+        deviations: differences (n, 3) from a star's indicators at the same position, in standard deviations.
+        fired: mask (n, 3) of the indicators of each streak that exceed their thresholds.
         centre: centre of rotation in the image by least squares (2,), px; meaningless if `degenerate`.
         degenerate: whether slopes and lengths of the chords are used instead of centre and angle.
     """
@@ -149,8 +149,8 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
-# Distance of the rotation centre from the boresight, in focal lengths, above which slopes are used instead.
-# It is computed from the rotation axis, because errors of a fitted centre make its distance too small.
+# Largest distance of the rotation centre from the boresight, in focal lengths, for which it is used.
+# The distance is computed from the rotation axis, because errors make a fitted centre appear too near.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -193,7 +193,7 @@ def evaluate(
     fired = np.zeros((0, 3), dtype=np.bool_)
     if len(deviations):
         # The median absolute deviation is used, because an object itself increases the standard deviation.
-        # For example, the largest of ten values never exceeds 2.85 standard deviations of the ten values.
+        # For example, none of ten values can deviate from their mean by more than 2.85 standard deviations.
         spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
         fired = np.abs(deviations) > np.maximum(bounds, strict * spread)
     return Indicators(endpoints, deviations, fired, centre, degenerate)
@@ -206,9 +206,9 @@ def short_regions(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return ends (n, 2, 2), px, their deviations (n,), px, and labels (n,) of short bright regions.
+    """Return ends (n, 2, 2), px, standard deviations (n,), px, and labels (n,) of short bright regions.
 
-    These regions are shorter than the streak of a star at the same position. The ends of a region are those
+    Short regions are shorter than the streak of a star at the same position. The ends of a region are those
     of the uniform line with the same moments as the region's bright part. For a point, both ends are equal.
     """
     regions = segmented.regions
@@ -253,7 +253,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SpaceObject:
-    """A streak or point with a motion that differs from that of the stars.
+    """A streak or point whose motion differs from the motion of the stars.
 
     Attributes:
         endpoints: ends of the object's streak (2, 2), px, in the order in time that gives the slower motion
@@ -288,9 +288,9 @@ class SpaceObject:
 class ObjectReport:
     """The result of a search: the examined streaks of an image, and the objects found, the brightest first.
 
-    The indicators and verdicts are those of the streaks with two ends, followed by those of the short
-    regions. The verdicts `crowded` are those of the regions with more than two corners. The search assumed
-    the `rotation` (3,), rad, camera axes.
+    The attributes `indicators` and `verdicts` contain first the streaks with two ends, then the short
+    regions. The attribute `crowded` contains one verdict for each region with more than two corners.
+    `rotation` (3,), rad, is the rotation vector of the camera, in camera axes, that the search assumed.
     """
 
     indicators: Indicators
@@ -304,7 +304,7 @@ class ObjectReport:
 _LEAST_CROSSING_PX = 10.0
 # Largest distance (px) of a line's end from a star's path for which the line is part of the path.
 _ON_PATH_PX = 1.5
-# Distance (px) of the ends of a streak from the predicted ends below which it is the streak of a star.
+# Distance (px) of a streak's ends from the ends predicted for a star below which the streak is a star's.
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
@@ -312,16 +312,16 @@ _FEW_PATHS = 2
 _GOOD_FIT = 1.4
 # Upper limit of chi-square per pixel along a uniform streak (three standard deviations for 1000 pixels).
 _UNIFORM = 1.15
-# Ratio of the brightness of a star's path to that of a line on it above which the line may be the star's.
+# Minimum brightness of a star's path, relative to a line on the path, if the line can be part of the star.
 _HIDDEN_STAR = 0.6
-# Number of parts into which a star's path is divided to compare their brightness.
+# Number of parts into which a star's path is divided; every part must be bright enough.
 _PARTS = 12
-# Limits of the excess of chi-square that remains with an object, relative to the decrease by the object: for
-# every object, and for a uniform streak that resembles the streak of a star.
+# Largest ratio of the excess chi-square that remains with an object to the decrease by the object:
+# for every object, and for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
 # Fraction of the required decrease of chi-square above which the light may be a part of an object's streak.
 _PART = 0.6
-# Largest excess of chi-square, relative to its decrease by an object, for which the ends are located.
+# Largest ratio of remaining excess chi-square to its decrease by an object for which ends are located.
 _HOPELESS = 4.0
 # Margin (standard deviations of the PSF) beyond the distance at which a star's profile equals the noise.
 _DIM_SIGMAS = 2.0
@@ -333,8 +333,8 @@ _BORDER_PX = 2
 class Judgement:
     """Classification of one streak or region.
 
-    The candidate is the detected object, or None unless the verdict is OBJECT. The light is that of the stars
-    that explain the pixels, or None for an object and for an untested streak.
+    The attribute `candidate` is the detected object if the verdict is OBJECT, otherwise None. The attribute
+    `light` is the model of the pixels by stars, or None for an object and for an untested streak.
     """
 
     verdict: Verdict
@@ -382,7 +382,7 @@ def _light_beside(
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """Classifies streaks and regions of a frame as stars or objects by their pixels.
+    """Classifier of the streaks and regions of a frame as stars or objects, by their pixels.
 
     The camera rotates by `rotation` (3,), rad, camera axes, during the `exposure`, s.
     """
@@ -476,7 +476,7 @@ class Judge:
         return pixels_of_region(regions.labels, regions.boxes[np.searchsorted(regions.label, label)], label)
 
     def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
-        """Return the objects in regions in which objects and stars may be merged.
+        """Return the objects in regions in which the images of objects and stars may be merged.
 
         If a few trial stars do not explain all light of a region, stars are fitted to the region. If the
         fitted stars do not explain all light either, they are subtracted, and the brightest remaining light
@@ -579,11 +579,12 @@ class Judge:
         stars: Sequence[FloatArray],
         improvement: float,
     ) -> SpaceObject | None:
-        """Return the object between `ends`, with the order of its ends that gives the slower motion.
+        """Return the object between `ends`, or None if stars explain the pixels.
 
-        The motion is that relative to the stars. The ends are located from the light along the whole streak.
-        If the fit of the object along the streak is poor, the stars of the region are fitted and included.
-        Returns None if the located streak is that of a star, or if stars explain its pixels.
+        The order of the ends is the order that gives the slower motion relative to the stars. The ends are
+        located from the light along the whole streak. If the fit of the object along the streak is poor, the
+        stars of the region are fitted and included. Returns None also if the located streak is the streak of
+        a star.
         """
         rough = light.explain(ends)
         gained = light.chi_square - rough.chi_square
@@ -611,7 +612,7 @@ class Judge:
     def _located(
         self, ends: FloatArray, light: StarLight, stars: Sequence[FloatArray], improvement: float
     ) -> tuple[LocatedEnds, StarLight, Explanation] | None:
-        """Return the located ends of an object, and how well stars and object explain its pixels, or None."""
+        """Return located ends of an object, model of stars, and fit of stars and object, or None."""
         best = None
         for among_stars in (True, False):
             located = light.located(ends, among_stars)
@@ -657,10 +658,10 @@ class Judge:
         return cut_patch(self.segmented, index, self.objects.psf_sigma, gain, saturation)
 
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
-        """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
+        """Return the rate, rad/s, and the image direction (2,) of an object's motion relative to the stars.
 
-        The object moves from the first of the `ends` (2, 2), px, to the second. Both ends of a streak are
-        rotated to mid-exposure like the directions of stars. The difference between the rotated ends is the
+        The object moves from the first of the `ends` (2, 2), px, to the second. Both ends of the streak are
+        rotated to mid-exposure with the rotation of the stars. The difference between the rotated ends is the
         motion of the object relative to the stars.
         """
         middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
@@ -702,7 +703,7 @@ def detect(
 def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Streaks) -> ObjectReport:
     """Return the report on an image after classification of all streaks and crowded regions.
 
-    The labels `labels` (n,) are those of the regions of the streaks in `indicators`.
+    The argument `labels` (n,) contains the label of the region of each streak in `indicators`.
     """
     judged: list[Judgement] = []
     settled: list[int] = []

@@ -64,9 +64,9 @@ class Trails:
 class ObjectPatch:
     """A rectangle of the image around a possible object, whose first pixel is at `corner` (x, y), px.
 
-    The pixels (rows, columns) are in counts above the sky level, and saturate at the `ceiling`. The `noise`
-    is the standard deviation of a background pixel, counts, and `psf` that of the PSF, px. The gain is in
-    electrons per count. The mask `usable` selects the pixels that are not saturated.
+    The pixels `light` (rows, columns) are in counts above the sky level, and saturate at `ceiling` counts.
+    The standard deviations of a background pixel (counts) and of the PSF (px) are `noise` and `psf`. The gain
+    is in electrons per count. The mask `usable` selects the pixels that are not saturated.
     """
 
     light: FloatArray
@@ -78,7 +78,7 @@ class ObjectPatch:
     ceiling: float
 
     def image(self, middle: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the image (rows, columns) of a trail of one count with midpoint and half extent (2,), px."""
+        """Return the image (rows, columns), of one count, of a trail with midpoint and half extent (2,), px."""
         rows, columns = self.light.shape
         return spread_over(_trail(middle - self.corner, half)[0], columns, rows, self.psf)
 
@@ -202,14 +202,14 @@ def _stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: Float
 
 
 class FramePatches:
-    """Fits possible objects at given positions of an image, together with the catalogue stars nearby.
+    """An image in which possible objects are fitted together with the catalogue stars nearby.
 
     A star with a flux of one count has the magnitude `zero`. The standard deviation of the PSF is `psf`, px.
     """
 
     def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # Differences between neighbouring pixels contain little light of faint stars.
+        # The noise is computed from differences of neighbouring pixels, which contain few faint stars.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
@@ -294,9 +294,10 @@ def measure_objects(
 ) -> MeasuredObjects | None:
     """Return the possible objects in an image, or None if the attitude of the image is unknown.
 
-    The star tracker solution is that of the image `pixels` (rows, columns). The `epoch` is the Julian year of
-    the positions of the stars. The `velocity` of the camera (3,), m/s, corrects aberration; None for no
-    correction. The `detection` settings are those of the bright areas in the image.
+    The argument `solution` is the star tracker's solution of the image `pixels` (rows, columns). The `epoch`
+    is the Julian year of the positions of the stars. The `velocity` of the camera (3,), m/s, corrects
+    aberration; None for no correction. The settings `detection` are used to detect the bright areas in the
+    image.
     """
     sky = solution.sky_map(velocity)
     if sky is None or solution.fix is None:
@@ -337,7 +338,7 @@ def _among_streaks(
     exposure: float,
     settings: ObjectMeasurementSettings,
 ) -> list[tuple[FittedObject, float]]:
-    """Return the objects in an image whose stars are streaks, and the magnitude that one count represents."""
+    """Return the objects in an image of streaked stars, each with the magnitude of a star of one count."""
     detection, search = seen.settings, settings.search
     if motion.rate is None:
         return []
@@ -345,7 +346,7 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of one count is that of the identified streaks, or NaN if no streak is identified.
+    # The magnitude of a star of one count is computed from the identified streaks, and is NaN without them.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
     if known is not None and np.any(known):
@@ -366,7 +367,7 @@ def _among_streaks(
 def _among_points(
     seen: Survey, stars: CatalogueTrails, settings: ObjectMeasurementSettings
 ) -> list[tuple[FittedObject, float]]:
-    """Return the objects in an image whose stars are points, and the magnitude that one count represents."""
+    """Return the objects in an image of point stars, each with the magnitude of a star of one count."""
     areas, ratio = seen.areas, _significances(seen)
     strong = np.flatnonzero(ratio >= settings.significance)
     if not len(strong) or not len(stars.magnitude):
@@ -375,7 +376,7 @@ def _among_points(
     nearest = away.argmin(axis=1)
     distance = away[np.arange(len(strong)), nearest]
     is_star = distance < settings.clearance + 0.5 * areas.length[strong]
-    # The median is used, because bright stars are saturated and faint stars may be pairs.
+    # The magnitude of one count is a median, because bright stars are saturated and faint stars may be pairs.
     own = is_star & (distance < 1.0)
     if not np.any(own):
         return []
@@ -406,13 +407,13 @@ def _among_points(
 
 
 def _significances(seen: Survey) -> FloatArray:
-    """Return the flux (n,) of each bright area of an image, in standard deviations."""
+    """Return the flux (n,) of each bright area of an image, in standard deviations of its noise."""
     noise = float(np.median(seen.sky.noise.values))
     return np.asarray(seen.areas.flux / (noise * np.sqrt(np.maximum(seen.areas.pixels, 1))))
 
 
 def _faintness(flux: FloatArray) -> FloatArray:
-    """Return 2.5 log10 of counts (n,), the magnitude difference between a star of one count and each star."""
+    """Return by how many magnitudes (n,) stars with a `flux` (n,), counts, are brighter than one count."""
     return np.asarray(2.5 * np.log10(np.maximum(flux, 1e-9)))
 
 
@@ -434,8 +435,8 @@ def measure_points(
 ) -> FieldPoints:
     """Return the points of light in a frame, with moving objects marked if the stars are streaks.
 
-    The motion of the camera over the `exposure`, s, is that from the streaks of the frame. The `detection`
-    settings are those of the bright areas in the frame (rows, columns).
+    The motion of the camera over the `exposure`, s, is that from the streaks of the frame. The settings
+    `detection` are used to detect the bright areas in the frame (rows, columns).
     """
     moves = motion.status is StreakStatus.RATE and motion.rate is not None and motion.length >= STREAK_PX
     if moves and isinstance(motion, MotionResult) and motion.rate is not None:

@@ -19,7 +19,8 @@ class EndpointSettings:
             the threshold is the image mean, as in Sease.
         least_area: minimum number of pixels in a region. A noise peak in one pixel raises the 3 x 3 sums of
             nine pixels.
-        most_streaks: maximum number of bright regions that are measured; the strongest are measured.
+        most_streaks: maximum number of bright regions that are measured; regions with the largest ratio of
+            length to endpoint error are measured first.
         saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         gain: electrons per count.
         smoothing_sigma: standard deviation of the Gaussian that smooths the image before the corner detector,
@@ -80,10 +81,10 @@ class ObjectSettings:
         most_points: maximum number of short regions that are examined as points.
         most_merged: maximum number of regions that are searched again after their stars are removed.
         least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region.
-            The default is the fraction of a bright star's streak that remains at its end if the rotation has
-            an error of 2 %.
+            The default is the fraction of a bright star's streak that remains at its end after subtraction if
+            the rotation has an error of 2 %.
         most_corners: number of corners (peaks of the Harris response) above which a region is not examined.
-        point_significance: minimum flux of a short region, in standard deviations.
+        point_significance: minimum flux of a short region, in standard deviations of its noise.
         improvement: minimum decrease of chi-square when an object is added to a model of stars.
         crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars, larger
             than `improvement` because many lines are tested.
@@ -119,7 +120,7 @@ class ObjectMeasurementSettings:
         search: settings of the search for objects in images whose stars are streaks.
         faintest: V magnitude of the faintest object that is reported; the star catalogue must be complete to
             fainter magnitudes.
-        significance: minimum flux of an area of light, in standard deviations.
+        significance: minimum flux of an area of light, in standard deviations of its noise.
         clearance: minimum distance between an object and the nearest catalogue star, px, in addition to half
             the length of the object's area of light.
         floor: minimum standard deviation per axis of a position, px (from the campaign `object-passes`).
@@ -145,7 +146,8 @@ class MeasuredObjects:
         points: positions at mid-exposure (n, 2), px.
         directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration.
         covariance: covariances of the directions due to the errors of the positions (n, 3, 3), rad^2, ICRS.
-        magnitudes: V magnitudes of the objects relative to the stars of the image (n,), or NaN if unknown.
+        magnitudes: V magnitudes of the objects (n,), measured by comparison with the stars of the image, or
+            NaN if unknown.
         attitude: covariance of the attitude error (3, 3), rad^2, ICRS axes. The attitude error is common to
             all objects.
     """

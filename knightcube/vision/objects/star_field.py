@@ -5,7 +5,7 @@ The worker measures the points of light in a frame (`measure.measure_points`). I
 streaks. Otherwise the centroids of all bright areas are measured, and a single frame does not distinguish an
 object from a star.
 
-The class `StarField` keeps the directions of the stars of earlier frames. The points of a new frame are
+The class `StarField` stores the directions of the stars of earlier frames. The points of a new frame are
 assigned to the stars of earlier frames by means of the predicted rotation of the camera, and the assigned
 stars correct the rotation. A point that is not assigned to a star is noise, an object, or a star that has
 entered the field of view. A tracker over several frames determines which points move relative to the stars.
@@ -29,21 +29,22 @@ GATE = 5.0
 LEAST_STARS = 3
 """Minimum number of assigned stars that determine the rotation of the camera."""
 MOST_FAILURES = 3
-"""Number of successive frames with too few assigned stars after which the field is cleared."""
+"""Number of successive frames with too few assigned stars after which all stars are removed from the
+field."""
 KNOWN = 2
 """Minimum number of frames in which a direction appears for the direction to be that of a star."""
 FORGOTTEN = 20
 """Number of frames after which a direction that does not appear again is removed, unless it is a star."""
 MOST_STARS = 600
-"""Maximum number of stars that are kept; the most recent are kept."""
+"""Maximum number of stored directions; those measured most recently are kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFrame:
     """The attitude of a frame relative to the stars of earlier frames, and a mask of the stars in the frame.
 
-    The attitude (4,) of the camera relative to the field has a covariance (3, 3), camera axes, rad^2. The
-    flag `begun` states whether this frame is the first frame of the field.
+    The attitude (4,) of the camera relative to the star field has a covariance (3, 3), camera axes, rad^2.
+    The flag `begun` is true if this frame is the first frame of the star field.
     """
 
     quaternion: FloatArray
@@ -65,7 +66,7 @@ class StarField:
     def locate(self, found: FieldPoints, predicted: FloatArray, sigma: float) -> LocatedFrame:
         """Return the attitude of a frame relative to the star field, and a mask of the stars in the frame.
 
-        If fewer than three points are stars of the field, the field is not updated, and all points are
+        If fewer than three points match stars of the field, the field is not updated, and all points are
         treated as stars. If three successive frames have fewer than three stars of the field, all stars of
         the field are removed, and the points of the third frame become the new field. The `predicted`
         attitude (4,) of the camera relative to the field has the standard deviation `sigma`, rad.

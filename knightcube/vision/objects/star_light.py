@@ -4,9 +4,9 @@ The test compares two hypotheses by chi-square: that the light of the region com
 stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
 spread function (PSF). The rotation of the camera determines the paths of the stars. The object moves
 uniformly from one end of its streak to the other, on a line that is straight either in the image or relative
-to the stars. The straight line in the image and that relative to the stars differ if the camera rotates about
-the boresight. The brightnesses of stars and object are fitted by non-negative least squares. The first
-hypothesis also explains two stars whose streaks overlap or touch, and a segment of a faint star's streak.
+to the stars. A line that is straight in the image is curved relative to the stars if the camera rotates about
+the boresight. The brightnesses of stars and object are fitted by non-negative least squares. The hypothesis
+of stars only also explains two stars whose streaks overlap or touch, and a segment of a faint star's streak.
 Stars do not explain light that is not on the path of a star, or light that ends within such a path.
 
 A star's streak has the same brightness from end to end. The brightness of a star is therefore at most the
@@ -55,27 +55,27 @@ PATHS_PER_LENGTH = 8
 _LONGEST_CHAIN = 5.0
 # Largest distance (px) between two paths that count as the same path.
 _SAME_PATH = 0.15
-# Maximum number of rounds in which the light of an object's streak is followed and its ends are fitted.
+# Maximum number of iterations, each of which follows the light of an object's streak and fits its ends.
 _ROUNDS = 5
-# Minimum length (px) beyond each end over which light is followed: in the first and in later rounds.
+# Minimum distance (px) to which light is followed beyond each end, in the first and in later iterations.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
-# Distance (px) between the end of a streak and that of its light above which the latter is fitted.
+# Distance (px) between an assumed end and the end of the light above which the fit starts at the latter.
 _FOLLOWED = 1.5
-# Maximum number of Gauss-Newton steps of the ends in a round, and the step (px) that ends the fit.
+# Maximum number of Gauss-Newton steps of a fit of the ends, and step (px) below which it has converged.
 _END_FITS, _END_CONVERGED = 3, 0.05
-# Change (px) of the ends in a round below which the rounds end.
+# Change (px) of the ends in one iteration below which the iterations stop.
 _LOCATED = 0.3
-# Ratio of the brightness on the path to that of the streak above which the light belongs to another source.
+# Ratio of local to median brightness on a path above which the local light belongs to another source.
 _BRIGHTER = 2.0
-# Relative error of subtracted starlight on the streak above which the light is ignored.
+# Error of subtracted starlight, as a fraction of the streak's brightness, above which light is ignored.
 _HIDDEN = 0.25
 # Minimum length (px) of a streak whose ends are located.
 _LEAST_LOCATED = 12.0
 # Distance from all star and object paths beyond which pixels are ignored, in standard deviations of the PSF.
 _REACH = 3.0
-# Relative ridge (regularisation) of the normal equations of the brightnesses.
+# Regularisation of the fit of brightnesses: number added to the unit diagonal of the normal equations.
 _RIDGE = 1e-10
-# Relative error of the modelled image of a bright streak, due to its ends, its PSF and its uniformity.
+# Error of a bright streak's modelled counts, as a fraction, due to errors of ends, PSF and uniformity.
 SHAPE_ERROR = 0.1
 
 
@@ -83,8 +83,9 @@ SHAPE_ERROR = 0.1
 class Explanation:
     """Quality of the hypothesis that the pixels of a region show stars and one object of `flux` counts.
 
-    The chi-square is that of the best-fitting sum of star streaks and the object's streak. The misfits are
-    the chi-squares per pixel along the object's streak, for stars with the object and for stars only.
+    The attribute `chi_square` belongs to the best-fitting sum of star streaks and the object's streak. The
+    attributes `misfit` and `misfit_of_stars` are the chi-squares per pixel along the object's streak, with
+    the object and with stars only.
     """
 
     chi_square: float
@@ -127,7 +128,7 @@ class StarLight:
     Attributes:
         chi_square: chi-square of the best-fitting sum of star streaks.
         pixels: number of pixels used.
-        expected: expected chi-square of a correct model. For bright light it is less than `pixels`, because
+        expected: expected chi-square of a correct model. In bright regions it is less than `pixels`, because
             the weights of bright pixels also allow for model errors.
 
     Raises FlightError if the least-squares solution of the brightnesses does not converge.
@@ -165,13 +166,14 @@ class StarLight:
         self._brightness, self.chi_square = _brightnesses(self._normal, self._right, self._power)
 
     def chi_square_with(self, ends: FloatArray) -> float:
-        """Return the chi-square of stars and an object between `ends` (2, 2), px, see `explain`."""
+        """Return the chi-square of stars and an object between `ends` (2, 2), px (see `explain`)."""
         return min(self._with_line(line)[1] for line in self._object_images(ends))
 
     def explain(self, ends: FloatArray) -> Explanation:
         """Return the quality of the hypothesis of stars and one object between `ends` (2, 2), px.
 
-        The object's path is straight in the image or among the stars, whichever gives the smaller chi-square.
+        The object's path is straight in the image or relative to the stars, whichever gives the smaller
+        chi-square.
         """
         lines = self._object_images(ends)
         fits = [self._with_line(line) for line in lines]
@@ -187,7 +189,7 @@ class StarLight:
         return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
 
     def _object_images(self, ends: FloatArray) -> list[FloatArray]:
-        """Return the weighted images (p,) of an object whose path is straight in the image or among stars."""
+        """Return the weighted images (p,) of objects with paths straight in the image and among stars."""
         paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
         first = int(np.abs(paths[1] - paths[0]).max() < _SAME_PATH)
         return [self._weighted_image(path) for path in paths[first:]]
@@ -202,9 +204,9 @@ class StarLight:
         """Return the most likely ends of the light of an object's streak, or None if no streak is found.
 
         The light is followed along the path of the streak beyond both `ends` (2, 2), px, but not into other
-        regions. The path is straight in the image or `among_stars`. The initial ends are those of the most
-        likely part of the path with uniform brightness and no light outside. From the initial ends, ends and
-        brightness are fitted to the pixels. Known stars are subtracted.
+        regions. The path is straight relative to the stars if `among_stars` is true, otherwise straight in
+        the image. The initial ends are the ends of the most likely interval of uniform brightness without
+        light outside. Ends and brightness are then fitted to the pixels. Known stars are subtracted.
         """
         beyond = max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         label = region_along(self._segmented, ends)
@@ -277,7 +279,7 @@ class StarLight:
         gain = share * usual * (2.0 * light - usual)
         gain[light > _BRIGHTER * usual + 3.0 / np.sqrt(np.maximum(share, 1e-300))] = 0.0
         if len(self._known):
-            # The error of a subtracted star is common to all pixels of the star.
+            # Errors of subtracted stars do not average out, because they are common to all pixels of a star.
             hidden, _ = _light_along(pixels, signal - target, weight, curve, self._psf_sigma)
             gain[SHAPE_ERROR * hidden > _HIDDEN * usual] = 0.0
         middle = int(np.argmin(np.abs(parts - 0.5)))
@@ -341,18 +343,18 @@ class StarLight:
         return self.chi_square - self.expected + outside
 
     def _with_line(self, line: FloatArray) -> tuple[FloatArray, float]:
-        """Return the brightnesses (k + 1,) of k stars and of a weighted image `line` (p,), and chi-square."""
+        """Return brightnesses (k + 1,) of k stars and an object of image `line` (p,), and chi-square."""
         stars = len(self._normal)
         normal = np.empty((stars + 1, stars + 1))
         normal[:stars, :stars], normal[stars, stars] = self._normal, line @ line
         normal[stars, :stars] = normal[:stars, stars] = self._stars.T @ line
         right = np.append(self._right, line @ self._target)
         brightness, chi_square = _brightnesses(normal, right, self._power)
-        # Rounding errors do not make chi-square larger than without the line.
+        # Without rounding errors, chi-square would never be larger than without the object.
         return brightness, min(chi_square, self.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
-        """Return the weighted image (p,) of a streak with one count in total along `path` (m, 2), px."""
+        """Return the weighted image (p,) of a streak with a flux of one count along `path` (m, 2), px."""
         return streak_at(self._near, path, self._psf_sigma) * self._weight
 
 
@@ -474,9 +476,10 @@ def _counts_at(
 def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[FloatArray, float]:
     """Return the non-negative least-squares coefficients (k,) of k images, and the chi-square.
 
-    The arguments are the scalar products (k, k) of the weighted images with one another, those (k,) of the
-    images with the weighted pixels of the frame, and the sum of the squares of these pixels. Raises
-    FlightError if the equations are not positive definite, or if the solver does not converge.
+    The argument `normal` (k, k) contains the scalar products of the weighted images with one another, and
+    `right` (k,) their scalar products with the weighted pixels of the frame. The argument `power` is the sum
+    of the squares of the weighted pixels. Raises FlightError if the equations are not positive definite, or
+    if the solver does not converge.
     """
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal / scale / scale[:, None]
@@ -514,7 +517,7 @@ def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole, per
 # Margin (px) of a patch of pixels around a region, which is wider than the PSF.
 _ROOM = 8
 _MOST_STARS = 12
-# Detection thresholds of a star and of the light without stars, in standard deviations of the smoothed image.
+# Detection thresholds of stars and of remaining light, in standard deviations of the smoothed noise.
 _STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
 # Excess of a pixel over the modelled stars (standard deviations) above which the fit excludes the pixel.
 _NOT_THEIRS = 4.0
@@ -523,7 +526,7 @@ _WIDE_REACH = 5.0
 # Largest step (px) of a fit, step (px) below which the fit has converged, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
 LEAST_LINE_PX = 4.0
-"""Minimum length (px) of an object's line of light. A shorter line is treated as a point."""
+"""Minimum length (px) of an object's line of light; a shorter line is treated as a point."""
 # Distance at which the Gaussian that smooths an image is truncated, in standard deviations.
 _FARTHEST = 4.0
 
@@ -563,7 +566,7 @@ class Patch:
         """Return the excess of chi-square of the counts `left` in the region over its expected value.
 
         The array `left` (rows, columns) contains the counts that remain after a model is subtracted. The
-        returned value is approximately the largest decrease of chi-square by any further model.
+        returned value is approximately the largest decrease of chi-square that additional sources can cause.
         """
         weight = self.weight[self.mask]
         variance = self.noise**2 + np.maximum(self.signal[self.mask], 0.0) / self.gain
@@ -660,7 +663,7 @@ _FIRST_OFFSETS = 9
 
 
 def _brightest_star(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray | None:
-    """Return the position (x, y) in the patch of the brightest possible star, or None without a star.
+    """Return the position (x, y) in the patch of the brightest possible star, or None if there is none.
 
     The brightness of a star centred on a pixel is at most the minimum of the smoothed image `left` (rows,
     columns) along the star's path, which is given by `offsets` (k, 2), px, from the pixel.
@@ -707,13 +710,14 @@ def _brightest_path_numpy(
 def _brightest_path(
     seen: FloatArray, steps: IntArray, factor: FloatArray, beyond: FloatArray, threshold: float
 ) -> tuple[float, int, int]:
-    """Return the largest minimum of an image along a path, and the column and row of the path's middle.
+    """Return the largest minimum of an image along a shifted path, and column and row of the path's middle.
 
     Returns minus infinity, -1 and -1 if the minimum along the path is below the threshold at all positions of
     the path.
 
     The image (rows, columns) is multiplied by `factor` (k,) at the pixels (x, y) of the path, which are given
-    relative to its middle by `steps` (k, 2). The values above, below, left and right of it are `beyond` (4,).
+    relative to its middle by `steps` (k, 2). The values above, below, left and right of the image are
+    `beyond` (4,).
     """
     rows, columns = seen.shape
     best, best_column, best_row = -np.inf, -1, -1
@@ -769,7 +773,7 @@ def _fit_together(
 
 
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of the brightest significant light in a region without its stars, or None.
+    """Return the ends (2, 2), px, of the brightest significant light that is not from stars, or None.
 
     The array `left` (rows, columns) contains the counts of the patch after its stars are subtracted. For a
     point, the two ends are equal. Residuals below the model error of a bright star are not significant.
@@ -798,7 +802,7 @@ def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
         return fitted_line(left, patch.weight, ends - patch.corner, patch.psf_sigma) + patch.corner
     size, reach = np.array(left.shape[::-1]), int(np.ceil(_WIDE_REACH * patch.psf_sigma))
     for _ in range(_FITS):
-        # Only the pixels near the point are used.
+        # The fit of a point uses only the pixels near the point.
         middle = np.floor(ends[0] - patch.corner).astype(int)
         low, high = np.clip([middle - reach, middle + reach + 1], 0, size)
         near = slice(low[1], high[1]), slice(low[0], high[0])

@@ -67,7 +67,7 @@ class Regions:
         return select(self, chosen, "labels")
 
     def is_significant(self, sigmas: float, background: Background) -> BoolArray:
-        """Return which regions (n,) have a flux of at least `sigmas` standard deviations."""
+        """Return the mask (n,) of the regions whose flux is at least `sigmas` times its noise."""
         return np.asarray(self.flux >= sigmas * background.typical_noise * np.sqrt(self.area))
 
     def __len__(self) -> int:
@@ -78,8 +78,9 @@ class Regions:
 class Segmented:
     """A frame segmented into bright regions.
 
-    The signal (rows, columns), float32, is the counts above the background with `hot_pixels` repaired hot
-    pixels. The candidates are those regions that may be streaks, in descending order of strength.
+    The signal (rows, columns), float32, contains the counts above the background, in which `hot_pixels` hot
+    pixels are repaired. The candidates are the regions that may be streaks, in descending order of the ratio
+    of length to endpoint error.
     """
 
     signal: Image
@@ -91,7 +92,7 @@ class Segmented:
 
 @dataclass(frozen=True, slots=True)
 class Streaks:
-    """Streaks of one frame, in descending order of strength.
+    """Streaks of one frame, in descending order of the ratio of length to endpoint error.
 
     Attributes:
         endpoints: the two ends (x, y) of each streak in arbitrary order (n, 2, 2), px, before `extend`.
@@ -157,7 +158,7 @@ def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
 
 
 def threshold_mean(pixels: Image) -> BoolArray:
-    """Return which `pixels` exceed the mean of the image, the threshold of Sease for noiseless frames."""
+    """Return the mask of `pixels` above the image mean, which is Sease's threshold for noiseless frames."""
     return np.asarray(pixels > pixels.mean())
 
 
@@ -246,7 +247,7 @@ def measure_streaks(
 ) -> Streaks:
     """Return the streaks: the candidate regions whose cornerness has exactly two peaks.
 
-    If `cornerness` is given, it returns the response at each pixel instead of the Harris detector.
+    The function `cornerness`, if given, computes the response at each pixel instead of the Harris detector.
     """
     respond = harris_cornerness if cornerness is None else cornerness
     sigma = expected_sigma(segmented.candidates, segmented.background, settings)
@@ -275,7 +276,7 @@ def measure_streaks(
 
 
 def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return image and mask of the region `label` with a margin, and the frame position of the first pixel.
+    """Return image and mask of the region `label` with a margin, and the first pixel's position in the frame.
 
     In the image, the pixels of other regions are zero.
     """
@@ -303,7 +304,7 @@ def _harris_corners(segmented: Segmented, settings: EndpointSettings) -> list[Fl
 
 
 _Kernels = tuple[FloatArray, FloatArray, FloatArray]
-"""Kernels of the Gaussian that smooths for the gradient, of its derivative, and of the tensor's window."""
+"""Kernels: Gaussian normal to the gradient, Gaussian derivative, and Gaussian window of the tensor."""
 _Limits = tuple[float, float, int]
 """Harris constant k, minimum relative response of a corner, and half-width of the centre of intensity, px."""
 
@@ -685,11 +686,11 @@ def chord_outward(endpoints: FloatArray) -> FloatArray:
 
 
 def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
-    """Return the centre of rotation (2,), px: the point nearest to the perpendicular bisectors of streaks.
+    """Return the centre of rotation (2,), px, which is nearest to the perpendicular bisectors of streaks.
 
-    Each streak is given by its two ends (n, 2, 2), px. The nearer the rotation axis is to the normal of the
-    boresight, the farther away is the centre; for parallel chords the centre is NaN. Source: Sease, eq.
-    (3.17) and (3.18) as corrected in the errata.
+    Each streak is given by its two ends (n, 2, 2), px. The centre is the farther away, the more nearly the
+    rotation axis is normal to the boresight; for parallel chords the centre is NaN. Source: Sease, eq. (3.17)
+    and (3.18) as corrected in the errata.
     """
     chord = endpoints[:, 1] - endpoints[:, 0]
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)

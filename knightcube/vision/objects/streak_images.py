@@ -1,9 +1,10 @@
 """Paths of stars and objects in an image during an exposure, and the images of their streaks.
 
 A streak is the light of a point that moves along its path at a constant rate. The camera's point spread
-function (PSF) is a Gaussian. The light of a nearly straight path is the product of its profiles across and
-along the path. The light of any other path is the sum of the light of its points. The functions that the
-search for objects calls most have a numpy form and a compiled form (`knightcube.compiled`).
+function (PSF) is a Gaussian. The image of a nearly straight streak is the product of its profiles across and
+along the path. The image of any other streak is the sum of the images of the points of its path. The
+functions that the search for objects calls most have a numpy form and a compiled form
+(`knightcube.compiled`).
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def _set_circle(
 def straight_path(ends: FloatArray, parts: FloatArray | None = None) -> FloatArray:
     """Return points (m, 2), px, on the straight line between two ends (2, 2), px.
 
-    The points are those at the given fractions `parts` (m,) of the line, or evenly spaced points.
+    The points lie at the fractions `parts` (m,) of the line, or are evenly spaced if `parts` is None.
     """
     parts = _even_parts(ends) if parts is None else parts
     return np.asarray(ends[0] + parts[:, None] * (ends[1] - ends[0]))
@@ -142,7 +143,7 @@ def _path_among_stars_numpy(
     focal, centre = view[0], np.array(view[1:])
     vectors = np.concatenate([(ends - centre) / focal, np.ones((2, 1))], axis=1)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    # Both ends are rotated to mid-exposure from the start and from the end of the exposure.
+    # Each end is rotated to mid-exposure, both from the start and from the end of the exposure.
     middle = _rotated(vectors, rotation, np.array([[0.5, -0.5], [0.5, -0.5]]))
     apart = middle[1, 1] - middle[0, 0], middle[0, 1] - middle[1, 0]
     slower = int(apart[1] @ apart[1] < apart[0] @ apart[0])
@@ -219,7 +220,7 @@ def _rotated(directions: FloatArray, rotation: FloatArray, parts: FloatArray) ->
 
 
 def _even_parts(ends: FloatArray) -> FloatArray:
-    """Return the positions (m,) of evenly spaced points between two ends (2, 2), px, from 0 to 1."""
+    """Return the positions (m,) of evenly spaced points between two ends (2, 2), px, as fractions."""
     steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
     return np.asarray((np.arange(steps) + 0.5) / steps)
 
@@ -297,7 +298,7 @@ def pixels_near(points: FloatArray, reach: float, rows: int, columns: int) -> In
 def _mark_discs(
     centres: IntArray, half: IntArray, low_x: int, low_y: int, marked: BoolArray, spans: IntArray
 ) -> int:
-    """Mark discs of pixels around `centres` (m, 2), set the marked span of each row, and return the number.
+    """Mark discs around `centres` (m, 2), set the marked span of each row, and return the number of pixels.
 
     The array `half` (2 r + 1,) contains the half-width of the disc in each row.
     """
@@ -323,11 +324,11 @@ def _mark_discs(
     return total
 
 
-# Number of points of a path between two nodes, over which the path is approximately straight.
+# Maximum number of nodes on a path. Between two nodes, the path is approximately straight.
 _NODES = 33
 # Minimum cosine between a nearly straight path and its chord.
 _LEAST_AHEAD = 0.85
-# Distance from a path (standard deviations) beyond which the compiled form omits the light, below 1e-11.
+# Distance from a path, in standard deviations, beyond which the compiled form omits the light.
 _DARK = 7.0
 # Number of points of a path below which the image of a streak is the sum of the images of its points.
 _LEAST_POINTS = 4
@@ -353,7 +354,7 @@ def _streak_images_numpy(pixels: IntArray, paths: FloatArray, sigma: float, slop
 
 
 def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
-    """Add one count, divided equally among the `points` (m, 2), px, to `image` (1 or 3, p)."""
+    """Add one count, divided equally among `points` (m, 2), px, to `image` (1, p), or (3, p) with slopes."""
     for point in points:
         near = np.flatnonzero(np.abs(pixels - point).max(axis=1) < _FARTHEST * sigma + 1.0)
         edges = ((pixels[near] - point)[:, :, None] + np.array([-0.5, 0.5])) / sigma
@@ -367,7 +368,7 @@ def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, s
 
 
 def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
-    """Add the light of one count along a nearly straight `path` (m, 2), px, to `image` (1 or 3, p)."""
+    """Add one count along a nearly straight `path` (m, 2), px, to `image` (1, p), or (3, p) with slopes."""
     chord = path[-1] - path[0]
     length = float(np.linalg.norm(chord))
     width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
@@ -397,7 +398,7 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
     n = off * cosine
     s = np.interp(u, along, arc) + (beyond + off * bend * cosine**2) / cosine
     light = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * pace * len(path))
-    # Only pixels near the ends of the streak are affected by the ends.
+    # The ends of the streak affect only nearby pixels.
     covered, sloping = np.ones(len(s)), np.zeros(len(s))
     for sign, distance in ((1.0, s + 0.5 * spacing[0]), (-1.0, arc[-1] + 0.5 * spacing[-1] - s)):
         ending = np.flatnonzero(distance < room)
@@ -416,16 +417,16 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
 
 @compiled_form_of(_streak_images_numpy)
 def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: bool) -> FloatArray:
-    """Return images (k, 1, p) or (k, 3, p), on p pixels, of k streaks with one count in total each.
+    """Return the images (k, 1, p), on p pixels, of k streaks with a total flux of one count each.
 
     The count is distributed evenly over the points of the path. The image is the product of the profiles
     across and along the path, which are blurred by a Gaussian with the standard deviation `sigma`, px, and by
     the pixel. The error is at most 2 % of the largest value. The image of a strongly curved path is the sum
     of the images of its points.
 
-    The `pixels` (p, 2) are sorted by row. The points of the `paths` (k, m, 2) are in px. With `slopes`, the
-    image of each streak is followed by its two derivatives, 1/px, with respect to displacements of the whole
-    path along x and along y.
+    The `pixels` (p, 2) are sorted by row. The points of the `paths` (k, m, 2) are in px. If `slopes` is true,
+    the result has the shape (k, 3, p): the image of each streak is followed by its derivatives, 1/px, with
+    respect to displacements of the whole path along x and along y.
     """
     images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
     for k in range(len(paths)):
@@ -595,12 +596,12 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
 def line_image(
     ends: FloatArray, columns: int, rows: int, sigma: float
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the image, with one count in total, of a straight streak between different `ends` (2, 2), px.
+    """Return the image of a straight streak with a flux of one count between different `ends` (2, 2), px.
 
     The returned arrays are the flat indices of p pixels nearby (p,), five images on these pixels (5, p), and
-    the unit vectors along and across the streak (2, 2). The images are the counts, and the derivatives of the
-    counts, 1/px, with respect to displacements of the first end along and across the streak, and of the
-    second end along and across the streak.
+    the unit vectors along and across the streak (2, 2). The five images are the counts, and the derivatives
+    of the counts, 1/px, with respect to displacements of the first end along and across the streak, and of
+    the second end along and across the streak.
     """
     width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
     length = float(np.linalg.norm(ends[1] - ends[0]))
@@ -618,7 +619,7 @@ def line_image(
     profile = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * length)
     covered = ndtr(a) - ndtr(b)
     whole = profile * covered
-    # The first moment, with the relative position along the streak, is the contribution of the second end.
+    # The contribution of the second end is weighted by the position along the streak, as a fraction.
     second = profile * (s * covered + width * (bell_a - bell_b)) / length
     aside = n / width**2
     first_along = whole / length - profile * bell_a / width
@@ -631,7 +632,7 @@ def line_image(
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
 # Distance (standard deviations) from the end of a line beyond which the light does not depend on the end.
 _COVERED = 8.5
-# Relative ridge of the normal equations of a fit to pixels.
+# Regularisation of a fit to pixels: number added to the unit diagonal of the normal equations.
 _RIDGE = 1e-6
 
 
@@ -769,7 +770,7 @@ def _solved(sums: FloatArray) -> FloatArray:
 
 
 def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> FloatArray:
-    """Return the image (rows, columns) of a streak with one count in total along `path` (m, 2), px.
+    """Return the image (rows, columns) of a streak with a flux of one count along `path` (m, 2), px.
 
     The count is distributed evenly over the points of the path, and each point is blurred by a Gaussian with
     the standard deviation `sigma`, px.
@@ -781,7 +782,7 @@ def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> Floa
 def spread_with_slopes(
     path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
 ) -> list[FloatArray]:
-    """Return the image of a streak with one count in total, and the derivatives of this image, 1/px.
+    """Return the image of a streak with a flux of one count, and the derivatives of this image, 1/px.
 
     The derivatives are with respect to k displacements of the path, each along x and along y. A displacement
     of 1 px moves each of the m points of the path by the fraction of a pixel given in `shares` (k, m).
@@ -799,7 +800,7 @@ class _Profiles:
     """Profiles of m points on w adjacent pixels along one axis of `count` pixels.
 
     The first of the w pixels of each point (m,) may be outside the range of the axis. The values (m, w) are
-    the integrals of the point spread over the pixels.
+    the integrals of the point spread function over the pixels.
     """
 
     count: int
@@ -822,10 +823,10 @@ def _slopes_within_pixels(profiles: _Profiles, centres: FloatArray, sigma: float
 
 
 def _added(x: _Profiles, y: _Profiles, across: FloatArray, down: FloatArray) -> FloatArray:
-    """Return the image (rows, columns) of points that are each the product of two profiles.
+    """Return the sum (rows, columns) of the images of m points, each the product of two profiles.
 
-    The arrays `across` (m, w) and `down` (m, w) contain the two factors of each point, on the pixels that the
-    profiles `x` and `y` cover along the two axes.
+    The arrays `across` (m, w) and `down` (m, w) contain the profiles of each point along x and along y. The
+    profiles `x` and `y` give the pixels that these arrays cover.
     """
     width = across.shape[1]
     columns = x.count + 2 * width
