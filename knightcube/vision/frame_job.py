@@ -74,7 +74,8 @@ class TrackerSettings:
 
     Attributes:
         solve: settings of star detection, identification and attitude.
-        scale: lowest and highest ratio of the true to the assumed focal length, (1, 1) for a calibrated lens.
+        scale: lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for a
+            calibrated lens.
         index: file of the sky index, or None for the default index.
     """
 

@@ -40,7 +40,7 @@ UNKNOWN_FOV_DEG = 4.0, 60.0
 _SQUARES, _LEAST_COARSE_PX = (3, 5), 330
 """Bin sizes (px) with which an unsolved image is binned, and minimum side length (px) of the binned image."""
 FOV_TOLERANCE = 0.05
-"""Default uncertainty of a given field of view, relative to the field of view."""
+"""Default uncertainty of a given field of view, as a fraction of the field of view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +128,7 @@ class StarSolution:
         return self.frame.fix is not None
 
     def __repr__(self) -> str:
-        """Return status, pointing, uncertainty and number of stars, or the reason, in one line."""
+        """Return one line of text: status, pointing, uncertainty and number of stars, or the reason."""
         if not self:
             return f"<StarSolution {self.status}: {self.reason}>"
         across = 3_600.0 * math.degrees(math.sqrt(max(self.covariance[0, 0], self.covariance[1, 1])))
@@ -353,9 +353,10 @@ def camera_of_field(
 ) -> tuple[Pinhole, tuple[float, float]]:
     """Return a pinhole camera for a field of view, and the lowest and highest possible scale.
 
-    The tangents of the observed field angles must be multiplied by the scale for the true field of view.
-    Without `fov_deg`, deg across the columns, the range `UNKNOWN_FOV_DEG` is used. Without the largest error
-    `error_deg`, deg, it is 5 % of the field. Raises InputError unless the field is 1 to 120 deg.
+    The scale is the ratio of the true tangents of field angles to those of the returned camera. If the field
+    of view `fov_deg`, deg across the columns, is None, the range `UNKNOWN_FOV_DEG` is used. If the largest
+    error `error_deg`, deg, is None, 5 % of the field of view is used. Raises InputError unless the field of
+    view is 1 to 120 deg.
     """
     _check_field_of_view(fov_deg, error_deg)
     lowest, highest = UNKNOWN_FOV_DEG
@@ -384,7 +385,7 @@ def _solution(
     pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
     if fix is None:
         matched = matched[:0]
-    # The aspect of the pixels makes the focal length along y different from that along x.
+    # If pixels are not square, the focal length along y differs from the focal length along x.
     camera = frame.camera.rescaled(1.0 / (1.0 + float(frame.bend[ASPECT])))
     fov = math.nan if fix is None else field_of_view(camera)
     star = frame.star[matched]

@@ -78,7 +78,7 @@ class ObjectPatch:
     ceiling: float
 
     def image(self, middle: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the image (rows, columns), of one count, of a trail with midpoint and half extent (2,), px."""
+        """Return the image (rows, columns) of a trail of one count with a midpoint and half extent (2,)."""
         rows, columns = self.light.shape
         return spread_over(_trail(middle - self.corner, half)[0], columns, rows, self.psf)
 

@@ -129,7 +129,7 @@ _CONTRADICTION = 0.6
 _SHAKEN = 2.5
 # Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
 _CALM = 2.0
-# Fraction of streak ends that a wrong rotation confirms, because it matches one end of each streak.
+# Fraction of streak ends that a fit with a wrong rotation angle can match, at one end of each streak.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -273,7 +273,7 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # The variable `ends` is the fraction of confirmed streak ends or of unbroken streaks, the smaller.
+    # The variable `ends` is the smaller of the fractions of confirmed streak ends and of unbroken streaks.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
@@ -324,7 +324,7 @@ _MOST_TRAILING = 0.5
 
 # Largest distance (px) across the streak between two segments of one streak.
 _CHAIN_ASIDE = 1.3
-# Smallest and largest angle between the centres of two segments of one streak, relative to the rotation.
+# Smallest and largest angle between two segments of one streak, as fractions of the rotation angle.
 _CHAIN_APART = (0.55, 1.7)
 # Largest flux ratio of two segments of one streak.
 _CHAIN_RATIO = 2.5
@@ -379,7 +379,7 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return whether each of the first `judged` stars seems to be only a segment of a streak, (judged,).
+    """Return a mask (judged,) of the stars, among the first `judged`, that seem to be segments of streaks.
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
     on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.
@@ -421,7 +421,7 @@ class _Candidate:
     """A motion from the joint fit, with its rotation vector over the exposure (3,), rad, and its streaks.
 
     For a rolling shutter, `middles` (n, 2), px, are the centres of the n bright streaks, and `excess` (n,) is
-    the chi-square of each streak minus the number of its pixels. For a global shutter, both are empty.
+    the chi-square of each streak minus the number of its pixels. For a global shutter, both arrays are empty.
     """
 
     result: MotionResult
@@ -432,7 +432,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the motion is not rejected by the streak check."""
+        """Whether the streak check does not reject the motion."""
         return self.verdict is not StreakVerdict.REJECTED
 
 
@@ -637,7 +637,7 @@ def estimate_rate(
     Args:
         image: raw counts (rows, columns), of an unsigned integer type.
         camera: pinhole model or calibrated lens. The distortion of a lens is included only as an uncertainty
-            of the pinhole.
+            of the pinhole model.
         exposure: exposure time, s.
         prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
             the rotation.
@@ -668,9 +668,9 @@ def estimate_motion(
     """Return the mean rate over one exposure with its covariance, and the stars of the frame `pixels`.
 
     The camera `pinhole` has the shape of the frame (rows, columns). The exposure, the settings and the prior
-    rate are those of `estimate_rate`. A frame with the checksum `previous_checksum` of the previous frame
-    indicates a frozen camera. The `prior_course` is the rotation as a function of time during the exposure,
-    as estimated by the navigation filter; None if unknown.
+    rate are those of `estimate_rate`. The camera is frozen if the checksum of the frame equals the checksum
+    `previous_checksum` of the previous frame. The `prior_course` is the rotation as a function of time during
+    the exposure, as estimated by the navigation filter; None if unknown.
 
     Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the attributes
     `status` and `reason` of the result state the cause.
@@ -756,8 +756,8 @@ def _best_motion(
     leading = _fitted(camera, seen, first)
     if leading.verdict is StreakVerdict.CONFIRMED:
         return leading
-    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle. If streaks are
-    # broken into fragments, the rotation axis of the fit is often correct, but the angle is wrong.
+    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle.
+    # If streaks are broken into fragments, the fit often finds the correct axis, but a wrong angle.
     angles = _frame_angles(camera, leading.rotation)
     if leading.possible and _has_angle(leading.rotation, angles):
         return leading

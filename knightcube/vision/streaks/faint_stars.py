@@ -78,7 +78,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return a polar grid with one in `every` of the circles that cross the detector."""
+    """Return a polar grid with every n-th circle that crosses the detector; n is the argument `every`."""
     angle = float(np.linalg.norm(motion.rotation))
     axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
@@ -124,7 +124,7 @@ def _camera_of(pinhole: Pinhole) -> _Camera:
 def _samples(
     flat: Float32Array, turning: Float32Array, rising: Float32Array, camera: _Camera, per_count: float
 ) -> tuple[Float32Array, BoolArray]:
-    """Return samples of the 3 x 3 sums `flat`, and a mask of the samples on the detector, (r, c).
+    """Return samples (r, c) of the 3 x 3 sums `flat`, and a mask (r, c) of the samples on the detector.
 
     The samples are rounded to integer multiples of 1/`per_count`, so that their sums are fast and exact. The
     sums must be zero along the border of the frame. The other arguments are those of `_sum_along`.
@@ -182,7 +182,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
 
 # Side (px) of the square of pixels whose sum is one sample of the polar grid.
 _BOX = 3.0
-# Largest cumulative sum of samples that can be represented, in units of the rounding step.
+# Largest permitted cumulative sum of samples, in units of the rounding step.
 _HIGHEST = 2.0**30
 # Number that rounds a sample (float32) to an integer if it is added and then subtracted in double precision.
 _ROUND = np.float64(1.5 * 2.0**52)
@@ -214,7 +214,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
     """
     width = max(round(grid.length), 1)
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # Elements outside the detector are never written, so that the system allocates no memory for them.
+    # The operating system allocates no memory for elements outside the detector, which are never written.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
@@ -410,7 +410,7 @@ _PROFILE /= _PROFILE[0]
 
 
 def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
-    """Return the overlap of two streaks at the columns `one` and `other` (...), relative to their length.
+    """Return the overlap of two streaks at the columns `one` and `other` (...), as a fraction of length.
 
     The argument `span` (..., 2) is the range of columns of a circle that lie on the detector. `length` is in
     samples.
@@ -443,7 +443,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # Second difference and noise are scaled so that the former equals the response for an isolated star.
+    # The second difference and its noise are scaled so that it equals an isolated star's response.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -573,11 +573,11 @@ def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: 
 _ROUNDING = 30.0
 # Number of passes of the search for stars, of which the first uses second differences.
 _PASSES = 3
-# Relative regularisation of the normal equations for peak heights, for stars that nearly coincide.
+# Regularisation of the peak heights of nearly coincident stars, as a fraction of the diagonal elements.
 _RIDGE = 0.01
-# Absolute regularisation of the normal equations for peak heights.
+# Regularisation added to the diagonal elements of the normal equations for peak heights.
 _TINY = 1e-6
-# Relative accuracy at which the iteration for the peak heights stops.
+# Relative residual of the normal equations at which the iteration for the peak heights stops.
 _SOLVED = 1e-4
 # Maximum number of conjugate-gradient iterations for the peak heights.
 _MOST_GRADIENTS = 200
@@ -790,7 +790,7 @@ def _add_responses(
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
     """Return peak heights (k,) of stars such that the sum of their responses is the measured response."""
     middle = np.rint(row).astype(int)
-    # The indices of all pairs of stars that may overlap, including pairs of a star with itself.
+    # The arrays `one` and `other` index all pairs of stars that may overlap, and each star with itself.
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], row - _FARTHEST, side="right")
     count = np.searchsorted(row[order], row + _FARTHEST) - first
@@ -803,7 +803,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     common = np.stack([first, last], axis=-1)
     overlap = overlap_of(column[one], column[other], common, grid.length)
     overlap = overlap * profile((row[one] - row[other]) * ACROSS)
-    # The factor of the diagonal keeps the heights of isolated stars independent of the regularisation.
+    # The right-hand side has the diagonal's factor, so that regularisation does not bias isolated stars.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(np.float64)

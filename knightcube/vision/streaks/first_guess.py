@@ -11,11 +11,12 @@ angle from the start of one fragment to the end of the next is therefore also a 
 
 If few streaks lie completely in the frame, a scan finds the rotation angle. Along a circle about the rotation
 axis, the intensity of a star's streak is a box function whose length is the rotation angle. For each trial
-length, the pixel samples around the brightest regions are summed in boxes, and each box is moved along its
-circle to the position of its largest sum. A box of the correct length contains all samples of a star's streak
-and no samples beyond the ends of the streak. Boxes that are too long or too short by a factor of two explain
-only half of the chi-square. The scan therefore finds the rotation angle without a good initial guess, whereas
-a fit of the pixels converges only from within a few point-spread widths.
+length, the pixel samples around the brightest regions are summed over intervals (boxes) of this length, and
+each box is moved along its circle to the position of its largest sum. A box of the correct length contains
+all samples of a star's streak and no samples beyond the ends of the streak. Boxes that are too long or too
+short by a factor of two explain only half of the chi-square. The scan therefore finds the rotation angle
+without a good initial guess, whereas a fit of the pixels converges only from within a few point-spread
+widths.
 
 If the brightest regions do not determine the rotation angle, for example because streaks are faint and
 fragmented, or because the border truncates all streaks, all circles of a polar grid are searched. The mean of
@@ -43,13 +44,13 @@ SCANNED_STARS = 14
 
 # Spacing (px) of the samples along the circle on which stars move fastest.
 _STEP = 2.0
-# Ratio of consecutive trial lengths of a box, which is a run of pixel samples along a circle.
+# Ratio of consecutive trial lengths of streaks in the scan for the rotation angle.
 _FACTOR = 1.04
-# Smallest trial length (samples) of a box, which is a run of pixel samples along a circle.
+# Smallest trial length (samples) of streaks in the scan for the rotation angle.
 _SHORTEST = 6
 # Number of the most likely rotation angles that are sorted by their difference from the prior angle.
 _WEIGHED = 3
-# Upper limit of a sample relative to the median of its region, which limits the effect of crossing stars.
+# Upper limit of a sample, as a multiple of its region's median, which limits the effect of crossing stars.
 _CAP = 2.0
 # Upper limit of the significance (standard deviations) of a star in the scan for the rotation angle.
 _ENOUGH = 60.0
@@ -101,8 +102,11 @@ def scan_angles(
 
 
 _Best = tuple[FloatArray, IntArray, FloatArray, FloatArray]
-"""Explained chi-square, first sample, sum of the samples, and number of samples within the frame, of the best
-boxes of w widths along the circles of n regions, each (w, n)."""
+"""Results of the search for boxes of w lengths along the circles of n regions, each (w, n).
+
+The arrays are explained chi-square, first sample, sum of the samples, and number of samples within the frame,
+for the best position of each box. A box is an interval of samples on a circle.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,14 +124,14 @@ class _Boxes:
     step: float
 
     def best(self, widths: IntArray) -> _Best:
-        """Return the box that explains most chi-square, for each region and each of `widths` (w,)."""
+        """Return the box that explains most chi-square, for each region and each length in `widths` (w,)."""
         return _best_boxes(self.total, self.exist, self.variance, self.middle, widths)
 
 
 def _best_boxes_numpy(
     total: FloatArray, exist: FloatArray, variance: FloatArray, middle: IntArray, widths: IntArray
 ) -> _Best:
-    """Return the best boxes for the lengths `widths` (w,), from the attributes of `_Boxes`."""
+    """Return the best boxes of the lengths `widths` (w,); the other arguments are attributes of `_Boxes`."""
     last = total.shape[1] - 1
     each = np.arange(len(middle))[:, None]
     shape = len(widths), len(middle)
@@ -192,7 +196,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
 def _refined_angle(
     boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatArray, width: int
 ) -> ScannedAngle:
-    """Return the best rotation angle near the box length `width` (samples), with the stars for this angle."""
+    """Return the best rotation angle near the streak length `width` (samples), and its stars."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
     held = boxes.best(widths)
@@ -223,7 +227,7 @@ def _refined_angle(
 
 # Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Sine of the angle between the linear equations of two regions below which they give no rotation axis.
+# Sine of the angle between the equation vectors of two regions below which they give no rotation axis.
 _PARALLEL = 1e-9
 # Standard error of a region's orientation multiplied by the region's length (rad px).
 _SIDE_ERROR = 1.2
@@ -233,9 +237,9 @@ _LEAST_ERROR = 0.012
 _LEAST_LENGTH = 3.5
 # Constant part (px) of the standard error of a region's length.
 _LENGTH_ERROR = 1.0
-# Relative part of the standard error of a region's length, as a fraction of the length.
+# Proportional part of the standard error of a region's length, as a fraction of the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of two rankings, of which one includes the votes against.
+# Maximum number of rotation angles from each of two rankings, with and without contradicting regions.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) between the circles on which two fragments of one streak lie.
 _SAME_CIRCLE = 2.0
@@ -253,7 +257,7 @@ _LEAST_GROWTH = 0.4
 class MotionGuess:
     """An initial guess of the motion, and of the stars: centres (n, 2), px, and fluxes (n,), counts.
 
-    The fraction of the flux in regions that are too long for the guessed rotation angle is `contradicted`.
+    The attribute `contradicted` is the fraction of the flux in regions too long for the rotation angle.
     """
 
     motion: CameraMotion
@@ -352,7 +356,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     pixels = regions.column, regions.row, regions.light, regions.owner
     (mean, square, height), (low, high), bounds = _arcs(pixels, frame, reference, view)
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
-    # The brightness variance along a uniform arc is length^2 / 12 plus the variance of the point spread.
+    # The variance of the brightness along a uniform arc is length^2 / 12 plus the variance of the PSF.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     arcs = height, mean + reference, bounds[0] + reference, bounds[1] + reference, width
     at_border = _at_border(regions, pinhole, low), _at_border(regions, pinhole, high)
@@ -562,15 +566,15 @@ def _stars_of_angle(
     return pixel[seen], (regions.flux / part)[chosen][seen]
 
 
-# Ratio of consecutive trial lengths of a box, which is a run of samples along a circle.
+# Ratio of consecutive trial lengths of streaks in the search on all circles.
 _FRAME_FACTOR = 1.1
-# Smallest trial length (samples) of a box, which is a run of samples along a circle.
+# Smallest trial length (samples) of streaks in the search on all circles.
 _FRAME_SHORTEST = 5
 # Factor by which the search for the rotation angle reduces the number of circles.
 _SPARSE = 2
-# Minimum significance (standard deviations) of a box relative to the samples on both sides of it.
+# Minimum significance (standard deviations) of a possible streak against the samples on both sides of it.
 _LEAST_SIGMAS = 5.0
-# Upper limit of the significance (standard deviations) of one box in the sum over all boxes of one length.
+# Upper limit of the significance (standard deviations) of one possible streak in the sum over all streaks.
 _FRAME_ENOUGH = 40.0
 
 
@@ -602,7 +606,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 
 
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the sum of the squared significances of the most significant boxes of `width` samples.
+    """Return the sum of the squared significances of the most significant streaks of `width` samples.
 
     The array `padded` (c, r) contains the cumulative sums along the azimuth on r circles, with a margin of
     `room` samples at both ends.
@@ -616,8 +620,8 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The circles are divided into intervals of one box length. The most significant box of an interval is
-    # counted if no adjacent interval, on the same or a neighbouring circle, has a more significant box.
+    # The circles are divided into intervals of one streak length, each with its most significant streak.
+    # This streak is counted if no adjacent interval, on any circle, has a more significant streak.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)
@@ -629,6 +633,6 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
 
 
 def sharper_widths(width: int, longest: int) -> IntArray:
-    """Return the integer box lengths (samples) within half a search step of `width`, up to `longest`."""
+    """Return the integer streak lengths (samples) within half a search step of `width`, up to `longest`."""
     room = max(1, round(0.6 * (_FRAME_FACTOR - 1.0) * width))
     return np.arange(max(width - room, 2), min(width + room, longest) + 1)

@@ -40,10 +40,10 @@ SLOWEST = 1e-3
 """Lower limit (px per exposure) of a star's speed, which avoids divisions by zero."""
 # Largest camera rotation (rad) in one part of a path, whose column or row must change monotonically.
 _LONGEST_ROTATION = 1.1
-# Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
+# Number of instants at which part of a path is sampled to find where it crosses lines of pixels.
 _CROSSING_SAMPLES = 17
-# Ratio of a star's speeds along rows and columns at which its path is divided. If the ratio were 1, the
-# border between two parts could follow a diagonal of pixels, all of which would be omitted.
+# Ratio of a star's speeds along rows and columns at which its path is divided.
+# With a ratio of 1, all pixels on a diagonal border between two parts could be omitted.
 _DIAGONAL = 1.03
 # Number of instants at which the direction of part of a path is evaluated.
 _DIRECTION_INSTANTS = 7
@@ -61,7 +61,8 @@ class Strips:
 
     Attributes:
         star: index of the star of each block of pixels (b,), in ascending order.
-        time: time at which the star crosses each line of pixels (b, LINES), exposures since mid-exposure.
+        time: time at which the star crosses each line of pixels (b, LINES), in exposure times since
+            mid-exposure.
         corner: column and row of the first pixel of each line of pixels (b, LINES, 2).
         step: step in column and row from one pixel of a line to the next (b, 2).
         index: flat index in the frame of each pixel (b, LINES, k), or 0 for a pixel that is not `inside`.
@@ -362,7 +363,7 @@ class BlockPixels:
         inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
-        ceiling: smallest counts above the background at which each pixel is saturated.
+        ceiling: counts above the background at which each pixel saturates.
         gain: gain of the camera, electrons per count.
         crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
         common: index of each fitted pixel in the list of the pixels that several stars share.
@@ -533,7 +534,7 @@ def _frame_values_numpy(
     """Return a mask of the usable pixels, and signal, floor and ceiling of all pixels, see `BlockPixels`."""
     signal, floor, counts, bad = of_frame
     light = signal.take(index)
-    # The background is the raw counts minus the signal, and is subtracted from the saturation level.
+    # The background (raw counts minus signal) is subtracted from the saturation level.
     ceiling = np.float32(top) - counts.take(index) + light
     return inside & ~bad.take(index), light, floor.take(index), ceiling.astype(np.float32)
 
@@ -592,7 +593,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), SLOWEST)
-    # A star is slow if its speed changes relatively by more than `_STEADY` over one point-spread width.
+    # A star is slow if its speed changes by more than the fraction `_STEADY` over one point-spread width.
     slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:

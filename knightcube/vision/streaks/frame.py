@@ -1,6 +1,6 @@
-"""Preparation of a frame for the fit: background, noise, unusable pixels, bright regions and star width.
+"""Preparation of a frame for the fit: background, noise, unusable pixels, bright regions and PSF width.
 
-If the point spread is several pixels wide, the frame is binned (`Binning`). If the point spread is wide, a
+If the point spread function (PSF) is several pixels wide, the frame is binned (`Binning`). For a wide PSF, a
 fit to a binned frame is as accurate as a fit to the full frame, and takes a fraction of the computing time.
 The responses of a colour camera's raw pixels are equalised, and extended sources such as the Earth's limb are
 excluded.
@@ -234,7 +234,7 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     return replace(frame, signal=signal.reshape(-1), sums=box_sum(signal).reshape(-1), floor=floor)
 
 
-# Displacements (px) at which the autocorrelation is measured; pixel noise adds to that at zero.
+# Displacements (px) at which the autocorrelation is measured; pixel noise affects only zero displacement.
 _NEAR, _FAR = 1, 3
 # Maximum number of bright regions from which the point-spread width is estimated.
 _MOST_WIDTH_REGIONS = 12
@@ -243,7 +243,7 @@ _LEAST_WIDTH_REGIONS = 3
 
 
 def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | None:
-    """Return the standard deviation (px) of the point spread without pixel convolution, or None if unknown.
+    """Return the standard deviation (px) of the PSF without pixel convolution, or None if unknown.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
     to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and along rows is also Gaussian,
@@ -271,7 +271,7 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     return float(np.sqrt(max(float(np.median(known)) - PIXEL_VARIANCE, 0.0)))
 
 
-# Minimum standard deviation of the point spread in a binned image, in binned pixels.
+# Minimum standard deviation of the PSF in a binned image, in binned pixels.
 _NARROWEST = 1.0
 
 
@@ -382,7 +382,7 @@ def prepare_frame(
 def _prepared(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
 ) -> _Prepared:
-    """Return the frame, binned for a point spread with the standard deviation `sigma`, px."""
+    """Return the frame, binned for a PSF with the standard deviation `sigma`, px."""
     binning = Binning.suited(pinhole, sigma)
     frame = reduce_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
     regions = find_bright_regions(frame, settings.threshold_sigmas, _MOST_REGIONS)

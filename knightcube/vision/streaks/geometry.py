@@ -137,7 +137,7 @@ class CameraMotion:
 
     @property
     def relative_acceleration(self) -> float:
-        """Change of the rate along the mean rotation axis over the exposure, relative to the mean rate."""
+        """Change of the rate along the mean rotation axis over the exposure, divided by the mean rate."""
         square = float(self.rotation @ self.rotation)
         rate = self.smooth.higher(np.array([-0.5, 0.5]), 1)
         change = self.acceleration + rate[:, 1] - rate[:, 0]
@@ -149,7 +149,7 @@ class CameraMotion:
         return np.asarray(self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY))
 
     def relative_rate(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rate about the mean axis at `time` (m,), relative to the mean, or its derivative."""
+        """Return the rate about the mean axis at `time` (m,), divided by the mean rate, or its derivative."""
         vector = _rate(self, time) if derivative == 0 else self.acceleration[:, None] + self.higher(time, 2)
         relative = self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY)
         return np.asarray(np.broadcast_to(relative, time.shape))
@@ -177,9 +177,9 @@ _INVERSIONS = 6
 class DistortedPinhole(Pinhole):
     """A pinhole camera with small calibration errors: image centre, focal length and cubic distortion.
 
-    The inherited methods project without distortion. Only the functions `paths` and `positions` apply it: a
-    displacement (x, y) of the image centre (`shift`, px), a relative error of the focal length (`scale`), and
-    the cubic distortion at the corner, as a fraction of the corner's distance from the centre.
+    The inherited methods project without these errors. Only the functions `paths` and `positions` apply them:
+    a displacement (x, y) of the image centre (`shift`, px), a relative error of the focal length (`scale`),
+    and cubic distortion (`cubic`), as a fraction of the corner's distance from the centre.
     """
 
     shift: tuple[float, float]
@@ -243,7 +243,7 @@ class DistortedPinhole(Pinhole):
 
 
 def streak_pinhole(camera: CameraModel, knowledge: CameraKnowledge) -> Pinhole:
-    """Return the camera model of the streak fit; it includes the distortion only of an estimated lens."""
+    """Return the camera model of the streak fit, which includes distortion only if the lens was estimated."""
     if knowledge.covariance is None or not isinstance(camera, Lens):
         return camera.ideal
     return DistortedPinhole.of(camera)
