@@ -1,9 +1,9 @@
-"""Compiled forms of frequently executed functions, which numba generates where it is installed.
+"""Compiled forms of frequently executed functions, which numba generates if it is installed.
 
-Each such function has a numpy form and a loop form, which return the same values up to rounding. The numpy
-form is the reference, and also works without numba. The loop form is plain Python with loops over elements,
-which numba compiles at its first call. The decorator `@compiled_form_of(numpy_form)` combines the loop form
-with the numpy form:
+A function with a compiled form has a numpy form and a loop form, which return the same values up to rounding.
+The numpy form is the reference, and also works without numba. The loop form is plain Python with loops over
+elements, which numba compiles at its first call. The decorator `@compiled_form_of(numpy_form)` combines the
+loop form with the numpy form:
 
     @compiled_form_of(sum_of_squares_numpy)
     def sum_of_squares(values: FloatArray) -> float:
@@ -32,18 +32,17 @@ Result = TypeVar("Result")
 
 _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
-"""LLVM options for helpers: sums may be computed in any order, which permits vector instructions."""
+"""LLVM options for functions that loop forms call: any order of sums, which permits vector instructions."""
 _COMPILING = (
     "numba compiles the star tracker and the streak fit for this machine; this takes up to a minute, once "
     f"({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []
-"""Functions that numba has not compiled yet and that are called by loop forms (plain Python loops for
-numba)."""
+"""Functions that loop forms call and that are not yet registered for compilation by numba."""
 
 
 class HotFunction(Generic[Parameters, Result]):
-    """Function with a numpy form and a loop form, of which each process uses one."""
+    """Function with a numpy form and a loop form; each process uses one of the two forms."""
 
     def __init__(
         self, numpy_form: Callable[Parameters, Result], loop_form: Callable[Parameters, Result]
@@ -129,7 +128,7 @@ def _numba_is_usable() -> bool:
 
 @functools.cache
 def _announce_compilation() -> None:
-    """Log a warning at the first compilation of this process; functions read from the cache need none."""
+    """Log a warning when numba first compiles a function in this process, but not for cached functions."""
     event = importlib.import_module("numba.core.event")
 
     class FirstCompilation(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types

@@ -60,7 +60,7 @@ _STANDS_OUT = 6.0
 _LEAST_LIT = 16
 """Minimum number of bright pixels of an image; fewer bright pixels may be hot pixels or stars."""
 _WINDOW = 9
-"""Minimum distance (px) along a scan line between an edge and a hidden pixel."""
+"""Minimum distance (px) along a scan line between an edge and a pixel that shows the spacecraft."""
 _PROFILE: IntArray = np.arange(-_WINDOW, 6)
 """Positions of the samples of a stored brightness profile, in px from the edge towards the bright side."""
 
@@ -105,7 +105,8 @@ class ScanLines:
 class ImagePart:
     """A rectangle of an image in which a second search finds edges on more scan lines.
 
-    The lowest and highest (x, y) are the `box` (2, 2), px. The levels are those of the whole image.
+    The lowest and highest (x, y) are the `box` (2, 2), px. The brightness levels are those of the whole
+    image.
     """
 
     box: FloatArray
@@ -173,7 +174,7 @@ def find_edges(
         return ScanEdges(empty, empty, none, none, none, np.zeros((0, len(_PROFILE)))), read
     edges = _line_edges(light, bright, (columns, rows), settings.contrast * span)
     if hidden is not None:
-        # Hidden pixels that are this close would affect the position of an edge.
+        # Hidden pixels within the distance `reach` would affect the position of an edge.
         reach = np.maximum(_WINDOW, (_REACH + _TAIL) * edges.scale)
         steps = np.linspace(-1.0, 1.0, 2 * _WINDOW + 1)
         points = edges.points[:, None] + edges.towards[:, None] * (reach[:, None] * steps)[..., None]
@@ -215,8 +216,7 @@ def _levels(light: list[FloatArray], masked: list[BoolArray] | None = None) -> L
     dark = np.abs(np.concatenate(steps)[values <= least + 0.1 * (most - least)])
     middle = len(dark) // 2
     noise = float(np.partition(dark, middle)[middle]) * _STEP_TO_SIGMA
-    # The second percentile of the pixels lies about two standard deviations below the mean of the dark
-    # pixels.
+    # The second percentile of all pixels is about two standard deviations below the mean dark pixel.
     low = least + 2.0 * noise
     lit = order[np.searchsorted(order, low + max(_STANDS_OUT * noise, 0.05 * (most - low)), "right") :]
     if len(lit) < _LEAST_LIT or most <= low:
@@ -251,10 +251,10 @@ class _BinaryChanges:
 def _line_edges(
     light: list[FloatArray], bright: list[BoolArray], places: tuple[IntArray, IntArray], contrast: float
 ) -> ScanEdges:
-    """Return those edges on columns and rows whose step height exceeds `contrast`.
+    """Return the edges on columns and rows whose step height exceeds `contrast`.
 
-    The brightness `light`, and the mask of bright pixels, of the columns and of the rows are (n, m) each, and
-    their indices `places` are (n,).
+    For the columns, and for the rows, the brightness `light` and the mask of bright pixels are (n, m), and
+    the indices `places` are (n,).
     """
     parts, read = [], 0
     for direction, binary in enumerate(bright):
@@ -329,8 +329,7 @@ def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)
     kernel = x * np.exp(-0.5 * (x / size) ** 2)
-    # The response of the derivative kernel to a step between two pixels is the sum of the kernel's positive
-    # half.
+    # The response to a step between two pixels is the sum of the positive half of the derivative kernel.
     kernel = kernel / np.sum(kernel[x > 0])
     window = np.arange(-reach - half, reach + half + 1)
     matrix = np.zeros((len(window), 2 * reach + 1))
@@ -485,7 +484,7 @@ def _hidden_samples(masked: BoolArray) -> BoolArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return cached unit vectors (m, 3) to the imaged ones of k sampled pixels, and their mask (k,)."""
+    """Return unit vectors (m, 3) to the sampled pixels that the lens images, and their mask (k,)."""
     x, y = np.meshgrid(columns, _sample_places(camera.rows), indexing="ij")
     other_y, other_x = np.meshgrid(rows, _sample_places(camera.columns), indexing="ij")
     points = np.stack(

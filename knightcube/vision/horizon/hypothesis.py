@@ -152,7 +152,7 @@ The number of edges gives the density of chance edges.
 class LimbInView:
     """Length of the part of a limb in an image that should show edges, px, and crossings with scan lines.
 
-    The number `crossings` is that of this part, and `all_crossings` that of the whole limb in the image.
+    The number of crossings is `crossings` for this part, and `all_crossings` for the whole limb in the image.
     """
 
     length: float
@@ -166,14 +166,13 @@ def limb_in_view(
     """Return the length of a limb in the image and the number of its crossings with scan lines.
 
     The points (n, 2), px, follow the closed limb. The masks (n,) mark the points inside the image, and the
-    points at which the limb is due to show an edge. Scanned columns and rows are `space` px apart.
+    points at which the limb should show an edge. Scanned columns and rows are `space` px apart.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)
     both = [kept & np.roll(kept, -1) for kept in (inside & due, inside)]
     size = np.hypot(step[:, 0], step[:, 1])
-    # The x component of a step along the limb gives the number of crossed columns, and the y component the
-    # number of crossed rows.
+    # The x and y components of a step along the limb give the numbers of crossed columns and rows.
     crossings = np.sum(step * (step > _GRAZING * size[:, None]) / np.array(space), axis=1)
     return LimbInView(
         *(float(np.sum(each)) for each in (size[both[0]], crossings[both[0]], crossings[both[1]]))
@@ -186,13 +185,13 @@ def log10_chance(
     """Return log10 of an upper bound on the expected number of limbs that fit equally well by chance.
 
     The distances from the fitted limb, px, are `residuals` (k,) for the edges that belong to the limb, and
-    `others` (m,) for all other edges. There are 2 `unknowns` for nadir and 3 with altitude.
+    `others` (m,) for all other edges. The number of fitted `unknowns` is 2 for the nadir, and 3 for nadir and
+    altitude.
     """
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
     beside = _BESIDE * size
-    # One edge is added, so that the density of chance edges is positive even if the limb has no edges beside
-    # it.
+    # One edge is added, so that the density of chance edges is positive even without edges near the limb.
     near = np.count_nonzero(np.abs(others) < beside) + 1.0
     density = near / (2.0 * beside * max(limb.all_crossings, lines))
     best = math.inf
@@ -201,8 +200,7 @@ def log10_chance(
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        # The variable `tail` is Chernoff's bound (log10) on the probability that chance edges lie on at least
-        # the fraction `share` of the limb segments.
+        # Chernoff's bound (log10) on the probability of chance edges on the fraction `share` of the segments.
         tail = 0.0
         if share > chance:
             rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))

@@ -1,19 +1,21 @@
-"""Comparison of images with the brightness that an assumed view of the Earth predicts, and a coarse nadir.
+"""Comparison of images with the brightness predicted for an assumed view of the Earth, and a coarse nadir.
 
 If the assumed view of the Earth is correct, the whole image agrees with it: sky and night side are dark, and
 the sunlit limb has edges along its entire length. A view that was fitted to the terminator instead of the
-limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish the two.
+limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish limb and
+terminator.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
 al., section 4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere, and predicts for
-each that the samples on the sunlit part of the Earth's disc are bright. The coarse nadir is the mean of the
-trial directions, weighted by their likelihood, and the covariance is their spread. If the direction of the
-Sun is unknown, any sample on the Earth's disc may be dark, because it may be on the night side.
+each direction that the samples on the sunlit part of the Earth's disc are bright. The coarse nadir is the
+mean of the trial directions, weighted by their likelihood, and the covariance is their spread. If the
+direction of the Sun is unknown, any sample on the Earth's disc may be dark, because it may be on the night
+side.
 
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
-attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be,
-because its camera has failed, is blinded, is mounted upside down or sends random data. The comparison
-excludes samples near the limb, in the twilight zone and near the Sun.
+attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night side can
+be. Possible causes are a camera that has failed, is blinded, is mounted upside down or sends random data. The
+comparison excludes samples near the limb, in the twilight zone and near the Sun.
 """
 
 from __future__ import annotations
@@ -76,7 +78,7 @@ def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArr
 def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
     """Return how well an assumed view of the Earth agrees with samples of an image.
 
-    If the Sun's direction is unknown, only samples in the sky outside a possible glare are compared.
+    If the Sun's direction is unknown, only samples in the sky outside possible glare of the Sun are compared.
     """
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
@@ -95,9 +97,9 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
 
 
 _LEAST_GLARE, _IN_GLARE = 4, 0.8
-"""Minimum number of bright samples in the sky, and minimum fraction in the glare, that indicate the Sun."""
+"""Minimum number of bright sky samples, and minimum fraction around their mean, that indicate the Sun."""
 _ROUND_GLARE = 0.85
-"""Minimum fraction of bright samples among the k samples nearest to the Sun for round glare of k samples."""
+"""Minimum bright fraction of the samples nearest to the assumed Sun, for the glare to count as round."""
 
 
 def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> BoolArray:
@@ -127,7 +129,7 @@ def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> Boo
 _LEAST_SKY = 8
 """Minimum number of samples in the assumed sky for a test of whether the sky looks like space."""
 _DIM_AIR = 30e3
-"""Height (m) above the limb at which the atmosphere has 3 % of its brightness.
+"""Height (m) above the limb at which the atmosphere has 3 % of its maximum brightness.
 
 The height is used for images that do not show enough sky above `_ATMOSPHERE`.
 """
@@ -195,7 +197,7 @@ _SAMPLES = 8
 _DIRECTIONS = 2000
 """Number of trial directions of nadir, about 4.5 deg apart."""
 _STRAY = 0.03
-"""Probability that a sample in the sky is bright, equal to that of a dark sample on sunlit ground."""
+"""Assumed probability that a sample in the sky is bright, and that a sample on sunlit ground is dark."""
 _WEIGHT = 0.2
 """Weight of a sample in the log-likelihood, below 1 because neighbouring samples have correlated errors."""
 _WIDEST = math.radians(30.0)

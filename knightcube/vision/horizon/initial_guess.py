@@ -2,11 +2,12 @@
 
 All rays u to the limb of a sphere make the same angle rho with the nadir n. The limb therefore satisfies the
 equation u.g = 1, which is linear in g = n / cos rho (Christian & Robinson 2016). Two rays to the limb
-determine the nadir up to two solutions if rho is known, and three rays determine rho and the nadir. Every
-pair of edges gives a trial cone, or every triple if the altitude is unknown, or an evenly spaced selection of
-them. An edge agrees with a cone if it lies near the cone and its bright side is towards nadir. The edges of
-the best cone are removed and the search is repeated, so that the terminator, a coast or a band of clouds
-gives a separate cone. The search is a sample consensus (Fischler & Bolles 1981) without random selection.
+determine the nadir up to two solutions if rho is known, and three rays determine rho and the nadir. Trial
+cones are computed from all pairs of edges, or from all triples if the altitude is unknown. Of too many pairs
+or triples, an evenly spaced selection is used. An edge agrees with a cone if it lies near the cone and its
+bright side is towards nadir. The edges of the best cone are removed and the search is repeated, so that the
+terminator, a coast or a band of clouds gives a separate cone. The search is a sample consensus (Fischler &
+Bolles 1981) without random selection.
 
 A horizon does not determine the rotation about nadir, which is needed because the Earth's flattening depends
 on the direction of the pole, and the illumination on the direction of the Sun. The rotation is derived from a
@@ -139,8 +140,7 @@ def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
     """Return the indices of up to `tries` triples of `count` items, both close together and far apart."""
     number = np.arange(tries)
     first = number % count
-    # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the index differences
-    # evenly.
+    # Fractional parts of multiples of the golden ratio and sqrt(2) spread the index differences evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -255,8 +255,7 @@ def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     square = float(middle @ middle)
     if square < 1e-12:
         return half_turn(tangent_basis(source)[0], 1.0)
-    # A rotation of 180 deg about `source` followed by one about `middle` is the smallest rotation to
-    # `target`.
+    # The smallest rotation consists of 180 deg about `source` followed by 180 deg about `middle`.
     return np.asarray(half_turn(middle, square) @ half_turn(source, 1.0))
 
 
@@ -346,7 +345,7 @@ class InitialGuess:
         place: known or assumed position of the camera relative to the Earth.
         view: assumed position and attitude of the camera and height of the limb.
         orientation: attitude of the camera, with the uncertainty of its rotation about nadir.
-        members: which edges of the image agree with the cone of the guess (n,).
+        members: mask of the edges of the image that agree with the cone of the guess (n,).
     """
 
     place: Place

@@ -171,8 +171,8 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     lengths = np.sqrt(np.einsum("ij,ij->i", stretched, stretched))
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
-    # The derivative with respect to the scaled ray is transformed into camera axes. The same matrix product
-    # also computes the permuted components that the cross product with the ray needs.
+    # The derivative with respect to the scaled ray is transformed into camera axes.
+    # The matrix product also gives the permuted components that the cross product with the ray needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
@@ -181,8 +181,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     gradients = np.empty((len(rays), PARAMETERS))
     # A small rotation d of the camera displaces a fixed direction u by -d x u.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # The variable `by_size` is the negative derivative of the cone's half-angle arcsin(1 / size) with respect
-    # to `size`.
+    # The variable `by_size` is minus the derivative of the cone's half-angle, arcsin(1 / size).
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -201,7 +200,7 @@ _LAST_STEP = 3e-5
 _SAME_GRADIENTS = 3e-3
 """Rotation step (rad) below which the gradients of the residuals are not computed again.
 
-Such a step changes the gradients by less than 1 %.
+A smaller step changes the gradients by less than 1 %.
 """
 _HUBER, _BEYOND = 1.5, 5.0
 """Residuals (standard deviations) above which Huber's weights decrease, and above which they are zero."""
@@ -278,8 +277,8 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
             return None
         last = float(np.max(np.abs(step[:3])))
     factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
-    # The weights include the spread estimated from the median residual. The factor `excess` also takes into
-    # account a few large residuals.
+    # The weights include the spread estimated from the median residual.
+    # The factor `excess` also takes a few large residuals into account.
     fitted = weights[used] * residuals[used] ** 2
     excess = max(1.0, float(np.sum(fitted)) / max(len(fitted) - 3, 1))
     covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))
@@ -351,8 +350,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
         return 1.0
     aside = rays @ tangent_basis(nadir).T
     azimuth = np.arctan2(aside[:, 1], aside[:, 0])
-    # The sequence of points around the limb starts at the widest gap, because the points on both sides of the
-    # gap are not neighbours.
+    # The sequence of points around the limb starts at the widest gap, whose ends are not neighbours.
     order = np.argsort(azimuth)
     gaps = np.diff(azimuth[order], append=azimuth[order[0]] + 2.0 * np.pi)
     along = scaled[np.roll(order, -1 - int(np.argmax(gaps)))]
@@ -396,15 +394,16 @@ UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
 _LOWEST, _HIGHEST, _STEP = -320e3, 240e3, 500.0
 """Lowest and highest tangent height of the brightness table, and the step between its heights (m)."""
 _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
-"""Smallest and largest blur of the brightness table (standard deviation, m), and number of blurs."""
+"""Smallest and largest blur (standard deviation, m at the limb) in the brightness table; number of blurs."""
 
 
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
     """Return the brightness of air and ground at tangent heights, and their derivatives, 1/m, as (4, n, k).
 
-    Brightness is relative to sunlit air of infinite optical depth, and to ground without air. The k heights
-    along each of n scan lines are (n, k), m, and the Gaussian blur of each scan line is (n,), m. The blur is
-    rounded to the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
+    The brightness of air is relative to sunlit air of infinite optical depth, and that of ground to ground
+    without air. The k heights along each of n scan lines are (n, k), m, and the Gaussian blur of each scan
+    line is (n,), m. The blur is rounded to the nearest blur of the table; neighbouring blurs of the table
+    differ by 8 %.
     """
     table = _limb_table()
     width = np.log(np.clip(blur, _SHARPEST, _BROADEST) / _SHARPEST) / math.log(_BROADEST / _SHARPEST)

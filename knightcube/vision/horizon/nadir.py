@@ -13,8 +13,8 @@ is ambiguous or refused, and the result contains the reason.
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
 searched again with the nadir of the other cameras as prior knowledge. One common limb is fitted to the limb
-points of all images. Its unknown height above the ground displaces the nadir only if the images show one side
-of the limb but not the opposite side.
+points of all images. The unknown height of the limb above the ground displaces the nadir only if the images
+show one side of the limb but not the opposite side.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def nadir_of_uncertain_field(
     Nadir and altitude are weighted means over the horizons of eleven trial focal lengths. The weight of a
     horizon is the probability of its focal length and of its misfit. The uncertainty of each mean includes
     the scatter of the individual horizons. Refused horizons also contribute to the means, but the image is
-    refused if they have half of the total weight or more. See `find_nadir`.
+    refused if refused horizons have half of the total weight or more. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)
@@ -304,7 +304,7 @@ def _by_field(
     settings: HorizonSettings,
     hidden: BoolArray | None,
 ) -> tuple[list[_FieldTrial], FloatArray]:
-    """Return the best permitted horizon of each trial focal length, and the probabilities of the lengths."""
+    """Return the best horizons at trial focal lengths, unless prior knowledge excludes them, and weights."""
     centre, width = 0.0, 1.0
     trials: list[_FieldTrial] = []
     weights = np.zeros(0)
@@ -323,8 +323,7 @@ def _by_field(
         # Only edges whose distance from the horizon is known for all focal lengths are compared.
         squares = np.minimum(squares[:, ~np.isnan(squares).any(axis=0)], _OFF)
         loss = squares.sum(axis=1)
-        # The misfit of the best fit and its correlation are attributed to ground and clouds, and scale the
-        # misfit of the other fits.
+        # The misfit and the correlation of the best fit, due to ground and clouds, scale all misfits.
         best_fit = int(np.argmin(loss))
         on = squares[best_fit] < _OFF
         mean = float(squares[best_fit][on].sum()) / max(int(np.count_nonzero(on)), 1)
@@ -343,7 +342,7 @@ def _by_field(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """One search that read `read` pixels: horizons, best first; unknown altitudes are in `altitudes`, m."""
+    """Result of one search: horizons, the best first, number of pixels read, and range of altitudes, m."""
 
     observation: Observation
     levels: Levels
@@ -527,8 +526,8 @@ def _measurement(
     sigma = fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA if free else 0.0)
     if free:
         mean, share = limited_normal(altitude, sigma, altitudes)
-        # The error of the altitude is correlated with the rotation error d (3,) of the camera, and a rotation
-        # d displaces nadir n by d x n.
+        # The error of the altitude is correlated with the rotation error d (3,) of the camera.
+        # A rotation d displaces nadir n by d x n.
         gain = np.cross(fit.covariance[:3, ALTITUDE] / sigma**2, nadir)
         nadir = nadir + (mean - altitude) * gain
         nadir = nadir / np.linalg.norm(nadir)
@@ -544,8 +543,7 @@ def limited_normal(mean: float, sigma: float, limits: tuple[float, float]) -> tu
     """
     low, high = ((limit - mean) / sigma for limit in limits)
     x = np.linspace(max(low, min(-8.0, high - 1.0)), min(high, max(8.0, low + 1.0)), 2001)
-    # The density is normalised to its maximum in the range, so that it does not underflow if the range is far
-    # from the mean.
+    # The density is normalised to its maximum in the range, so that it does not underflow.
     nearest = min(max(0.0, low), high)
     weight = np.exp(0.5 * (nearest**2 - x**2))
     weight /= weight.sum()

@@ -109,7 +109,8 @@ class EdgeSettings:
     Attributes:
         lines: number of columns, and of rows, that the first search reads.
         more_lines: number of columns, and of rows, that a second search of the image reads.
-        run: odd window of the majority filter against short fluctuations, px (Meller et al., section 3.1).
+        run: window of the majority filter against short fluctuations, px, an odd number (Meller et al.,
+            section 3.1).
         threshold: brightness above which a pixel counts as bright, as a fraction of the range from the dark
             level to the bright level.
         contrast: minimum step height of an edge, as a fraction of the range from dark to bright level.
@@ -149,7 +150,8 @@ class HorizonSettings:
         altitude_sigma: standard deviation of the altitude of a known position, m.
         altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
             would accept any bright disc as the Earth, for instance a lens ghost.
-        tolerance: largest distance of an edge from a horizon's circular cone, including flattening, px.
+        tolerance: largest distance of an edge from a horizon's circular cone, px; it includes the Earth's
+            flattening.
         least_edges: minimum number of edges on a horizon.
         enough_edges: number of edges on a horizon below which the image is searched again on more scan lines.
         some_edges: number of edges in an image below which the image is not searched again.

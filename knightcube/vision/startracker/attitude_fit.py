@@ -42,7 +42,8 @@ class StarField:
         half_width: tangents of half the field of view along x and along y (2,).
         scale: lowest and highest possible factor by which the tangents x/z, y/z must be multiplied for the
             true focal length; (1, 1) for a calibrated camera.
-        magnitude: instrumental magnitudes of the points (n,), or None if only their order is known.
+        magnitude: instrumental magnitudes of the points (n,), or None if only the order of brightness is
+            known.
     """
 
     direction: FloatArray
@@ -77,11 +78,11 @@ class StarField:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleSteps:
-    """Steps of the range of possible scales within which the side ratios of triangles are nearly constant.
+    """Steps of the image scale, within each of which the side ratios of triangles are nearly constant.
 
     Attributes:
         middle: scales (s,), one in each step, at which the side ratios of triangles are computed.
-        lowest, highest: limits of the scale of each step (s,).
+        lowest, highest: scale limits of each step (s,).
     """
 
     middle: FloatArray
@@ -93,11 +94,12 @@ class ScaleSteps:
 
     @classmethod
     def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return steps of a field's range of scales, within each of which side ratios vary by `tolerance`.
+        """Return scale steps; side ratios in a step differ from those at its middle by at most `tolerance`.
 
         At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
         / 2 across the radius. The ratio of two sides of a triangle at the field-angle tangent t therefore
-        depends on their directions by up to t^2 / 2. The steps are computed half-way to the corner.
+        depends on their directions by up to t^2 / 2. The number of steps is computed for a triangle half-way
+        between the image centre and a corner.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -128,9 +130,10 @@ class StarMatch:
         fix: attitude from all matched stars, ICRS to camera, with its covariance, or None unless identified.
         scale: factor by which the observed tangents x/z, y/z must be multiplied for the true focal length.
         scale_sigma: standard deviation of the scale; 0 if the scale was given.
-        log10_false_alarm: log10 of the probability that random stars match as well anywhere; 0 if unknown.
-        distortion: fitted distortion of the lens, as the relative displacement of a star in the image corner;
-            0 if the stars matched without distortion.
+        log10_false_alarm: log10 of the probability that random stars match equally well at any attitude; 0 if
+            unknown.
+        distortion: fitted distortion of the lens: displacement of a star in the image corner, relative to its
+            distance from the optical axis; 0 if the stars matched without distortion.
         from_lens: part (3, 3) of the covariance of `fix` due to the uncertainty of `distortion`, rad^2.
         mirrored: whether the stars were identified in the mirrored field (`StarField.mirrored`). For a
             mirrored field, `fix` is the attitude of the mirrored field.
@@ -150,8 +153,8 @@ class StarMatch:
 # Rotation step (rad) below which the iteration ends. After a step d, the error is about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition number of the normal equations, which is reached if all stars lie within 1e-6
-# rad of one direction.
+# Minimum reciprocal condition number of the normal equations.
+# It is reached if all stars lie within 1e-6 rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -264,8 +267,8 @@ def _refined_numpy(
     """Return whether the fit converged, and the four attributes of the resulting `Refinement`."""
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
-    # The 9 x 9 Gram matrix of weighted predictions, residuals and derivatives with respect to ln scale
-    # contains all terms of the normal equations.
+    # A row contains a star's weighted prediction, residual and derivative with respect to ln scale.
+    # All terms of the normal equations are elements of the Gram matrix (9, 9) of the rows.
     rows = np.zeros((len(observed), 9))
     normal = np.zeros((parameters, parameters))
     failed = False, matrix, scale, np.zeros((parameters, parameters)), np.zeros(len(observed))
@@ -283,8 +286,7 @@ def _refined_numpy(
             return failed
         step = -(covariance @ gradient)
         longest = float(np.abs(step).max())
-        # The largest element of a matrix multiplied by the largest element of its inverse approximates the
-        # condition number.
+        # The product of the largest elements of a matrix and its inverse approximates the condition number.
         condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
         if not 0.0 < condition < 1.0 or not longest < 1.0:
             return failed
@@ -301,7 +303,7 @@ def _refined_numpy(
 
 
 def _write_normal(gram: list[list[float]], normal: FloatArray) -> list[float]:
-    """Write the normal matrix (p, p) from the rows' Gram matrix; return the gradient (p,), sums of p x r."""
+    """Write the normal matrix (p, p) from the Gram matrix of the rows (9, 9); return the gradient (p,)."""
     trace = gram[0][0] + gram[1][1] + gram[2][2]
     gradient = _summed_cross(gram, 3)
     for i in range(3):
@@ -457,7 +459,7 @@ def _turn(matrix: FloatArray, turn: FloatArray) -> None:
 
 
 def _summed_cross(gram: list[list[float]], at: int) -> list[float]:
-    """Return the sum of p x q over the stars; p begins at column 0 of the Gram matrix, q at column `at`."""
+    """Return the sum over all stars of p x q; p begins at column 0 of the Gram matrix's rows, q at `at`."""
     return [gram[1][at + 2] - gram[2][at + 1], gram[2][at] - gram[0][at + 2], gram[0][at + 1] - gram[1][at]]
 
 
@@ -472,7 +474,7 @@ def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 PRIOR = 0.05
-"""Prior standard deviation of an uncalibrated lens's radial distortion, relative to the corner's radius."""
+"""Prior standard deviation of an uncalibrated lens's distortion, as a fraction of the corner's radius."""
 _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
@@ -495,7 +497,8 @@ class DistortedFit:
         observed: indices of the observed points that match guide stars (k,).
         star: indices of the guide stars that the points match (k,).
         refined: attitude and scale, with a covariance that is increased if the residuals are too large.
-        distortion: radial distortion, as the relative displacement of a star in the image corner.
+        distortion: radial distortion: displacement of a star in the image corner, relative to its distance
+            from the optical axis.
         seen: unit vectors to all observed points, corrected for the distortion (n, 3), camera frame.
         from_lens: part (3, 3) of the attitude covariance due to the uncertainty of the distortion, rad^2.
     """
@@ -554,8 +557,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # If the residuals are larger than expected, the covariance from the stars is increased, but not that from
-    # the prior.
+    # Too large residuals increase the covariance from the stars, but not the variance of the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2

@@ -101,14 +101,12 @@ def refit_motion(
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
     """Return `motion` fitted again with all catalogue stars, or None if the fit fails or changes the rate."""
-    # Under a rolling shutter, an ambiguous rate is the mean of two possible rates and not a valid initial
-    # value.
+    # With a rolling shutter, an ambiguous rate is the mean of two possible rates: not a valid initial value.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = streak_pinhole(solution.camera, likelihood.knowledge), motion.exposure
-    # The rotation during the exposure is computed from the mean rate, the acceleration and the higher-order
-    # terms.
+    # The rotation during the exposure includes mean rate, acceleration and higher-order terms.
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
     course = CameraMotion.between(motion.rate * exposure, growth, shape)

@@ -89,7 +89,7 @@ class Detections:
 
     @property
     def is_star(self) -> BoolArray:
-        """Mask of the sources (n,) that may be stars and are not hot, extended, streaks or clutter."""
+        """Mask (n,) of the sources that may be stars: not hot, not extended, not streaks and not clutter."""
         return np.asarray((self.quality & REFUSED) == 0)
 
     def select(self, chosen: BoolArray | IntArray) -> Detections:
@@ -155,8 +155,8 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
     Local maxima that may be part of the wings of a brighter star are excluded. At most `most` peaks in the
     mask `open_sky` (p,) are selected, and at most a quarter of `most` in each sixteenth of the frame's area,
-    so that a bright cloud does not exclude the stars beside it. The same number of peaks outside the open sky
-    is selected as well, so that the widths of foreground sources are measured.
+    so that a bright cloud does not exclude the stars beside it. Up to `most` peaks outside the open sky are
+    also selected, so that the widths of foreground sources are measured.
     """
     compared = np.sort(
         np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
@@ -167,7 +167,7 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
 
 def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the indices of the first `most` peaks, at most a quarter in each sixteenth of the area."""
+    """Return the indices of up to `most` peaks, at most a quarter of `most` in each sixteenth of the area."""
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")
@@ -180,8 +180,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
     """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    # Only peaks closer than 60 px are compared, because at this distance the wings are a millionth of the
-    # peak.
+    # Only peaks closer than 60 px are compared: at 60 px, the wings are a millionth of the peak.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
     # The wings of a saturated star begin at the edge of its saturated disc.
     apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
@@ -214,15 +213,14 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
 # Number of measured peaks per requested star, above 1 because some peaks are not stars.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Ratio of the noise of a block of pixels to the median over the frame above which the block is foreground.
+# Noise of a block of pixels, relative to the median noise of the frame, above which it is foreground.
 _RESTLESS = 2.5
 # Radius (px) of a saturated disc above which it is a planet, the Moon or a lamp instead of a star.
 _WIDEST_CORE = 7.0
 _SHARPER, _BROADER = 0.55, 1.8
 _SURE = 3.0
 _LONGER_THAN_COMA = 12.0
-# Radius (px) around a source. If most sources within this radius do not look like stars, the source is
-# clutter.
+# A source is clutter if most sources within this radius (px) do not look like stars.
 _ABOUT = 48.0
 _ODD_PART, _LEAST_ODD = 0.5, 8
 _ODD_WIDTH, _ODD_LENGTH = 1.25, 2.5
@@ -359,8 +357,7 @@ def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if frame_shape(areas).kind is not FrameKind.STREAKS:
-        # A long area may also be a row of stars, with several peaks, or a bright star with a tail due to
-        # coma.
+        # A long area may also be a row of stars (several peaks) or a bright star with a tail due to coma.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
@@ -446,7 +443,7 @@ def _peaks_near(
 
 
 def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return background (n,), noise of single and of smoothed pixels, each (n,), and noise correlation.
+    """Return background, noise of single pixels, noise of smoothed pixels, all (n,), and noise correlation.
 
     Background and noise are measured in the borders of the windows around the predicted positions. The noise
     of smoothed pixels, from which the detection threshold is derived, includes faint stars. The noise
@@ -455,8 +452,7 @@ def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
     mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
-    # The median noise of all windows is used for each window, because other stars or low counts can falsify
-    # the noise measured in one window.
+    # The median noise of all windows is used, because stars or low counts can falsify the noise of a window.
     common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]

@@ -14,9 +14,9 @@ motion in proportion to its row, is also fitted.
 
 A star has a position error of some pixels, regardless of its brightness, if its image does not agree with the
 model, for example a curved streak or the ring of a defocused lens. If the residuals show position errors from
-such images, a variance common to all stars is added to the noise, so that the sum of squares equals the
-number of degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without a common variance,
-the brightest stars would dominate the fit, and the covariance would be too small.
+images that do not agree with the model, a variance common to all stars is added to the noise, so that the sum
+of squares equals the number of degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without
+a common variance, the brightest stars would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ _MOST_STEPS = 8
 _SETTLED = 1e-11
 # Step (px) for the numerical derivative of a star's direction with respect to its image position.
 _STEP_PX = 0.5
-# Value of chi-square (2 degrees of freedom) that is exceeded with a probability of 0.1 %, and the median of
-# chi-square.
+# Chi-square (2 degrees of freedom) that is exceeded with a probability of 0.1 %, and median of chi-square.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
 # Residual (standard deviations) above which Huber's weights limit the influence of a star.
@@ -50,7 +49,7 @@ _LEAST_AGREEING = 4
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
 # Number of parameters of attitude and scale.
 _POSE = 4
-# Maximum number of times that the common variance is estimated and the agreeing stars are selected.
+# Maximum number of iterations that estimate the common variance and select the stars that agree with the fit.
 _AGREEMENT_ROUNDS = 3
 
 
@@ -83,7 +82,8 @@ class ImageFit:
     """The attitude and the quality of its fit.
 
     Attributes:
-        fix: attitude from the stars that agree; its covariance is increased if their residuals are too large.
+        fix: attitude from the stars that agree with each other; its covariance is increased if the residuals
+            are too large.
         scale: factor on the observed tangents x/z, y/z; 1 if the focal length was fixed.
         scale_sigma: relative standard deviation of the scale along the columns; 0 if it was fixed.
         bend: fitted lens errors (8,), see `sky_map`; zeros for an exact lens.
@@ -114,8 +114,8 @@ def fit_in_image(
 ) -> ImageFit:
     """Return the attitude that maps the star directions `reference` to the image positions `points`.
 
-    The positions (n, 2), px, have the covariances (n, 2, 2). The unit vectors (n, 3) are those of the
-    catalogue. The fit starts from the quaternion `start` (4,), reference to camera axes, and fits the
+    The positions (n, 2), px, have the covariances (n, 2, 2). The star directions are unit vectors (n, 3) from
+    the catalogue. The fit starts from the quaternion `start` (4,), reference to camera axes, and fits the
     `unknowns` together with the attitude. Raises AttitudeError if the stars do not determine the parameters.
     """
     # The array `slopes` (n, 3, 2) contains the derivatives of the directions with respect to the positions.
@@ -134,8 +134,8 @@ def fit_in_image(
     factor = inflation(squares[agree], seen.parameters(pose))
     if unknowns.scatter or factor > 1.0:
         other, shifted, more = _with_scatter(seen, pose, agree)
-        # Two explanations of the residuals of points are compared, and the more likely one is used. Either
-        # all variances are too small by a common factor, or a common variance must be added to all variances.
+        # Either all variances are too small by a common factor, or a common variance must be added to them.
+        # The more likely of the two explanations of the residuals is used.
         if unknowns.scatter or _surprise(other, shifted, more, 1.0) < _surprise(seen, pose, more, factor):
             seen, pose, agree = other, shifted, more
             squares = seen.squares(pose)
@@ -196,7 +196,7 @@ class _Seen:
         object.__setattr__(self, "before", np.append(self.unknowns.bend, np.ones(min(len(late), 1))))
 
     def parameters(self, pose: _FittedPose) -> float:
-        """Return the effective number of parameters that the stars determine instead of the prior."""
+        """Return the effective number of parameters that are determined by the stars and not by the prior."""
         before = self.before * np.diagonal(pose.covariance)[3 + int(self.unknowns.scale) :]
         return len(pose.covariance) - float(before.sum())
 
@@ -251,7 +251,7 @@ def _fitted_numpy(
     held: FloatArray,
     free_scale: bool,
 ) -> _Fitted:
-    """Return whether the stars agree, and the fitted matrix, scale, lens errors with delay, and covariance.
+    """Return whether the fit converged, the matrix, the scale, lens errors and delay, and the covariance.
 
     The fitted parameters are a rotation, ln scale if `free_scale` is true, some of the lens errors, and the
     delay if `late` is not empty. The array `held` contains the initial lens errors and delay, and `known`
@@ -285,8 +285,8 @@ def _normal(
 ) -> tuple[FloatArray, FloatArray]:
     """Return normal matrix (p, p) and gradient (p,) of the residuals, scaled to unit variance.
 
-    The p parameters are a rotation, ln scale if `scale` is true, the first lens errors (`bends` of the
-    eight), and the delay of the shutter if `late` is not empty.
+    The p parameters are a rotation, ln scale if `scale` is true, the first `bends` of the eight lens errors,
+    and the delay of the shutter if `late` is not empty.
     """
     slopes = [-whitener @ cross_matrices(predicted)]
     if scale:
@@ -478,8 +478,8 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
         squares = seen.squares(pose)
-    # A star agrees if its residual is within the scatter of the majority. If too few stars agree, all stars
-    # are used.
+    # A star agrees if its residual is within the scatter of the majority.
+    # All stars are used if too few stars agree.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
@@ -513,7 +513,7 @@ def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Se
 
 
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
-    """Return stars and fit after adding the common variance, px^2, of the stars that `agree` (n,)."""
+    """Return stars and fit with an added common variance, estimated from the stars in `agree` (n,)."""
     weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
     for _ in range(_SCATTER_ROUNDS):
         root = np.linalg.cholesky(seen.covariance[agree])
@@ -521,8 +521,7 @@ def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen,
         excess = float(np.sum(missed**2)) - (2 * len(missed) - seen.parameters(pose))
         if excess <= _EXPLAINED or len(missed) <= _LEAST_AGREEING:
             break
-        # The Newton step uses the derivative of chi-square with respect to the common variance, at constant
-        # pose.
+        # The Newton step differentiates chi-square with respect to the common variance, at constant pose.
         variance += excess / float(np.sum(np.linalg.solve(root.swapaxes(1, 2), missed[..., None]) ** 2))
         seen = replace(seen, covariance=own + variance * np.eye(2))
         pose = seen.fitted(pose, weight)
@@ -549,8 +548,8 @@ def attitude_by(
         points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
-    # At an angle a from the boresight, a pixel subtends an angle that is smaller by the factor cos^2 a along
-    # the radius and by cos a across the radius.
+    # At an angle a from the boresight, the angle of a pixel is proportional to cos^2 a along the radius.
+    # Across the radius, the angle of a pixel is proportional to cos a.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
     fix = solver(seen, reference[fit.agree], sigma)
     # The loss function of a solver is half of the sum of the stars' chi-squares.

@@ -48,8 +48,8 @@ _BRIGHTEST = 12
 _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
-# Limits of the longest side of a triangle, relative to the width of the field. The index contains larger
-# triangles only of bright stars, and the side ratios of smaller triangles are less accurate.
+# Limits of the longest side of a medium-sized triangle, relative to the width of the field.
+# Larger triangles are in the index only for bright stars; smaller ones have inaccurate side ratios.
 _MIDDLE_SIZES = 0.3, 0.75
 
 
@@ -59,7 +59,8 @@ class BatchSizes:
 
     Attributes:
         bright: number of triangles in each batch of only the brightest stars, which identify most frames.
-        spread: triangles in each batch that includes faint stars, if the brightest points are not stars.
+        spread: number of triangles in each batch that includes faint stars, for frames whose brightest points
+            are not stars.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -90,7 +91,8 @@ def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
     """Return batches of triangles (t, 3) of bright and faint stars.
 
     The last batch also includes triangles of neighbouring stars if the field has more than `_MOST_STARS`
-    points, or more than `_BRIGHTEST` points of unknown magnitude. Mirror images have the same batches.
+    points, or more than `_BRIGHTEST` points of unknown magnitude. A field and its mirror image have the same
+    batches.
     """
     batches = np.split(middle_sized(field, sum(sizes.spread)), np.cumsum(sizes.spread)[:-1])
     if len(field) > (_BRIGHTEST if field.magnitude is None else _MOST_STARS):
@@ -102,7 +104,7 @@ def middle_sized(field: StarField, most: int) -> IntArray:
     """Return up to `most` medium-sized triangles (t, 3) of the brightest stars, in a random order."""
     triangles = triples(min(len(field), _MOST_STARS), shuffled=True)
     direction = field.direction[:_MOST_STARS]
-    # The chord between two stars follows from their cosine, and the longest side from the least cosine.
+    # The longest side of a triangle is the pair of stars whose directions have the smallest cosine.
     cosine = (direction @ direction.T).ravel()
     shortest, longest = (2.0 * max(field.half_width) * size for size in _MIDDLE_SIZES)
     found = [triangles[:0]]
@@ -179,15 +181,14 @@ class TriangleMatches:
 
 
 _BINS_PER_LN_SCALE = 15.0
-# Factors of a multiplicative hash. Factors below 2^31 ensure that products of 32-bit numbers fit into 64
-# bits.
+# Factors of a multiplicative hash. They are below 2^31, so that products fit into 64 bits.
 _OF_STAR, _OF_PAIR, _OF_CODE = 1021, 257, 1_640_531_527
 
 
 def _codes(
     observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16], scale: FloatArray, lowest: float
 ) -> npt.NDArray[np.uint32]:
-    """Return the hash codes (k, 3) of the pairs in k matches; pairs are equal if their scale is similar."""
+    """Return hash codes (k, 3) of the pairs in k matches; equal pairs of similar scale have equal codes."""
     bins = (np.log(scale / lowest) * _BINS_PER_LN_SCALE).astype(np.uint32)
     pair = star.astype(np.uint32) * np.uint32(_OF_STAR) + observed
     return np.asarray((pair * np.uint32(_OF_PAIR) + bins[:, None]) * np.uint32(_OF_CODE))
@@ -197,8 +198,8 @@ def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
     """Return the votes (k,) for each of k matches of triangles.
 
     The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
-    contain the pair. The votes of a match are the sum of the votes of its three pairs. Two pairs rarely have
-    the same first bits of their codes by chance. If they do, their votes are added.
+    contain the pair. The votes of a match are the sum of the votes of its three pairs. In rare cases,
+    different pairs have the same first bits of their codes, and their votes are added.
     """
     bits = max(13, code.size.bit_length())
     slot = code >> np.uint32(32 - bits)
@@ -216,9 +217,9 @@ def look_up(
 ) -> tuple[TriangleMatches, int]:
     """Return the matches of observed triangles in the index, and the number of index entries read.
 
-    The corners of each triangle are `triangles` (t, 3). The tolerance of a side ratio is in standard
-    deviations, with an additional error due to `distortion` of the lens. At most `most` index entries are
-    read, in the order of the observed triangles.
+    The array `triangles` (t, 3) contains the indices of the observed stars at the corners of each triangle.
+    The tolerance of a side ratio is in standard deviations, with an additional error due to `distortion` of
+    the lens. At most `most` index entries are read, in the order of the observed triangles.
     """
     observed, star, scale, code, read = _look_up(
         np.ascontiguousarray(field.direction),
@@ -280,8 +281,7 @@ def _look_up_numpy(
     place = places[entry].view(np.uint8).reshape(-1, 2)
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
-        # Differences of unsigned bytes wrap around, so that positions below the lowest position do not pass
-        # the test.
+        # Differences of unsigned bytes wrap around, so that positions below the lowest position are excluded.
         near &= place[:, column] - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
@@ -389,7 +389,7 @@ def _matching_entries(
     places: npt.NDArray[np.uint16],
     layout: IntArray,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Return those of the `total` index entries in `runs` that match (k,), and their triangles (k,)."""
+    """Return the index entries (k,) that match, among the `total` entries in `runs`, and their triangles."""
     entry, query = np.empty(total + 8, dtype=np.int32), np.empty(total + 8, dtype=np.int32)
     found, sizes, most = 0, 1 << layout[2], 0
     for run in range(len(runs)):
@@ -401,8 +401,8 @@ def _matching_entries(
         begin, end, low, high, lower, upper, triangle = runs[run]
         if begin == end:
             continue
-        # All entries of a range are in the same cells. Entries before and after the range are excluded by the
-        # length of the longest side.
+        # All entries of a range are in the same cells.
+        # Entries outside the range are excluded by the length of their longest side.
         form = np.int64(key[begin]) & ~(sizes - 1)
         shortest = form + min(math.ceil(limits[triangle, 0] * sizes), sizes - 1)
         longest = form + min(math.floor(limits[triangle, 1] * sizes), sizes - 1)
@@ -484,7 +484,7 @@ def _at_scales(direction: FloatArray, scales: FloatArray) -> FloatArray:
 
 @loop_helper
 def _sorted_sides(seen: FloatArray, triangle: IntArray, side: FloatArray, corner: IntArray) -> int:
-    """Write sorted sides and their opposite corners; return 1 if the corners run to the left, otherwise 0."""
+    """Write sorted sides and their opposite corners; return 1 if their orientation is left, otherwise 0."""
     for c in range(3):
         one, two = triangle[(c + 1) % 3], triangle[(c + 2) % 3]
         cosine = seen[one, 0] * seen[two, 0] + seen[one, 1] * seen[two, 1] + seen[one, 2] * seen[two, 2]
@@ -513,8 +513,8 @@ def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) 
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position in a cell within `slack` of each ratio, and the number of higher ones."""
-    # Positions within a cell are in units of 1 / FINE of its width, and refer to the middle of such a unit.
+    """Return the lowest position in a cell within `slack` of each ratio, and the range of positions."""
+    # Positions within a cell are in units of 1 / FINE of its width, and refer to the middle of a unit.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
     reach = slack * (CELLS * FINE) + 0.5
     lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
@@ -568,7 +568,7 @@ def _runs(
     spans = high - low
     widest = int(spans.max(initial=0)) + 1
     here = np.arange(widest) <= spans[:, :, None]
-    # The ranges are in the order of the triangles, so that the ranges of the first triangles are read first.
+    # The ranges are sorted by observed triangle, because only the first ranges are read.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     short = low[query, 0] + along_short
     middle = low[query, 1] + along_middle
@@ -589,7 +589,7 @@ class IdentificationSettings:
         batches: numbers of observed triangles to look up in each batch.
         work: maximum number of index entries to read.
         verified: maximum number of candidate attitudes to verify after each batch of triangles.
-        mirror: whether the mirrored field is searched for as well.
+        mirror: whether the mirrored field is tried if the field itself is not identified.
         hint_error: factor by which a narrow range of scales is extended at both ends if no match is found; 1
             for no extension. The range (1, 1) of a calibrated camera is never extended.
         verification: settings of the verification of candidates.
@@ -605,8 +605,8 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor on the tolerance and on the number of verified candidates for triangles that include faint stars. The
-# factor is below 1, because many true triangles vote for the same stars.
+# Factor on the tolerance and on the number of verified candidates for triangles that include faint stars.
+# The factor is below 1, because many true triangles vote for the same pairs.
 _OF_SPREAD = 0.6
 # Number of matches with the most votes that are considered for each candidate to be verified.
 _RANKED = 8
@@ -842,7 +842,7 @@ def _into_frame(corners: FloatArray) -> None:
 
 
 def _frame(corners: FloatArray) -> FloatArray:
-    """Return the axes, as rows (3, 3), of a frame fixed to three unit vectors, the first to their centre."""
+    """Return the axes (rows of (3, 3)) of a frame fixed to three unit vectors; the first is their mean."""
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
     mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz
     norm = math.sqrt(mx * mx + my * my + mz * mz)

@@ -2,10 +2,10 @@
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
 frame from these fits. `measure` fits each star with the PSF of the frame, or computes a centroid in a window
-whose border is subtracted (Michalski, eq. (12) to (21)). A window with the side length a (px) ends at column
-x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts eq.
-(16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
-corrected here (errata).
+after subtraction of the mean of the window's border (Michalski, eq. (12) to (21)). A window with the side
+length a (px) ends at column x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel
+later, which contradicts eq. (16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM
+instead of y_CM, and is corrected here (errata).
 
 Three other centroid methods start from the centre of mass and weight the pixels. `weighted` weights each
 pixel with its own counts (Michalski, reference [22]; most CubeSat star trackers use this method). `iterative`
@@ -46,9 +46,8 @@ LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
 """Half-width of a star's window (PSF standard deviations), limited to `LEAST_HALF` to `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts. The
-# mismatch is smaller than in the first fit, because a large mismatch would give weight only to the wings of
-# bright stars.
+# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
+# A mismatch as large as in the first fit would give weight only to the wings of bright stars.
 _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
@@ -99,8 +98,7 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # The errors of the widths include the deviations from a Gaussian that the noise model of the first fit
-    # assumes.
+    # The errors of the widths include the mismatch between PSF and Gaussian in the first noise model.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
@@ -193,7 +191,7 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 Centroid = tuple[FloatArray, FloatArray]
-"""Type of centroids (n, 2), px, from the window's middle, and their derivatives (n, 2, m, m), px/count."""
+"""Type of centroids (n, 2), px, relative to the window's middle, and derivatives (n, 2, m, m), px/count."""
 
 _ROUNDS = 12
 _STANDS_OUT = 3.0
@@ -217,7 +215,7 @@ def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Ce
 
 
 def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: float) -> Centroid:
-    """Return centroids with a Gaussian weight that is centred on the last centroid in each iteration.
+    """Return centroids with a Gaussian weight that is centred on the previous centroid in each iteration.
 
     The iteration starts from the centre of mass `start`.
     """
@@ -227,8 +225,8 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # The variable `gain` is the derivative of the weighted sum with respect to the position of the
-        # weight, which is about half of the sum.
+        # The variable `gain` is minus the derivative of the weighted moment by the weight's position.
+        # For a star with the same width as the weight, it is half of the weighted sum of counts.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -250,8 +248,7 @@ def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float)
     columns = np.stack([np.ones_like(x), x, y, -(x * x + y * y)], axis=1).reshape(len(clean), 4, -1)
     weighed = columns * weight.reshape(len(clean), 1, -1)
     normal = weighed @ columns.transpose(0, 2, 1) + 1e-12 * np.eye(4)
-    # The array `moved` contains the derivatives of the four unknowns with respect to the logarithm of each
-    # pixel's count.
+    # The array `moved` contains the derivatives of the four unknowns with respect to ln(counts).
     moved = np.linalg.solve(normal, weighed)
     found = np.sum(moved * np.log(light).reshape(len(clean), 1, -1), axis=2)
     bend = np.where(found[:, 3] > 0.0, found[:, 3], np.inf)
@@ -304,7 +301,7 @@ class WindowCentroids:
 def centre_of_mass(
     windows: StarWindows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
 ) -> WindowCentroids:
-    """Return the centroids in windows from one of `METHODS` or the centre of mass.
+    """Return the centroids in windows by one of `METHODS`, or the centres of mass.
 
     The centre of mass follows Michalski, eq. (12) to (20). Pixels outside the frame count as zero.
     """
@@ -314,8 +311,7 @@ def centre_of_mass(
     variance = noise.variance(inner - sky[:, None, None], windows.noise)
     offset, slopes = _places(windows.light, variance, psf_sigma, method)
     both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
-    # The noise of the sky level, which is the mean over the border of the window, causes noise of the
-    # centroid.
+    # The sky level is the mean over the border of the window, and its noise causes noise of the centroid.
     border = windows.noise**2 / (8.0 * half)
     area = float(inner[0].size) if len(inner) else 1.0
     both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
@@ -364,8 +360,7 @@ def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
 
 _BLEND_ROUNDS = 5
 _STEPS, _STEPS_SATURATED = 3, 12
-# Minimum standard deviation (px) of a position, for differences between pixels and a PSF that is not
-# Gaussian.
+# Minimum standard deviation (px) of a position, because pixels differ and the PSF is not Gaussian.
 _FLOOR = 0.002
 
 

@@ -125,8 +125,7 @@ class StarTargets:
         return len(self.middle)
 
 
-# Length (px) below which a star's path is treated as a point; a path of this length widens a PSF of 1 px by
-# 0.2 %.
+# Length (px) of a star's path below which it is treated as a point. It widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
 # Number of quadrature nodes, for an error of 0.1 % of the flux on paths of four PSF widths.
 _NODES = 4
@@ -237,8 +236,7 @@ def _noise_terms_numpy(
     for _ in range(_ROUNDS):
         expected = floor + photon * m + square * m * m
         weight = 1.0 / expected**2
-        # Residuals beyond 5 standard deviations are ignored, because neighbouring stars or hot pixels cause
-        # them.
+        # Residuals beyond 5 standard deviations, due to neighbouring stars or hot pixels, are ignored.
         weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
         of_square, of_both, of_light = (float(np.sum(weight * m**power)) for power in (4, 3, 2))
         along, across = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
@@ -285,7 +283,7 @@ def _shared_mismatch(
 ) -> float:
     """Return the mismatch of PSF and Gaussian for known photon noise, as a weighted median over the stars.
 
-    The median is used: a wrong PSF affects all stars, but the light of neighbours only a few stars.
+    A median is used because a wrong PSF affects all stars, whereas neighbouring stars affect only a few.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
@@ -325,7 +323,7 @@ def _non_negative(
 
 X, Y, FLUX, SKY, WIDTH = range(5)
 NARROWEST, WIDEST = 0.25, 6.0
-# Maximum steps of position and width (px), by which a fit converges even from an initial error of 1 px.
+# Maximum steps of position and width (px), with which a fit converges even from an initial error of 1 px.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
 # Residual (standard deviations) above which a pixel is excluded in the last steps, and number of last steps.

@@ -32,7 +32,7 @@ from knightcube.vision.startracker.attitude_fit import scale_slope
 def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
     """Return the apparent directions (n, 3) of stars for a camera with a velocity (3,), m/s, as unit vectors.
 
-    The velocity is barycentric. Raises ValueError unless it is finite and below the speed of light.
+    The velocity is barycentric. Raises ValueError unless the velocity is finite and below the speed of light.
     """
     beta = np.asarray(velocity, dtype=float) / SPEED_OF_LIGHT
     square = float(beta @ beta)
@@ -46,12 +46,11 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 BENDS, ASPECT = 8, 6
 """Number of lens errors in the vector `bend`, and index of the aspect."""
-# The value of `_TILT` is the standard deviation of the tilt of a typical lens, relative to the corner's
-# tangent (20 px of 1024 px). The values of `_DISTORTION` are the standard deviations of the two distortion
-# terms of a typical lens at the image corner (3 % and 1 %).
+# Standard deviation of the tilt of a typical lens, relative to the corner's tangent (20 px of 1024 px).
+# Standard deviations of the two distortion terms of a typical lens at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 _DECENTRING = 0.004
-"""Prior standard deviation of a corner's displacement by decentring, relative to the corner's distance."""
+"""Prior standard deviation of the image corner's displacement by decentring, as a fraction of its radius."""
 _ASPECT = 0.01
 """Prior standard deviation of aspect and shear; 0.01 changes the ratio of width to height by 2 %."""
 
@@ -202,8 +201,7 @@ class SkyMap:
         """Return the ICRS directions of pixels (n, 2), as unit vectors (n, 3)."""
         rays = self.camera.unit_vectors(self._exchanged(points))
         seen = bent(rays, self.bend) @ attitude_matrix(self.quaternion)
-        # The inverse of the aberration is the aberration for the opposite velocity, accurate to (v/c)^2 or
-        # 0.002".
+        # The aberration for the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:

@@ -7,9 +7,9 @@ one, and then in the whole sky. The resulting attitude is that at mid-exposure.
 During an exposure at a constant rate, the middle of a streak is the position of the star at mid-exposure.
 During an exposure of length T, an angular acceleration a displaces the centroid of a point by a T^2 / 24, and
 the midpoint between the two ends of a streak by a T^2 / 8. If the fit of a streak includes the acceleration,
-only terms of higher order in time displace the position. White angular acceleration of density q adds a
-variance of q T^3 / 320 to the position of a point, of q T^3 / 48 to the midpoint of a streak's ends, and of q
-T^3 / 4743 to a fit that includes the acceleration.
+only terms of higher order in time displace the position. A white-noise angular acceleration of spectral
+density q adds a variance of q T^3 / 320 to the position of a point, of q T^3 / 48 to the midpoint of a
+streak's ends, and of q T^3 / 4743 to a fit that includes the acceleration.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class FrameSolution:
         fix: attitude from ICRS to camera axes and its covariance; the quaternion's scalar is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 if the focal length was given.
         bend: fitted lens errors (8,), see `sky_map`; zeros if the lens is exact.
-        log10_false_alarm: log10 of the probability that a frame of random points would be solved as well.
+        log10_false_alarm: log10 of the probability that a frame of random points would match equally well.
         tracked: whether the stars were identified by a search near the prior attitude.
         motion: motion of the camera from the streaks, camera frame, or None for points.
         mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
@@ -128,8 +128,10 @@ class Weighting:
     """Weights that express the attitude measured in a frame as a mean of the attitudes during the exposure.
 
     Attributes:
-        weights: weights of the rotations since mid-exposure at `NODES`; mid-exposure has one minus their sum.
-        noise_share: variance due to white angular acceleration, per density times exposure time cubed.
+        weights: weights of the rotations since mid-exposure at `NODES`; the weight of mid-exposure is one
+            minus their sum.
+        noise_share: variance due to white angular acceleration, divided by its spectral density and by the
+            cube of the exposure time.
     """
 
     weights: tuple[float, float, float, float]
@@ -190,11 +192,9 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
 _LEAST_SIGMA_PX = 0.005
 # Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
 _COLOUR_PX = 0.002
-# Ratio of the centroid error common to all stars to the excess width of the PSF (from the campaign
-# `resting`).
+# Common centroid error of all stars, relative to the excess width of the PSF (from the campaign `resting`).
 _SHAPE_DOUBT = 0.05
-# Chi-square per degree of freedom above which the star positions contradict their uncertainties, if it is
-# significant.
+# Significant chi-square per degree of freedom above which the positions contradict their uncertainties.
 _CONTRADICTED = 1.5
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
 # The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
@@ -209,9 +209,9 @@ _LEAST_SIGNIFICANCE = 5.0
 _PLACELESS_PX = 5.0
 # Distance (px) below which a point may be a part of the same star as a matched point.
 _SPLIT_PX = 10.0
-# Thresholds for the number of points near matched points above which each star is assumed to be imaged as
-# several points. The number of points must exceed the number expected by chance by the first value times its
-# standard deviation plus the second value times the number of matched points.
+# Stars are assumed to be imaged as several points each if too many points are near matched points.
+# The first limit is in standard deviations of the number of points expected by chance.
+# The second limit is a fraction of the matched points; the sum of both limits must be exceeded.
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference from the prior attitude (1 false rejection in 100,000 frames).
 _NEAR = 25.9
@@ -411,8 +411,7 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
         return solution
     measured = float(np.median(width))
     doubt = _SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
-    # The measured width includes the averaging over a pixel, and the variance of a pixel is subtracted to
-    # obtain the width of the point spread.
+    # The measured width includes the averaging over a pixel, whose variance is subtracted.
     psf_sigma = math.sqrt(max(measured**2 - PIXEL_VARIANCE, 0.0))
     return replace(solution, psf_sigma=psf_sigma).wider(np.diag([doubt**2, doubt**2, 0.0]))
 
@@ -468,8 +467,8 @@ def star_field(
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
-    # At an angle a from the boresight, a pixel subtends an angle that is smaller by the factor cos^2 a along
-    # the radius and by cos a across the radius.
+    # At an angle a from the boresight, the angle of a pixel is proportional to cos^2 a along the radius.
+    # Across the radius, the angle of a pixel is proportional to cos a.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     magnitude = None if flux is None else -2.5 * np.log10(flux)
@@ -536,11 +535,11 @@ def _with_attitude(
 
 
 def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
-    """Return why an attitude is rejected because of too large residuals of the points, or an empty string.
+    """Return the reason to reject an attitude whose points have too large residuals, or an empty string.
 
     If the positions are wrong, for example because a defocused lens images stars as rings, only points that
     are within the gate by chance match. If fewer than half of the points match, the matching points may be
-    only those that lie near stars by chance. Their residuals do not show the error.
+    only those that lie near stars by chance. The residuals of matches by chance do not show the error.
     """
     count, agreeing = len(seen.points), int(np.count_nonzero(fit.agree))
     if seen.kind is not FrameKind.POINTS or 2 * agreeing >= count or fit.excess < _CONTRADICTED:
@@ -567,7 +566,7 @@ def _split_doubt(seen: FrameSolution, chosen: IntArray) -> FloatArray:
     chance = apart[..., 0].size * math.pi * _SPLIT_PX**2 / (seen.camera.columns * seen.camera.rows)
     if len(parts) > chance + _SPLIT_SIGMAS * math.sqrt(chance) + _SPLIT_SHARE * len(chosen):
         half = np.einsum("ni,nj->ij", parts, parts) / (4.0 * len(parts) * seen.camera.focal_length**2)
-        # A shift of the image along x is a rotation about y, and a shift along y one about -x.
+        # A shift of the image along x is a rotation about y, and a shift along y is a rotation about -x.
         doubt[:2, :2] = ((half[1, 1], -half[0, 1]), (-half[0, 1], half[0, 0]))
     return doubt
 
@@ -577,8 +576,7 @@ def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
     camera = camera.rescaled(1.0 / found.scale)
     if found.distortion == 0.0 or not isinstance(camera, Pinhole):
         return camera
-    # The coefficient `distortion` applies to tangents divided by the tangent at the image corner, whereas k1
-    # applies to undivided tangents.
+    # Unlike k1, the coefficient `distortion` applies to tangents divided by the image corner's tangent.
     corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
     try:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)

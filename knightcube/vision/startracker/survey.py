@@ -44,11 +44,9 @@ _BAND = 32
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
-# Ratio of the noise of a sum of pixels to the value without correlation, below which correlation is
-# neglected.
+# Noise of a sum of pixels, relative to its value without correlation, below which correlation is neglected.
 _CORRELATED = 1.05
-# Ratio of the lower tail of the noise to two standard deviations below which the noise is clipped at zero
-# counts.
+# Ratio of the lower noise tail to two standard deviations below which noise is clipped at zero counts.
 _CUT_OFF = 0.8
 # Noise (counts) below which quantisation prevents a measurement of the noise.
 _HIDDEN = 0.5
@@ -154,8 +152,8 @@ def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackgroun
     tail, cut_off = _tails(lone, single.level, single.noise)
     smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
     noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
-    # Faint stars widen the upper tail of the noise distribution, but do not increase the noise of star
-    # positions. The noise is increased by the upper tail only if the lower tail is clipped at zero counts.
+    # Faint stars widen the upper tail of the noise distribution, but not the noise of star positions.
+    # The upper tail increases the noise only if the lower tail is clipped at zero counts.
     own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return SkyBackground(
         level,
@@ -205,17 +203,17 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
     """Return rows and columns of the hot pixels of a frame (rows, columns), as `find_hot_pixels` does.
 
     Only the pixels that exceed the lowest threshold of the surrounding blocks are tested, so that the
-    background is not interpolated at every pixel. The result is empty if at most `most` pixels do.
+    background is not interpolated at every pixel. The result is empty if at most `most` pixels exceed the
+    lowest threshold.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
     columns = pixels.shape[1]
-    # Between block centres, level and noise are interpolated with those of the adjacent blocks.
+    # Level and noise are interpolated between the centres of adjacent blocks.
     limit = background.level + HOT_SIGMAS * background.noise
     lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
     if np.issubdtype(pixels.dtype, np.integer):
-        # Integer pixels are compared with an integer threshold, which is four times as fast as in floating
-        # point.
+        # A comparison with an integer threshold is four times as fast as in floating point.
         lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
     lowest = lowest.astype(pixels.dtype)
     row, column = np.divmod(_bright_indices(np.ascontiguousarray(pixels), lowest), columns)
@@ -294,8 +292,7 @@ def _smoothed_above_numpy(
         np.add(once[:-1], once[1:], out=twice)
         np.add(twice[:, :-1], twice[:, 1:], out=wide)
         np.add(wide[:, :-1], wide[:, 1:], out=smooth)
-        # A band of rows lies between the centres of a few rows of blocks, and the weights of all other blocks
-        # are zero.
+        # Only a few rows of blocks have weights that are not zero in a band of rows.
         weight = down[first : first + count]
         near = np.flatnonzero(weight.any(axis=0))
         np.matmul(weight[:, near], across[near], out=bound)
@@ -402,10 +399,10 @@ class DetectionSettings:
         most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame's area
             contributes at most a quarter of `most_stars`.
         psf_sigma: standard deviation of the PSF, px. If `psf_sigma` is None, it is measured in the frame,
-            which needs several stars. For tracking windows with few stars, it should be stated.
+            which needs several stars. For tracking windows with few stars, `psf_sigma` should be stated.
         gain: electrons per count, or None to measure the gain from the residuals of the stars.
         saturation: counts at which a pixel saturates. If `saturation` is None, the frame saturates at its
-            highest count if several pixels have it, otherwise at the maximum of the integer type.
+            highest count if several pixels have that count, otherwise at the maximum of the integer type.
         window: side length of the centroid window, px, an odd number (a_ROI in Michalski, eq. (12) to (15)).
         search_radius: radius around a predicted position in which `measure_near` searches, px.
     """
@@ -574,8 +571,7 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Maximum median sine of the angle between streaks and image flow. Lines of a foreground have larger angles to
-# the image flow than streaks.
+# Maximum median sine of the angle between streaks and image flow, which lines of a foreground exceed.
 _CROOKED = 0.12
 
 

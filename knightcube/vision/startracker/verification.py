@@ -11,8 +11,8 @@ which gate, brightness limit and test are chosen (Bonferroni).
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
 all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
 distance is within the uncertainty of the prior. The largest set of pairs with a common displacement is used
-to refine the attitude. The refined attitude is verified with the whole field as in lost in space, except that
-only attitudes near the prior count as searched.
+to refine the attitude. The refined attitude is verified with the whole field as for an identification without
+a prior, except that only attitudes near the prior count as searched.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Chance:
 
 
 def order_probability(sequence: Sequence[int]) -> float:
-    """Return the probability that a random order has at most the inversions of `sequence` (Kendall's tau)."""
+    """Return the probability that a random order has no more inversions than `sequence` (Kendall's tau)."""
     inversions = sum(a > b for place, a in enumerate(sequence) for b in sequence[place + 1 :])
     counts = _inversion_counts(len(sequence))
     return sum(counts[: inversions + 1]) / math.factorial(len(sequence))
@@ -169,13 +169,11 @@ class _Matching:
 
 # Fraction of bright expected stars with a match below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
-# Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match. The second
-# value is the radius of the search for nearby stars, relative to the image corner's tangent. A larger
-# fraction of displaced stars indicates a wrong fit of the lens, because a foreground hides stars but does not
-# displace them.
+# Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
+# The second value is the radius of the search for nearby stars, relative to the image corner's tangent.
+# A larger fraction indicates a wrong fit of the lens: a foreground hides stars but does not displace them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Log10 of the ratio of the expected number of chance matches to its limit above which a candidate is rejected
-# without refinement.
+# Factor (log10) between the chance matches of a candidate that is rejected without refinement and the limit.
 _HOPELESS = 7.0
 
 
@@ -190,7 +188,7 @@ def verify(
     """Return the identification of the whole field, or NO_MATCH if the candidate may be a chance match.
 
     The candidate has an attitude matrix (3, 3), ICRS to camera, accurate enough for stars to match, and an
-    image scale. The search covered the fraction `searched` of all attitudes, 1 for lost in space.
+    image scale. The search covered the fraction `searched` of all attitudes, 1 if there is no prior attitude.
     """
     return verify_first(field, sky, matrix[None], np.array([scale]), searched, settings)
 
@@ -244,8 +242,7 @@ def _verified(field: StarField, matching: _Matcher, first: _Matching, start: Ref
             return nothing(field)
     found, refined = decided
     expected = found.expected
-    # The distortion of an uncalibrated lens is fitted if bright stars do not match or if residuals are too
-    # large.
+    # The distortion of an uncalibrated lens is fitted if bright stars do not match or residuals are large.
     bright = _bright_matched(expected, found.star)
     missed = not bright or sum(bright) < _FEW_MISSED * len(bright)
     widened = refined.widened()
@@ -476,7 +473,7 @@ def _first_match_numpy(
 def _pair_numpy(
     seen: FloatArray, variance: FloatArray, matrix: FloatArray, guide: FloatArray
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Return each star's nearest guide star and squared distance, infinite if another star is nearer."""
+    """Return each star's nearest guide star and squared distance, infinite if not mutually nearest."""
     cosines = seen @ (matrix @ guide.T)
     nearest = cosines.argmax(axis=1)
     rows = np.arange(len(nearest))
@@ -685,7 +682,7 @@ def _best_gate(
     fields: float,
     scales: float,
 ) -> tuple[float, float]:
-    """Return the most significant gate, 0 below `least` stars, and log10 of the chance matches."""
+    """Return the most significant gate, or 0 if too few stars match, and log10 of the chance matches."""
     best, bound, matched = 0.0, math.inf, least - 1
     for gate in gates:
         within, rank = _within(squared, nearest, gate)
@@ -719,7 +716,7 @@ def _log10_chance(
     least: int,
     enough: float,
 ) -> float:
-    """Return what `Chance.log10` returns, for matched stars (k,) in ascending order of their `ranks`."""
+    """Return the value of `Chance.log10` for matched stars (k,) in ascending order of their `ranks`."""
     best = math.inf
     for matched in range(len(stars), least - 1, -1):
         expected = ranks[matched - 1] + 1
@@ -745,14 +742,13 @@ def _log10_chance(
 
 @loop_helper
 def _share_ordered(sequence: IntArray, length: int) -> float:
-    """Return what `order_probability` returns for the first `length` elements."""
+    """Return the value of `order_probability` for the first `length` elements of `sequence`."""
     inversions = 0
     for place in range(length):
         for other in range(place + 1, length):
             if sequence[place] > sequence[other]:
                 inversions += 1
-    # Each further item increases the number of inversions by 0 to `more`, and the number of permutations by a
-    # factor.
+    # The item with the index `more` adds 0 to `more` inversions, with equal probability.
     share = np.zeros(length * (length - 1) // 2 + 1)
     share[0] = 1.0
     for more in range(1, length):
@@ -781,10 +777,10 @@ def _identified(field: StarField, matching: _Matching, refined: Refinement) -> S
 
 
 PRIOR_SIGMAS = 4.0
-"""Largest error of a prior attitude that the search near it covers, in standard deviations."""
+"""Largest error of a prior attitude that a search near the prior covers, in standard deviations."""
 _BRIGHTEST = 16
-# Maximum number of pairs of an observed and a predicted star. If more pairs were compared, the comparison
-# would be ambiguous and would take longer than a search of the whole sky.
+# Maximum number of pairs of an observed and a predicted star.
+# A comparison of more pairs would be ambiguous and slower than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 
@@ -849,7 +845,7 @@ def _same_shift(
     apart = shifts[:, None, :] - shifts
     tolerance = 4.0 * star_sigma + (PRIOR_SIGMAS * sigma + stretch) * radius
     agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
-    # Two pairs of stars with the same observed star or guide star do not count as agreeing.
+    # Two matches that contain the same observed star or the same guide star do not count as agreeing.
     agree &= (one[:, None] != one) & (two[:, None] != two)
     best = int(agree.sum(axis=1).argmax())
     members = np.append(np.flatnonzero(agree[best]), best)

@@ -11,20 +11,20 @@ applied up to the epoch of observation. Stars that an image cannot resolve are m
 centroid, with their combined magnitude. Aberration depends on the velocity of the camera; it is applied to
 the matched directions on board.
 
-The index contains only triangles of stars that are bright relative to the size of the triangle. The distance
-from a star to the `rank`-th nearest of all brighter stars is called the reach of the star. The index contains
-a triangle if its longest side is at most the reach of each of its three stars. Each star of the triangle is
-then one of the `rank` brightest stars in the circle around the star with the longest side as radius. About
-the same number of triangles of the brightest stars is therefore found in frames of any field of view, and in
-dense as in sparse regions of the sky. Near a cluster of bright stars, the reach of all stars is so short that
-there would be too few triangles. The sky is therefore also covered by circles of several radii, and the
-triangles of the `few` brightest stars of each circle are added to the index.
+The index contains only triangles whose stars are among the brightest in a circle of the triangle's size. The
+distance from a star to the `rank`-th nearest of all brighter stars is called the reach of the star. The index
+contains a triangle if its longest side is at most the reach of each of its three stars. Each star of a
+triangle in the index is therefore one of the `rank` brightest stars in the circle around the star with the
+longest side as radius. Frames of any field of view, in dense and in sparse regions of the sky, therefore
+contain about the same number of triangles that are in the index. Near a cluster of bright stars, the reach of
+all stars is so short that there would be too few triangles. The sky is therefore also covered by circles of
+several radii, and the triangles of the `few` brightest stars of each circle are added to the index.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of the orientation (left
 or right) of its corners, ordered by the lengths of the opposite sides, of the ratios of the shortest and of
-the middle side to the longest side, rounded down to cells of width `CELL`, and of the length of the longest
-side. In the sorted list of keys, the triangles with the same first and second part and with a longest side
-between two limits are contiguous.
+the middle side to the longest side, rounded down to multiples of `CELL`, and of the length of the longest
+side. In the sorted list of keys, the triangles with the same orientation, the same rounded side ratios and a
+longest side between two limits are contiguous.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def choose_guide_stars(
 ) -> GuideStars:
     """Return the guide stars with V magnitudes below `faintest`, for the Julian year `epoch`.
 
-    Stars closer together than `resolution`, rad, are merged, also in chains of several stars. Raises
+    Stars closer together than `resolution`, rad, are merged; a chain of close stars becomes one star. Raises
     ValueError if `epoch` is not finite.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
@@ -178,8 +178,8 @@ def choose_guide_stars(
     centre = np.stack(
         [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
     )
-    # The number of a group is the index of its first member, which is its brightest star because the
-    # catalogue is sorted by magnitude.
+    # The catalogue is sorted by magnitude.
+    # The number of a group is the index of its first and brightest star.
     first = np.flatnonzero(group == np.arange(len(catalogue)))
     magnitude = -2.5 * np.log10(joint[first])
     seen = np.flatnonzero(magnitude < faintest)
@@ -190,7 +190,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the lowest star index (count,) of each star's group; groups are connected by `pairs` (p, 2)."""
+    """Return the lowest star index in each star's group (count,); `pairs` (p, 2) of stars form groups."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -203,7 +203,7 @@ def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
 
 CELLS = 80
 CELL = 1.0 / CELLS
-"""Width of the cells into which the ratios of a triangle's sides, from 0 to 1, are divided."""
+"""Width of the cells (bins) of a triangle's side ratios, which are between 0 and 1."""
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
@@ -212,12 +212,11 @@ SIZE_UNIT = 2.0**-SIZE_BITS
 The longest side is a chord of the unit sphere and is below 1.
 """
 RUN_BITS = 12
-"""Binary logarithm of the interval between the key values of two entries of `TriangleIndex.below`."""
-# Number of boxes along each axis of the cube around the unit sphere, which is divided to find stars by
-# direction.
+"""Binary logarithm of the interval between the key values of consecutive entries of `TriangleIndex.below`."""
+# Number of boxes along each axis into which the cube around the unit sphere is divided for star searches.
 _BOXES = 20
 TIE = 1e-9
-"""Relative tolerance in comparisons of a triangle's side with a limit, because the two may be equal."""
+"""Relative tolerance for rounding errors in comparisons of a triangle's side with a limit."""
 LEAST_RATIO = 0.1
 """Minimum ratio of the shortest to the longest side of a triangle. Flatter triangles are not distinctive."""
 
@@ -226,8 +225,7 @@ LEAST_RATIO = 0.1
 _CIRCLES_APART = 0.7
 # Mean number of stars per circle in the first search, relative to the number of stars needed.
 _ENOUGH = 4.0
-# Mean number of stars within the distance `least` of a star in the fast comparison of the function `reach`,
-# as a multiple of `rank`.
+# Mean number of stars within `least` of a star in the first comparison of `reach`, as a multiple of `rank`.
 _BRIGHTER = 2.0
 
 
@@ -238,7 +236,8 @@ class TriangleIndex:
     Attributes:
         key: key of each triangle (m,), uint32, from orientation, cell of the side ratios, and longest side.
         corners: indices of the guide stars opposite the shortest, middle and longest side (m, 3), uint16.
-        shape: positions of each triangle's two side ratios within their cells (m, 2), uint8.
+        shape: positions of each triangle's two side ratios within their cells (m, 2), uint8, in 1/256 of a
+            cell.
     """
 
     key: npt.NDArray[np.uint32]
@@ -250,7 +249,7 @@ class TriangleIndex:
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """The number of keys below each multiple of 2^RUN_BITS (f,), by which keys are looked up."""
+        """The number of keys below each multiple of 2^RUN_BITS (f,), for a fast search of keys."""
         run = self.key >> np.uint32(RUN_BITS)
         count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
@@ -283,8 +282,7 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
     count = len(direction)
     result = np.full(count, farthest)
     wanted = np.arange(count)
-    # A fast comparison with the brightest stars of the sky shows which stars have a reach below `least`; most
-    # stars do.
+    # Most stars have a reach below `least`. A fast comparison with the brightest stars identifies them.
     brightest = math.ceil(4.0 * _BRIGHTER * rank / least**2) if least > 0.0 else count
     if brightest < count:
         near = cKDTree(direction[:brightest]).query_ball_point(
@@ -296,7 +294,7 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
     while begin < count:
         end = min(max(2 * begin, 4 * rank), count)
         stars = wanted[np.searchsorted(wanted, begin) : np.searchsorted(wanted, end)]
-        # About half of a star's neighbours are brighter, so that 4 x `rank` neighbours contain enough.
+        # About half of a star's neighbours are brighter, so that 4 x `rank` neighbours are enough.
         neighbours = min(4 * rank, end)
         distance, number = cKDTree(direction[:end]).query(
             direction[stars], neighbours, distance_upper_bound=farthest * (1.0 + TIE)
@@ -332,8 +330,7 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
-    # Most circles contain enough of the sky's brightest stars. For a circle with too few of the brightest
-    # stars, all stars are searched.
+    # All stars are searched only for circles that contain too few of the sky's brightest stars.
     brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
     for count in sorted({brightest, len(direction)}):
@@ -377,8 +374,7 @@ def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> 
 
     limit = reach(direction, rank, largest, smallest)
     able = np.flatnonzero(limit >= smallest)
-    # The stars are sorted by `limit`, so that each triangle is found only once, from its star with the
-    # smallest `limit`.
+    # With stars sorted by `limit`, each triangle is found once, from its star with the smallest `limit`.
     able = able[np.argsort(-limit[able], kind="stable")]
     limit, place = limit[able] * (1.0 + TIE), direction[able]
     first, last = np.sort(cKDTree(place).query_pairs(largest, output_type="ndarray"), axis=1).T
@@ -454,7 +450,7 @@ PATH = (
 
 @dataclass(frozen=True, eq=False)
 class SkyIndex:
-    """Guide stars, and triangles of guide stars that are bright relative to the stars around them.
+    """Guide stars, and triangles of the locally brightest guide stars.
 
     Attributes:
         stars: guide stars at the epoch of the index.
@@ -473,7 +469,7 @@ class SkyIndex:
 
     @cached_property
     def boxes(self) -> tuple[npt.NDArray[np.int32], FloatArray, npt.NDArray[np.int32]]:
-        """The guide stars (n,) by spatial box, their directions (n, 3), and the first star of each box.
+        """Guide stars sorted by spatial box: indices (n,), directions (n, 3), and the offset of each box.
 
         The cube around the unit sphere is divided into equally many boxes along each axis. The stars of a box
         are in order of brightness, the brightest first.
