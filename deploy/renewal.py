@@ -546,7 +546,7 @@ class Renewal:
         self._continue()
 
     def _copy_bundle(self, kind: str, name: str, expected: str, path: Path) -> None:
-        """Copy the selected bundle from the link's files. Raises Refused if its SHA-256 is not `expected`."""
+        """Copy the selected bundle of the link. Raises Refused if the bundle's SHA-256 is not `expected`."""
         if not _NAME.fullmatch(name):
             raise Refused(f"{name[:64]!r} is not the name of a bundle")
         digest = hashlib.sha256()
@@ -605,7 +605,7 @@ class Renewal:
         self._tidy()
 
     def _withdraw(self, name: str, kind: str) -> None:
-        """End the trial with the old version, or return to the previous version. Raises Refused."""
+        """Restore the version before the trial, or without a trial the previous version. Raises Refused."""
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
@@ -683,7 +683,7 @@ class Renewal:
         self._continue()
 
     def _revert(self, trial: Trial) -> None:
-        """Install the version before the trial, restart and end the trial. Raises Refused or OSError."""
+        """Install the trial's old version, request a restart and end the trial. Raises Refused or OSError."""
         state, board = self._state, self._board
         if trial.what == "configuration":
             try:

@@ -183,8 +183,8 @@ def draw_horizon(
 ) -> npt.NDArray[np.uint8]:
     """Return `picture` (rows, columns, 3) with the horizon drawn on it.
 
-    The fitted limb is a line. Edge points on the limb have orange rings, and other edge points have blue
-    rings.
+    The fitted limb is drawn as a line. Edge points on the limb have orange rings, and other edge points have
+    blue rings.
     """
     drawn = picture.copy()
     if solution.view is not None:

@@ -1,8 +1,9 @@
 """Reader of recorded packets from bytes or from the folder of a run, and their export to other formats.
 
-The reader accounts for every byte. The packets of a run are exported to CSV files, Parquet files, or one
-SQLite database, with the same columns: the first column is the mission time `time_s`, and an array has one
-column per element, such as quaternion_1 to quaternion_4. Numbers are written with full precision.
+The reader counts every byte, inside or outside packets. The packets of a run are exported to CSV files,
+Parquet files, or one SQLite database, with the same columns: the first column is the mission time `time_s`,
+and an array has one column per element, such as quaternion_1 to quaternion_4. Numbers are written with full
+precision.
 """
 
 from __future__ import annotations

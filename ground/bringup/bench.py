@@ -1,4 +1,4 @@
-"""The devices of a bench session: the search for them, the open devices, and the outcome of a step.
+"""Devices of a bench session: search for devices, open devices, and outcome of a step.
 
 The driver sets a coil to zero if its command is not repeated within 0.25 s. The guardian sets all coils to
 zero if this process stops, and `Session.close` does so at the end of every session. A missing chip is

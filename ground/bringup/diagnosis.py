@@ -145,7 +145,7 @@ def allan_deviation(values: FloatArray, period: float) -> tuple[FloatArray, Floa
 def diagnose_rest(
     samples: Samples, span: float, expected: UnitExpectation, bad: float, strongest: float
 ) -> list[Finding]:
-    """Return the faults of an inertial unit that rested for `span` s.
+    """Return the faults of an inertial unit that was at rest for `span` s.
 
     `bad` is the fraction of packets with a wrong checksum, `strongest` the strongest field (T) of the site.
     """

@@ -254,7 +254,7 @@ def step_strings(session: Session) -> Outcome:
 def _currents(session: Session, strings: SolarStrings, normal: FloatArray) -> FloatArray:
     """Return the string currents (n,), A, under a lamp along `normal`.
 
-    Raises StepSkipped without currents.
+    Raises StepSkipped if no currents arrive.
     """
     if session.hand is not None:
         session.hand.light(normal)

@@ -198,7 +198,7 @@ def fly(
     label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
     with _opened(out) as sink:
         done = _resume(label, out, sink)
-        _clear(out / _TEMPORARY)  # link of a campaign that was killed after its last result
+        _clear(out / _TEMPORARY)  # temporary folder of a campaign that was killed after its last result
         missing = [case for case in cases if case.key not in done]
         if missing:
             bar = Progress(len(cases), len(cases) - len(missing)) if progress else None

@@ -391,7 +391,7 @@ def predicted(
 ) -> tuple[OrbitPrediction, tuple[Station, ...], OrbitConfig | None]:
     """Return the predicted orbit, the stations, and the configuration if one is given. Raises UsageError.
 
-    The path `options.config` is that of a configuration or of a file of elements.
+    The path `options.config` names a configuration or a file of elements.
     """
     try:
         from ground.passes import OrbitPrediction, read_stations, station_of  # noqa: PLC0415

@@ -283,7 +283,7 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
         )
     second = meller.scan_horizon(other, camera, lines)
     if options.method == "graphic":
-        # The axes of both cameras are level (Graphic Method, `graphic_nadir`).
+        # The Graphic Method (`graphic_nadir`) assumes that the axes of both cameras are level.
         angle, axis = math.radians(options.turned), camera.ideal.centre
         towards = (np.array([0.0, 1.0]), np.array([-math.sin(angle), math.cos(angle)]))
         first, other_camera = (meller.LevelCamera(one, axis) for one in towards)

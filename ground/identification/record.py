@@ -197,7 +197,7 @@ class Timeline:
 
     Attributes:
         span: time (k,) since the previous event, s.
-        current: current (k,) during that time, A.
+        current: current (k,) during the time step, A.
         variance: variance (k,) of the current relative to that of an active coil, zero while the coil is off.
         sample: index (k,) of the sample at the event, or -1 for an event without a sample.
         jump: change (k,) of the current at the event, A.

@@ -118,7 +118,7 @@ class CommandStream:
         self.authenticated = False
 
     def packets(self, data: bytes) -> Iterator[bytes]:
-        """Yield the command packets that are complete after `data`. Raises StreamError at a wrong byte."""
+        """Yield the command packets that are complete after `data`. Raises StreamError at an invalid byte."""
         self._arrived += data
         if not self.authenticated and not self._take_token():
             return

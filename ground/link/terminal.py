@@ -200,8 +200,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        A report that the frame was refused as repeated ends the reports if it is the first report on the
-        command. After another report it means that a third party has replayed the frame, and it is skipped.
+        If the first report states that the frame's counter was used before, it is also the final report.
+        After other reports, such a report means that a third party has replayed the frame, and it is skipped.
         """
         reported = False
         for _, packet in self.packets(seconds):

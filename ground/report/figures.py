@@ -417,7 +417,7 @@ def _mean_power(ax: Axes, found: PowerHistory) -> None:
 
 
 def _field(ax: Axes, run: Run) -> None:
-    """Draw the Earth's magnetic field in the body frame, either the true or else the measured field."""
+    """Draw the Earth's magnetic field in the body frame: the true or, if unknown, the measured field."""
     packets = run["orbit_truth"]
     true = true_quaternions(run["truth"], packets)
     known = np.isfinite(true[:, 0])

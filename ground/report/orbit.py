@@ -38,7 +38,7 @@ SETTLED_AFTER_S = 600.0
 
 
 def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
-    """Return start, s, and end, s, of each period in mode detumble, and whether acquire or hold followed."""
+    """Return start and end, s, of each period in mode detumble, and whether mode acquire or hold followed."""
     times = np.append(seconds(run["mode"]), end)
     modes = [Mode(int(mode)) for mode in run["mode"]["mode"]]
     return [

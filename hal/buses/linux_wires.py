@@ -63,9 +63,9 @@ class PySerialPort:
     ) -> None:
         """Open the port.
 
-        Raises NotResponding if the port cannot be opened. If `patient` is true, a missing port raises no
-        error: the port counts as lost, and is opened later. A call of `send` takes at most `write_timeout`,
-        s; the default is short enough for the thread that drives the coils.
+        Raises NotResponding if the port cannot be opened. If `patient` is true, a missing port counts as
+        lost, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is short
+        enough for the thread that drives the coils.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0

@@ -97,8 +97,8 @@ class ServedCamera:
     def __init__(self, device: CameraDevice, clock: Clock, patient: bool = False) -> None:
         """Open the camera and start the periodic job.
 
-        Raises DeviceError if the camera cannot be opened. If `patient` is true, no error is raised: the
-        camera counts as lost, and is opened later.
+        Raises DeviceError if the camera cannot be opened. If `patient` is true, a camera that cannot be
+        opened counts as lost, and is opened later.
 
         The camera is reopened if no frame arrives within `PATIENCE_NS` plus six exposure times after the
         first unanswered trigger. A free-running camera may need several exposures until a new exposure time
