@@ -87,8 +87,7 @@ class PidController:
         Raises UsageError if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
-        # The initial integral of the error cancels the proportional part, so that the first command of a body
-        # at rest is zero.
+        # The initial integral cancels the proportional part, so that the first command at rest is zero.
         unweighted = (1.0 - self._weight) * wanted.angle
         if self._sum is None:
             self._sum = self._gains.proportional / self._gains.integral * ((1.0 - self._weight) * angle)
@@ -156,8 +155,8 @@ class AdaptiveController:
         inertia = plant.inertia / plant.torque_constant
         self._gain = inertia * settings.bandwidth
         begin = np.array([plant.inertia, plant.stiffness, plant.damping, 0.0]) / plant.torque_constant
-        # At the upper bounds, the stiffness needs half the current limit at 1 rad, and the damping half the
-        # current limit at 0.2 rad/s.
+        # The range of the stiffness corresponds to half the current limit at an angle of 1 rad.
+        # The range of the damping corresponds to half the current limit at a rate of 0.2 rad/s.
         self._range = np.array([0.5 * inertia, 0.5 * self._limit, 2.5 * self._limit, 0.5 * self._limit])
         self._low = np.maximum(begin - self._range, [0.5 * inertia, 0.0, 0.0, -np.inf])
         self._high = begin + self._range

@@ -106,7 +106,8 @@ def estimate_rate(
         prior_sigma: standard deviation of each component of the prior rate, rad/s.
         previous_checksum: checksum of the previous frame, by which a frozen camera is detected, or None.
 
-    Raises FlightError for an invalid frame, exposure or prior. The status of the result states a failure.
+    Raises FlightError for an invalid frame, exposure or prior. A failed estimation is reported by the status
+    of the result.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = saturation_level(pixels, settings.saturation)
@@ -121,8 +122,7 @@ def estimate_rate(
         return in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
     typical = _typical_length(segmented.regions, settings)
     if typical < settings.least_length:
-        # Most streaks are very short. Regions that look like long streaks are therefore blends of several
-        # stars.
+        # Most streaks are very short, so that apparent long streaks are blends of several stars.
         return replace(result, status=StreakStatus.TOO_SHORT, length=typical)
     return result
 
@@ -216,7 +216,7 @@ class RotationFit:
         rotation_vector: (3,) rotation vector from the first ends to the second ends in camera axes, rad.
         covariance: (3, 3) covariance of the rotation vector, rad^2.
         endpoints: (n, 2, 2) end positions, corrected for bias and consistently ordered, px.
-        used: (n,) whether each streak is used in the rotation.
+        used: (n,) whether each streak is used in the fit of the rotation.
         residual: RMS error of a streak end from the residuals of the used streaks (Sease, eq. 4.7), rad.
     """
 
@@ -286,7 +286,8 @@ def _reject_and_solve(
     """Return the rotation and flags (n,) of the used streaks after iterative rejection of outliers.
 
     In each iteration, streaks are rejected, or accepted again, according to their residuals, until the set of
-    used streaks remains the same. Raises numpy.linalg.LinAlgError if these determine no rotation.
+    used streaks remains the same. Raises numpy.linalg.LinAlgError if the used streaks do not determine a
+    rotation.
     """
     weights = 1.0 / errors**2
     solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
@@ -349,8 +350,8 @@ def _covariance(
     return np.asarray(covariance + np.outer(common, common))
 
 
-# For 4 and for 8 neighbour pixels: offset (x, y) from the centre pixel to one end of each diameter. A
-# diameter is a line through the centre pixel that ends at two opposite neighbours.
+# Offsets (x, y) from the centre pixel to one end of each diameter, for 4 and for 8 neighbour pixels.
+# A diameter is a line through the centre pixel that ends at two opposite neighbours.
 _DIAMETERS = {4: ((1, 0), (0, 1)), 8: ((1, 0), (1, 1), (0, 1), (-1, 1))}
 
 
@@ -451,8 +452,7 @@ def _coarse_corners(image: FloatArray, neighbours: int, relative: float) -> Bool
     return np.asarray(np.kron(likely, np.ones((2, 2), dtype=np.bool_))[:rows, :columns])
 
 
-# Lower limit of the assumed error (px) of an endpoint, because small residuals of few streaks can be due to
-# chance.
+# Lower limit (px) of an endpoint's assumed error, because few streaks can have small residuals by chance.
 _LEAST_SIGMA_PX = 0.02
 
 

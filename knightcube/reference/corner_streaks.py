@@ -1,7 +1,7 @@
 """Body rate and attitude from star streaks by corner detectors (Sease 2013, chapters 3 and 4).
 
-This module defines settings and results. It does not import scipy, so that it is fast to load. The methods
-are in `knightcube.reference.corner_streak_rate`.
+This module defines settings and results, and loads fast because it does not import scipy. The methods are in
+`knightcube.reference.corner_streak_rate`.
 """
 
 from __future__ import annotations
@@ -53,11 +53,10 @@ class StreakSettings(EndpointSettings):
 
 
 _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
-    # The endpoint biases for point spreads of 0.7 and 1.5 px are -0.14 and 0.40 px with Harris's detector.
-    # The endpoint biases for point spreads of 0.7 and 1.5 px are 0.34 and 0.71 px with the minimum
-    # eigenvalue. The endpoint biases for point spreads of 0.7 and 1.5 px are 1.23 and 1.68 px with
-    # Trajkovic-4. The endpoint biases for point spreads of 0.7 and 1.5 px are 0.93 and 1.24 px with
-    # Trajkovic-8.
+    # Endpoint biases of Harris's detector for point spreads of 0.7 and 1.5 px: -0.14 and 0.40 px.
+    # Endpoint biases of the minimum eigenvalue for point spreads of 0.7 and 1.5 px: 0.34 and 0.71 px.
+    # Endpoint biases of Trajkovic-4 for point spreads of 0.7 and 1.5 px: 1.23 and 1.68 px.
+    # Endpoint biases of Trajkovic-8 for point spreads of 0.7 and 1.5 px: 0.93 and 1.24 px.
     "harris": {},
     # The minimum eigenvalue is proportional to brightness^2, and Harris's response to brightness^4.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},

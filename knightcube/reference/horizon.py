@@ -9,16 +9,18 @@ pseudo-inverse. The method assumes that the image has no distortion and that the
 flat detector, which is valid near the optical axis only. Meller et al. do not state from which side the image
 is scanned (here from the darkest border), nor how to compute nadir from the circle in the image of one
 camera. This implementation removes the lens distortion before the fit, and assumes that the point of the
-circle closest to the optical axis lies on the limb. Nadir is on the line from this point to the centre, at
-the Earth's angular radius from the point. The circle fit does not distinguish between limb and terminator.
+circle closest to the optical axis lies on the limb. Nadir lies on the line from this limb point to the
+circle's centre, at the Earth's angular radius from the limb point. The circle fit does not distinguish
+between limb and terminator.
 
 Graphic Method (Meller et al., section 3.2.2 and Fig. 10): The limb is a circle in the horizon plane, whose
 distance below the satellite follows from the altitude. The plane through the centre column of a camera image
 contains the body's z axis and intersects the horizon plane in a line. The lines of two cameras intersect in a
 point Z on the z axis. The vector from Z to the centre of the horizon circle gives the angle between the z
-axis and nadir. Meller et al. do not state the image scale (px/km). Here it is the distance of the circle's
-centre below the optical axis (px), divided by the distance of the horizon plane below the satellite (km),
-which is exact for tilts about an optical axis, and exact to first order for other tilts of level cameras.
+axis and nadir. Meller et al. do not state the image scale (px/km). In this implementation, the image scale is
+the distance of the circle's centre below the optical axis (px), divided by the distance of the horizon plane
+below the satellite (km), which is exact for tilts about an optical axis, and exact to first order for other
+tilts of level cameras.
 
 Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from direction Q to
 direction P, the shortest rotation from Q to P rotates the old nadir direction to the new nadir direction. A
@@ -129,7 +131,7 @@ class ScannedHorizon:
 
 
 def scan_horizon(frame: Image, camera: CameraModel, lines: int = LINES) -> ScannedHorizon:
-    """Return the circle through the first edges in scan lines of an image. Raises NoHorizonError."""
+    """Return the circle through the first edges in scan lines, or raise NoHorizonError without a circle."""
     points = _first_edges(frame, lines)
     rays = camera.unit_vectors(points) if len(points) else np.zeros((0, 3))
     seen = np.isfinite(rays[:, 0])
@@ -180,7 +182,8 @@ class GraphicMethodError(FlightError):
 class LevelCamera:
     """Camera whose boresight is perpendicular to the body z axis, and whose y axis is parallel to it.
 
-    The unit vector `right` (2,) is the camera's x axis along body x and y. The optical axis is at (x, y) px.
+    The unit vector `right` (2,) contains the components of the camera's x axis along body x and y. The
+    optical axis is at the pixel `axis` (x, y).
     """
 
     right: FloatArray

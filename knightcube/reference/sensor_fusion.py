@@ -6,9 +6,9 @@ compared with theoretical magnetic field models, a three-dimensional satellite a
 single field vector, however, determines only two of the three angles. This implementation therefore collects
 magnetic field measurements for some minutes, during which the field direction changes along the orbit, and
 rotates the measurements into the present body axes with the gyros. Meller et al. do not state how the two
-matrices are fused; this implementation weights each matrix by the inverse of its covariance. The fused matrix
-and the gyros are the measurements of an extended Kalman filter for attitude and gyro bias. As in the paper,
-measurements are not checked for outliers by comparison with the estimate.
+attitude matrices are fused; this implementation weights each matrix by the inverse of its covariance. The
+fused matrix and the gyros are the measurements of an extended Kalman filter for attitude and gyro bias. As in
+the paper, measurements are not checked for outliers by comparison with the estimate.
 """
 
 from __future__ import annotations
@@ -183,8 +183,7 @@ class SeparateDetermination:
         cameras = attitude_of([one for one in (sun, nadir) if one is not None])
         fields = [*self._fields, *now]
         magnetometer = attitude_of(fields)
-        # The errors of magnetometer bias and field model are common to all collected fields, so that their
-        # mean is not more accurate.
+        # The errors of magnetometer bias and field model are common to all fields and do not average out.
         spread = len(fields) * magnetometer.covariance
         magnetometer = replace(magnetometer, covariance=spread)
         fused = fuse(cameras, magnetometer)
@@ -208,8 +207,7 @@ class SeparateDetermination:
         seconds = (time_ns - since_ns) * _NANOSECOND
         matrix, drift = attitude_matrix(turn), self._filter.bias_sigma
         for number, one in enumerate(self._fields):
-            # The error of the gyro bias is the same for all intervals, so that standard deviations are added
-            # instead of variances.
+            # The gyro bias error is the same for all intervals, so that standard deviations are added.
             drifted = (len(self._fields) - number) * FIELD_EVERY * drift
             cross = cross_matrices(one.observed[None])[0]
             added = cross @ cross.T * 2.0 * drifted * drift * seconds

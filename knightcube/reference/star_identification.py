@@ -1,41 +1,38 @@
 """Classical methods of star identification (Michalski, section 3.2), for comparison with the default method.
 
 Each method (`METHODS`) proposes candidates, which assign guide stars to some observed stars and thereby
-define an attitude. With this attitude, the brightest observed stars close to guide stars are counted. The
-candidates with the most such stars are verified with all observed stars by
-`knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is uncertain,
-the identification is tried at several scales (`ScaledField`). The function `match_images` determines the
-attitude of identified stars by image matching.
+define an attitude. The number of bright observed stars that are close to guide stars is counted for the
+attitude of each candidate. The candidates with the most of these stars are verified with all observed stars
+by `knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is
+uncertain, the identification is tried at several scales (`ScaledField`). The function `match_images`
+determines the attitude of identified stars by image matching.
 
 - Angle matching: The triangles of the brightest observed stars are processed in order of brightness
-  (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars whose angles
-  match two sides of a triangle are joined if the pairs share a star. Two joined pairs are a candidate if the
-  angle of the third side matches as well.
-- Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
-  define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
-  & Crassidis 2004 and 2006). Triangles in this range are candidates if their polar moments and side lengths
-  also match. If several triangles match, the published methods pivot to a neighbouring triangle, while this
-  implementation tests all matching triangles.
-- Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
-  limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
-  Navigation 51, 2004). Only triangles that a fourth observed star confirms are candidates, because a matching
-  fourth star makes chance matches rare.
-- Rate matching: Two frames, or the ends of streaks, give the velocity of each observed point (Michalski,
-  section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification algorithms, IEEE TAES 41,
-  2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars, unlike satellites,
-  aircraft and hot pixels. The position of each star is predicted from a previous attitude, which is
-  propagated by the body rate. Without a previous attitude, the pyramid method identifies the remaining
-  points.
-- Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
-  one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
-  Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because otherwise guide stars
-  in dense regions of the sky would get the most votes if the noise exceeds 0.3 px. In a second vote, two of
-  the assignments with the most votes vote for each other if the angle between their stars agrees. The largest
-  group of consistent assignments is the candidate.
-- Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting
-  the cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33,
-  1997). Several neighbouring stars are tried as the star that defines the orientation, because it may be
-  false or missing in the catalogue.
+(Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars whose angles
+match two sides of a triangle are joined if the pairs share a star. Two joined pairs are a candidate if the
+angle of the third side matches as well. - Triangles by area and polar moment: The area of an observed
+triangle and its propagated standard deviation define a range of areas in the table of guide star triangles
+(Michalski, sections 3.2.2 and 3.2.3, and Cole & Crassidis 2004 and 2006). Triangles in this range are
+candidates if their polar moments and side lengths also match. If several triangles match, the published
+methods pivot to a neighbouring triangle, while this implementation tests all matching triangles. - Pyramid:
+The triangles are ordered so that no observed star occurs in many consecutive triangles, which limits the
+effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins, Navigation 51,
+2004). Only triangles that a fourth observed star confirms are candidates, because a matching fourth star
+makes chance matches rare. - Rate matching: Two frames, or the ends of streaks, give the velocity of each
+observed point (Michalski, section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification
+algorithms, IEEE TAES 41, 2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all
+stars, unlike satellites, aircraft and hot pixels. The position of each star is predicted from a previous
+attitude, which is propagated by the body rate. Without a previous attitude, the pyramid method identifies the
+remaining points. - Geometric voting: For each pair of observed stars, each guide star with a partner at the
+pair's angle gets one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin,
+Pollak, Shimshoni & Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because
+otherwise guide stars in dense regions of the sky would get the most votes if the noise exceeds 0.3 px. In a
+second vote, two assignments with many votes vote for each other if the angle between their guide stars agrees
+with the angle between their observed stars. The largest group of consistent assignments is the candidate. -
+Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting the
+cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33, 1997).
+Several neighbouring stars are tried as the star that defines the orientation, because a neighbouring star may
+be false or missing in the catalogue.
 """
 
 from __future__ import annotations
@@ -89,7 +86,8 @@ class ClassicalSettings:
         brightest: number of brightest observed stars from which patterns are formed.
         tolerance: tolerance of angles, areas and moments, in standard deviations.
         patterns: maximum number of triangles or grid patterns that are looked up in a table.
-        joins: maximum number, for all image scales, of triangles formed from pairs, which take 0.5 ms each.
+        joins: maximum number of triangles formed from pairs, for all image scales together; a triangle takes
+            0.5 ms.
         candidates: maximum number of candidates per image scale that are compared with the observed stars.
         screened: number of brightest observed stars with which a candidate is first compared.
         verified: maximum number of candidates of a pattern that are verified with all observed stars.
@@ -288,8 +286,7 @@ def _support(
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # The error of an attitude from two stars causes a position error that is proportional to the distance
-    # from the middle of both stars.
+    # The position error from a two-star attitude is proportional to the distance from their midpoint.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -320,7 +317,7 @@ def matching_triangles(
     a1, b1, a2, c2 = a[first], b[first], a[~first], b[~first]
     place, of = shared(a1, a2)
     triangles = np.stack([a1[of], b1[of], c2[place]], axis=-1)
-    # Angle limits are clipped to 0 to pi, the range in which the cosine is monotonic.
+    # Angle limits are clipped to the range from 0 to pi, in which the cosine is monotonic.
     alike = within(sky, triangles[:, 1], triangles[:, 2], low[2], high[2])
     triangles = triangles[alike & (triangles[:, 1] != triangles[:, 2])]
     same_orientation = _turns_left(sky.stars.direction[triangles]) == _turns_left(
@@ -390,7 +387,7 @@ def _pyramids(
         alike &= within(sky, found[of, corner], fourth, low[owner], high[owner])
     triangles, fourth, owner = found[of[alike]], fourth[alike], owner[alike]
     observed = np.column_stack([np.tile(corners, (len(owner), 1)), rest[owner]])
-    # One fourth star per triangle is enough, because the verification uses all other stars.
+    # A single fourth star per triangle is enough, because the verification uses all other stars.
     _, once = np.unique(triangles, axis=0, return_index=True)
     return Candidates(observed[once], np.column_stack([triangles, fourth])[once])
 
@@ -500,7 +497,7 @@ def _ballot(
 def _agreement(
     view: ScaledField, sky: KnownSky, observed: IntArray, star: IntArray, tolerance: float
 ) -> BoolArray:
-    """Return a matrix (k, k) of flags: whether two assignments of guide stars to stars are consistent."""
+    """Return a matrix (k, k) of flags: whether two assignments of guide to observed stars are consistent."""
     count = len(observed)
     one, other = (index.ravel() for index in np.indices((count, count)))
     _, low, high = view.angles(observed[one], observed[other], tolerance)
@@ -553,7 +550,7 @@ class StarMotion:
 class PreviousAttitude:
     """Attitude quaternion (4,), from ICRS to the camera frame, `elapsed` s ago.
 
-    The standard deviation `sigma` about each axis, rad, includes the drift since then.
+    The standard deviation `sigma` about each axis, rad, includes the drift during the elapsed time.
     """
 
     attitude: FloatArray
@@ -633,8 +630,7 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
         agrees = _agrees(direction, motion, rate, covariance)
         if agrees.sum() <= shares.sum():
             continue
-        # The rate is refined, because a rate from two close points is inaccurate and many points agree with
-        # it.
+        # Many points agree with the inaccurate rate from two close points, so the rate is refined.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():
@@ -722,7 +718,7 @@ def match_images(
     """Return the attitude that matches the image of the reference stars to the observed image.
 
     The method AIM (attitude estimation using image matching: Delabie, De Schutter & Vandenbussche, Journal of
-    Guidance, Control, and Dynamics 36, 2013) is mentioned in Michalski, section 3.4. It projects the
+    Guidance, Control, and Dynamics 36, 2013) is mentioned in Michalski, section 3.4. The method projects the
     reference stars into an image with a prior attitude. The rotation and translation that move the projected
     image onto the observed image with the least squared distances have a closed form, derived here
     independently. The rotation in the image is a rotation about the boresight, and the translation is a tilt
@@ -733,7 +729,8 @@ def match_images(
     angle. Each further step projects the stars with the newest attitude and removes most of the remaining
     error: four steps reduce a prior error of 1 deg in a 20 deg field to less than 0.01".
 
-    Raises AttitudeError if the attitude is undetermined, or if a star is behind the camera by the prior.
+    Raises AttitudeError if the attitude is undetermined, or if a star is behind the camera according to the
+    prior attitude.
 
     Args:
         observed: (n, 3) observed unit vectors in camera axes, boresight +z.

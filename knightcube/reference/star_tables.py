@@ -7,9 +7,9 @@ are sorted by angle and searched with a k-vector, which finds the keys of a rang
 straight line, and contains, for evenly spaced values on the line, the number of keys below each value. Two
 look-ups then give the beginning and end of a range of keys, which is half-open (low <= key < high). Equation
 61 of Michalski also returns some keys just outside the range; this implementation compares the keys in the
-two boundary cells. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in the original paper, so
-that the straight line ends above the largest key. The margin 2.22e-16 in equation 56 of Michalski is replaced
-by a margin proportional to the magnitude of the keys.
+two boundary cells with the limits. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in the
+original paper, so that the straight line ends above the largest key. The margin 2.22e-16 in equation 56 of
+Michalski is replaced by a margin proportional to the magnitude of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -80,9 +80,9 @@ class KVector:
             return np.zeros(len(value), dtype=np.int64)
         last = len(self.count) - 2
         with np.errstate(over="ignore"):
-            # A value far above the keys gives an infinite quotient, which is clipped to the last cell.
+            # The cell number of a value far above all keys may overflow to infinity and is then clipped.
             cell = np.clip((value - self.origin) / self.slope, 0.0, last).astype(np.int64)
-        # The cell index is corrected if rounding has moved the quotient across the boundary of a cell.
+        # The cell number is corrected if rounding has moved the value into a neighbouring cell.
         cell = np.maximum(cell - (self.origin + self.slope * cell > value), 0)
         cell = np.minimum(cell + (self.origin + self.slope * (cell + 1) <= value), last)
         lower = self.count[cell].astype(np.int64)
@@ -500,7 +500,7 @@ class KnownSky:
     """Guide stars for a given field of view, with the tables of their pairs, triangles and grid patterns.
 
     Attributes:
-        index: search index of all guide stars; the indices of stars in identifications refer to it.
+        index: search index of all guide stars; the indices of stars in identifications refer to this index.
         half_width: (2,) tangents of half the angles of the field of view.
         stars: guide stars brighter than the magnitude at which a field contains 24 guide stars on average.
     """

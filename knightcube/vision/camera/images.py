@@ -139,7 +139,7 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
 
 
 def _grey_of_planes(planes: Image) -> Image:
-    """Return the luminance (rows, columns), in their data type, of colour planes (3, rows, columns)."""
+    """Return the luminance (rows, columns) of colour planes (3, rows, columns), in the planes' data type."""
     grey = np.zeros(planes.shape[1:])
     for weight, plane in zip(_LUMINANCE, planes, strict=True):
         grey += weight * plane
@@ -254,7 +254,7 @@ def read_image(path: Path | str) -> Image:
     The format is recognised by the file's content, not by its name. The pixels are uint8 or uint16. The
     pixels of FITS files may also be signed, 32-bit or floating-point. Colour images are converted to
     luminance (ITU-R BT.601). Photographs are rotated according to the orientation in their EXIF data. All
-    formats but FITS need Pillow. Raises UsageError if the file is missing, damaged or in an unsupported
+    formats except FITS need Pillow. Raises UsageError if the file is missing, damaged or in an unsupported
     format, if pixels are not finite, or if Pillow is not installed.
     """
     path = Path(path)
@@ -341,7 +341,7 @@ def _through_pillow(path: Path) -> Image:
 _ON_SIDE = (5, 6, 7, 8)
 """Values of the EXIF tag Orientation for which the stored rows are columns of the displayed image."""
 _ORIENTATION = 0x0112
-"""Number of the tag Orientation (EXIF 2.3, TIFF 6.0), which gives the sides of row 0 and column 0."""
+"""Number of the tag Orientation (EXIF 2.3, TIFF 6.0): sides of the picture at which row and column 0 lie."""
 
 
 def _upright(image: Image, picture: Picture) -> Image:
@@ -390,7 +390,7 @@ def _is_deep(picture: Picture) -> bool:
 
 
 def _low_bytes(args: Any) -> Any:
-    """Return the arguments of a Pillow decoder for the swapped byte order, so that it keeps the low bytes."""
+    """Return the arguments of a Pillow decoder for the swapped byte order, which keeps the low bytes."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
 
@@ -416,7 +416,7 @@ def _grey(path: Path, picture: Picture) -> Image:
 
 
 KEPT_FRAMES_FOLDER = "frames"
-"""Name of the folder of kept frames inside the run's folder."""
+"""Name of the folder of kept frames inside the output folder of a flight."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -301,7 +301,7 @@ class Lens:
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return undistorted tangents of the field angles of distorted tangents (...), NaN beyond the fold.
+        """Return the undistorted tangents of distorted tangents (...), or NaN beyond the fold.
 
         Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
         that is nearer to the axis. From these initial values, Newton's method overshoots the root at most
@@ -335,8 +335,7 @@ def _reach(k1: float, k2: float) -> float:
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
         return np.inf
-    # This formula for the smaller positive root r^2 avoids the loss of digits by cancellation and also holds
-    # for k2 = 0.
+    # This formula for the smaller positive root r^2 avoids cancellation and is also valid for k2 = 0.
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
 
@@ -380,7 +379,7 @@ class MountedCamera:
 
 
 FOURTH_AS = -0.3, 1.2
-"""Constant and quadratic coefficient of the least-squares approximation of r^4 over an image."""
+"""Coefficients of the least-squares fit of 1 and r^2 to r^4 over an image, with r = 1 at the corners."""
 
 UNSTATED = 30e-6
 """Standard deviation (s) of an unknown line time of a rolling shutter, for a typical readout time of 30 ms.
@@ -395,7 +394,7 @@ class CameraKnowledge:
 
     Attributes:
         focal_length: relative standard deviation of the focal length.
-        centre: standard deviation of the optical axis along x and along y, px.
+        centre: standard deviation of the optical axis's position along x and along y, px.
         distortion: standard deviation of the distortion at an image corner, relative to half the diagonal.
         line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
             of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
