@@ -5,16 +5,32 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from flight.schema.bodies import as_testbed
 from flight.schema.reader import parse
 from ground import report
 from ground.commands import identify
+from ground.commands.identify import _Identified
+from ground.identification.fit import (
+    AbsolutePlant,
+    MotionConstants,
+    MotionNoise,
+    PlantFit,
+    ScaledValue,
+    Whiteness,
+)
+from ground.identification.orbit import LearnedDescription, LearnedQuantity
+from ground.identification.record import HorizontalField, Record
+from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
+from tests.support.flights import demo_config
 from tests.support.places import DEMO
 
 
@@ -127,3 +143,158 @@ def test_the_output_names_the_files_unless_it_is_one_json_object(
         return
     expected = "a table\n\n" + (f"written: {out}\n" if written else made.fragment)
     assert shown == expected + (f"picture: {picture}\n" if drawn else "")
+
+
+# Texts and values of artificial results.
+
+
+def made(*, white: bool = True, field: bool = True) -> _Identified:
+    """Return an artificial identification."""
+    count = 5
+    measured = HorizontalField(4.567e-5, 1.2e-7, 80) if field else None
+    time = np.linspace(10.0, 52.0, count)
+    record = Record(time, time, time, time, time, np.zeros(count, bool), 0.025, measured)
+    innovations: Any = SimpleNamespace(restarts=frozenset({1, 3}))
+    fit = PlantFit(
+        MotionConstants(0.3, -0.02, 0.001, 1e-4, -2e-3, 0.05),
+        np.diag([0.01, 0.02, 0.03, 0.04, 0.05, 0.06]) ** 2,
+        MotionNoise(2e-3, 3e-3, 4e-4),
+        innovations,
+        Whiteness((1.0, 1.1), (0.5, 0.4) if white else (0.5, 1e-9)),
+    )
+    plant = AbsolutePlant(
+        ScaledValue(1.1e-3, 1e-5, 0.25),
+        ScaledValue(0.65, 0.01, 0.5),
+        ScaledValue(4.5e-5, 1e-7, 0.75),
+        ScaledValue(2.9e-5, 3e-7),
+        ScaledValue(1e-5, 2e-6),
+        ScaledValue(2e-6, 4e-7),
+        field,
+        np.eye(6),
+    )
+    return _Identified(Path("runs/one"), demo_config(10.0, camera=False), record, fit, plant)
+
+
+def test_the_text_states_each_constant_with_its_uncertainty_and_its_configured_value() -> None:
+    lines = identify._text(made()).splitlines()
+    plant = made().config.plant
+    gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
+    assert lines[0] == "flight: runs/one, 5 samples in 42 s, 2 restarts of the filter"
+    assert lines[3] == f"  gain:             +3.00000e-01 +- 1.0e-02 rad/s^2/A, configured {gain:.4g}"
+    assert lines[4].startswith("  torsion:          -2.00000e-02 +- 2.0e-02 1/s^2, configured ")
+    assert lines[8].startswith("  delay:            +5.00000e-02 +- 6.0e-02 s, configured 0")
+    assert lines[11].startswith("  inertia:            1.10000e-03 +- 1.0e-05 kg m^2")
+    assert lines[11].endswith(" 25 % prior, 75 % motion with dipole and field")
+    assert lines[13].endswith("T          75 % magnetometer and prior, 25 % motion with inertia and dipole")
+    assert lines[14].startswith("  torque constant:   2.90000e-05 +- 3.0e-07 N m/A")
+    assert lines[18] == "field:  0.4567 gauss from the magnetometer, with a scale error of 2 %"
+    expected = "current 2.00 mA, angle 3.00 mrad, rate 400 urad/s; the innovations are white"
+    assert lines[19] == f"noise:  {expected}"
+    assert len(lines) == 20
+
+
+def test_the_text_warns_of_coloured_innovations_and_of_a_field_that_was_not_measured() -> None:
+    text = identify._text(made(white=False, field=False))
+    assert "the innovations are NOT white: the errors are increased accordingly\n" in text
+    assert "field:  not measured because the coils were never off long enough: as configured\n" in text
+    assert "75 % prior, 25 % motion with inertia and dipole" in text
+
+
+def test_the_json_object_has_the_values_of_the_text() -> None:
+    facts = identify._facts(made())
+    assert (facts["folder"], facts["duration_s"], facts["samples"], facts["gone_over"]) == (
+        "runs/one",
+        42.0,
+        5,
+        2,
+    )
+    assert facts["motion"]["damping"] == {"value": 0.001, "sigma": pytest.approx(0.03), "unit": "1/s"}
+    assert facts["motion_covariance"][2][2] == pytest.approx(9e-4)
+    assert facts["plant"]["dipole"] == {
+        "value": 0.65, "sigma": 0.01, "own_prior": 0.5, "unit": "m^2",
+        "rests_on": "50 % prior, 50 % motion with inertia and field",
+    }  # fmt: skip
+    assert facts["magnetometer_T"] == {"value": 4.567e-5, "sigma": 1.2e-7}
+    assert facts["noise"] == {"current": 2e-3, "angle": 3e-3, "rate": 4e-4}
+    assert facts["innovations"]["white"] is True
+    assert identify._facts(made(white=False, field=False))["magnetometer_T"] is None
+    assert identify._facts(made(white=False))["innovations"]["white"] is False
+
+
+def learned() -> LearnedDescription:
+    """Return two quantities, of which one was learned and one value has no uncertainty."""
+    dipole = LearnedQuantity(
+        "dipole", ("x", "y"), "A m^2", np.array([0.0, 0.01]), np.array([0.02, 0.01]),
+        np.array([0.005, 0.001]), np.array([0.05, 0.05]),
+    )  # fmt: skip
+    gyro = LearnedQuantity(
+        "gyro", ("xx",), "", np.array([1.0]), np.array([1.002]), np.array([0.0]), np.array([0.0])
+    )
+    return LearnedDescription(None, 1234.4, {"dipole": dipole, "gyro": gyro})  # type: ignore[arg-type]
+
+
+def test_the_table_shows_each_learned_value_with_its_change() -> None:
+    lines = identify._table(learned(), Path("runs/one")).splitlines()
+    assert lines[0] == "flight: runs/one, values learned until 1234 s"
+    assert lines[2].split() == ["quantity", "described", "learned", "claim", "change"]
+    assert lines[3] == "residual dipole x A m^2                    0         0.02     0.005    +4.0 sigma"
+    assert lines[4] == "residual dipole y A m^2                 0.01         0.01     0.001    +0.0 sigma"
+    assert (
+        lines[5] == "gyro matrix xx                             1        1.002         0"
+        "    +nan sigma, not learned"
+    )
+    assert [len(line.split(" sigma")[0]) for line in lines[3:6]] == [len(lines[2]) - 6] * 3
+
+
+def test_a_learned_quantity_has_no_change_without_an_uncertainty() -> None:
+    dipole, gyro = (identify._quantity_facts(one) for one in learned().quantities.values())
+    assert dipole == {
+        "unit": "A m^2", "learned": True, "described": [0.0, 0.01], "value": [0.02, 0.01],
+        "claim": [0.005, 0.001], "described_sigma": [0.05, 0.05], "change_sigmas": [4.0, 0.0],
+    }  # fmt: skip
+    assert gyro["change_sigmas"] == [None]
+    assert gyro["learned"] is False
+    assert not math.isnan(gyro["value"][0])
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_the_run_of_a_satellite_gives_its_learned_values_without_a_fit(
+    written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = tmp_path / "run", tmp_path / "new" / "learned.yaml"
+    folder.mkdir()
+    out.parent.mkdir()
+    (folder / "config.yaml").write_text("extends: orbit\n")
+    bases: list[str] = []
+
+    def fragment(found: Any, of: Path, base: str) -> str:
+        bases.append(base)
+        return "craft: {}\n"
+
+    monkeypatch.setattr(identify, "read_run", lambda place: place)
+    monkeypatch.setattr(identify, "learned_description", lambda run, config: learned())
+    monkeypatch.setattr(identify, "fragment", fragment)
+    options = argparse.Namespace(
+        source=folder, out=out if written else None, json=False, picture=None,
+        run=None, duration=None, seed=None, realtime=False,
+    )  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert identify.run(options) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"flight: {folder}, values learned until 1234 s\n")
+    assert shown.endswith(f"\nwritten: {out}\n" if written else "\ncraft: {}\n")
+    assert out.exists() == written
+    assert bases == ["../run/config.yaml" if written else "run/config.yaml"]
+    options.out, options.json = None, True
+    assert identify.run(options) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["folder"], facts["time_s"], facts["fragment"]) == (str(folder), 1234.4, "craft: {}\n")
+    assert list(facts["quantities"]) == ["dipole", "gyro"]
+    options.picture = tmp_path / "x.png"
+    with pytest.raises(UsageError, match="--picture: draws the fit of a testbed flight only"):
+        identify.run(options)
+    for name in ("run", "duration", "seed", "realtime"):
+        options = argparse.Namespace(**{**vars(options), "picture": None, name: 3})
+        with pytest.raises(UsageError, match=f"--{name}: .* is the folder of a flight, give a configuration"):
+            identify.run(options)
+        setattr(options, name, None)
