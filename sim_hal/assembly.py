@@ -123,8 +123,7 @@ def assemble(
     The function `now_ns` returns the simulation time. The functions `expose` and `expose_wide` replace the
     camera renderers; in real time they run in another process. Raises ConfigError for an invalid world.
     """
-    # All devices get the same start time, because in real time the clock advances while the devices are
-    # built.
+    # In real time, the clock advances during assembly, so all devices get the same start time.
     start_ns = now_ns()
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     circuit, monitor = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wires)

@@ -7,7 +7,7 @@ line-of-sight filter is therefore linear at any angular rate, and only the measu
 After each step the filter state is divided by the length of the position y, so that y is a unit vector again.
 The filter state is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE
 Transactions on Automatic Control 28). The component of the velocity z across the line of sight is the angular
-rate v. The component of the velocity z along the line of sight is s = (range rate) / range. Without forces
+rate v. The component of the velocity z along the line of sight is s = (range rate) / range. Without forces,
 the angular acceleration of the line of sight is -2 (range rate) / range times the angular rate.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
@@ -17,15 +17,15 @@ orbit radius.
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
 not straight lines. For example, the ratio (range rate) / range changes by the squared angular rate per second
-for an object that moves along a great circle at a constant angular rate. The additional noise density is
-(`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
+for an object that moves along a great circle at a constant angular rate. The additional noise density along
+the line of sight is (`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
 
 Each sighting is assigned to at most one track, first to confirmed and then to tentative tracks, in order of
-increasing cost: the chi-square plus the logarithm of the determinant of the innovation's covariance. This is
-the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking Systems,
-section 6.4). Unassigned sightings start tentative tracks. A track is confirmed after m sightings in n frames
-if its angular rate differs from the rate of the stars. A confirmed track is propagated without measurements
-while the object is not detected.
+increasing cost: the chi-square plus the logarithm of the determinant of the innovation's covariance. The
+assignment is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern
+Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A track is confirmed after m
+sightings in n frames if its angular rate differs from the rate of the stars. A confirmed track is propagated
+without measurements while the object is not detected.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class FrameSightings:
             rad^2; the attitude error is not included.
         magnitudes: magnitudes (n,) of the objects, calibrated by the stars in the frame, or NaN if unknown.
         attitude: covariance (3, 3) of the attitude error, ICRS axes, rad^2. The attitude error rotates all
-            directions of a frame together.
+            directions of a frame by the same rotation.
         observer: geocentric position (3,) of the observer, ICRS, m, or None on the ground or if unknown.
     """
 
@@ -72,10 +72,10 @@ class MotionModel:
         rate: initial standard deviation of each component of the angular rate, rad/s.
         closing: initial standard deviation of the ratio (range rate) / range, 1/s.
         wander: noise density of the tidal acceleration divided by the range, 1/s^3. Between two low orbits
-            with the rate n, its component across the line of sight is at most 1.5 n^2 = 1.8e-6 1/s^2. With
-            the default density, the errors of direction and rate agree with the covariance in passes with
-            angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
-        residual_wander: the same noise density if the gravity gradient is known, 1/s^3.
+            with the orbital rate n, the component of this acceleration across the line of sight is at most
+            1.5 n^2 = 1.8e-6 1/s^2. With the default density, the errors of direction and rate agree with the
+            covariance in passes with angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
+        residual_wander: noise density that replaces `wander` if the gravity gradient is known, 1/s^3.
         bend: standard deviation of the unmodelled rate of change of the ratio (range rate) / range on curved
             paths, as a multiple of the squared angular rate of the object.
     """
@@ -175,7 +175,7 @@ def predict(
 
 
 def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> DirectionInnovation:
-    """Return the residual of a direction (3,), with covariance (3, 3), rad^2, relative to the prediction."""
+    """Return the residual of a direction (3,), with covariance (3, 3), rad^2, from its prediction."""
     basis = tangent_basis(state.direction)
     residual = basis @ direction / max(float(direction @ state.direction), 1e-3)
     observation = np.hstack([basis, np.zeros((2, 3))])
@@ -226,9 +226,10 @@ class TrackSettings:
         needed: number of sightings within `within` frames that confirm a track.
         within: number of frames in which `needed` sightings confirm a track.
         missed: probability that the gate rejects a true sighting of the object.
-        moving: minimum angular rate of the object of a confirmed track, in standard deviations.
-        minimum_rate: angular rate below which an object may be an uncatalogued star, rad/s.
-        coast: time after which a confirmed track without a sighting ends, s.
+        moving: minimum angular rate at which a track is confirmed, in standard deviations of the rate.
+        minimum_rate: minimum angular rate at which a track is confirmed, rad/s; slower objects may be
+            uncatalogued stars.
+        coast: time without a sighting after which a confirmed track ends, s.
         maximum_tracks: largest number of tracks, including tentative tracks.
         brightness: standard deviation of the brightness of an object from sighting to sighting, magnitudes.
     """
@@ -257,7 +258,8 @@ class Track:
         magnitude: mean magnitude of the last sightings, or NaN if unknown.
         magnitude_sigma: standard deviation of the mean magnitude, computed from the scatter, or NaN before
             the second sighting. The error due to the colours of the stars is not included.
-        history: one bit per frame, set if the frame contains a sighting; the lowest bit is the newest frame.
+        history: one bit per frame, set if the frame contains a sighting of the object; the lowest bit is the
+            newest frame.
         measured: direction (3,) of the sighting in the newest frame, or NaN without a sighting.
         measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.
         chi_square: chi-square of the sightings relative to the predictions, with two degrees of freedom per
@@ -363,8 +365,7 @@ class ObjectTracker:
                     continue
                 seen = compare(track.line, frame.directions[number], spread[number])
                 if seen.chi_square + unlike <= self._gate:
-                    # Likelihoods are compared, because chi-square alone would favour tracks with large
-                    # covariances.
+                    # Chi-square alone would favour tracks with large covariances.
                     cost = seen.chi_square + unlike + math.log(float(np.linalg.det(seen.covariance)))
                     pairs.append((not track.confirmed, cost, index, number))
         taken: dict[int, int] = {}
@@ -401,8 +402,7 @@ class ObjectTracker:
     def _is_object(self, track: Track) -> bool:
         if track.history.bit_count() < self._settings.needed:
             return False
-        # The first two sightings of a track determine direction and rate, and later sightings test direction
-        # and rate.
+        # The first two sightings determine direction and rate, and later sightings test both.
         tested = 2 * (track.sightings - 1)
         if track.chi_square > bound(self._settings.missed, tested):
             return False

@@ -99,8 +99,7 @@ class Wire:
         # Bytes sent after the end of a delay fault arrive after the delayed bytes, as on a real line.
         start_ns = max(start_ns, self._last_ns)
         if data and sender_baud != receiver_baud:
-            # A receiver with a lower baud rate than the sender receives fewer characters; all characters are
-            # random.
+            # A receiver with a lower baud rate than the sender receives fewer characters, all random.
             data = self._rng.bytes(max(1, len(data) * min(receiver_baud, sender_baud) // sender_baud))
         room = self._capacity - self._waiting
         self.lost_bytes += max(0, len(data) - room)

@@ -738,8 +738,7 @@ class Vn100Emulator:
     # Output.
 
     def _sample(self, now_ns: int) -> Vn100Sample:
-        # The first three fields of register 85 are the filter lengths of magnetometer, accelerometer and
-        # gyro.
+        # Register 85 begins with the filter lengths of magnetometer, accelerometer and gyro.
         windows = tuple(map(int, self.registers.values[85][:3]))
         sample = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return sample if self.alter is None else self.alter(sample)

@@ -126,8 +126,7 @@ class Sensors:
         """
         self._rng, self._profile = rng, profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
-        # The measured quaternion is bilinear in the true quaternion and the error quaternion, so one matrix
-        # computes it.
+        # A matrix product is enough, because the measurement is bilinear in true and error quaternion.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
         self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
         self._fixed_bias = gyro_bias

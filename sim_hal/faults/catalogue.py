@@ -353,8 +353,7 @@ def _unplugged(bench: Bench, *_: object) -> Removal:
 
 
 def _baud(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # The baud rate changes even if the line becomes too slow, because the emulated register write is not
-    # checked.
+    # The emulated write is not checked, so the baud rate changes even if the line is then too slow.
     with suppress(UnitError):
         bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
     return no_removal

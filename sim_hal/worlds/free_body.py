@@ -249,8 +249,7 @@ def coil_frames(dipoles: FloatArray) -> FloatArray:
         if float(start @ end) == 1.0:
             frames.append(np.eye(3))
             continue
-        # A rotation by 180 deg about `start`, followed by one about the bisector `middle`, maps `start` to
-        # `end`.
+        # `end` is `start` rotated by 180 deg about `start` and then by 180 deg about the bisector `middle`.
         middle = start + end
         across = np.eye(3)[(index + 1) % 3]
         if float(middle @ middle) < 1e-12:
@@ -523,8 +522,7 @@ class FreeBody:
                 field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
                 specific_force_body=np.zeros(3),
             )
-            # The motion is cached, because truth recorder and inertial unit read the motion at the same
-            # times.
+            # Truth recorder and inertial unit read the motion at the same times, so the motion is cached.
             self._read = self._state, motion
         return motion
 

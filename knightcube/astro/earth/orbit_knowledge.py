@@ -297,8 +297,7 @@ def check_lines(first: str, second: str) -> None:
         )
     days = 366.0 if int(first[18:20]) % 4 == 0 else 365.0
     if not 1.0 <= float(first[20:32]) < days + 1.0:
-        # For resonant orbits, SGP4 takes steps of half a day, and an absurd epoch would require too many
-        # steps.
+        # For resonant orbits, SGP4 takes steps of half a day, which are too many for an absurd epoch.
         raise UsageError(
             f"{first!r}: line 1, columns 21 to 32: the day of the year of the epoch, {first[20:32].strip()}, "
             f"must be from 1 to {days:g}"

@@ -251,10 +251,9 @@ class CoilMap:
         normals = np.array([np.cross(one, other) for one, other in combinations(units.T, 2)])
         normals = normals[np.linalg.norm(normals, axis=1) > _PARALLEL]
         reached = np.abs(normals @ self.dipoles) @ self.current_limits
-        # Each element of `use @ box` belongs to a face of the zonotope of possible dipole moments. The
-        # element is the largest component, along the normal of the face, of a point of the box, divided by
-        # the distance of the face from the centre. Each iteration scales the multiplier of a face by this
-        # ratio, as in iterative proportional fitting.
+        # Each element of `use @ box` belongs to a face of the zonotope of possible dipole moments.
+        # The element is the extent of the box along the face's normal, divided by the face's distance.
+        # Each iteration scales the multiplier of a face by this ratio (iterative proportional fitting).
         use = np.abs(normals) / reached[:, None]
         multipliers = np.full(len(use), 3.0 / len(use))
         for _ in range(_STEPS):

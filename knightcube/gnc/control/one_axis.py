@@ -164,8 +164,7 @@ class LqTracker:
             v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
         else:
-            # The coil can provide the deceleration `braking` (rad/s^2) until the angle of the path is
-            # reached.
+            # The coil can decelerate by `braking` (rad/s^2) until the body reaches the angle of the path.
             authority = max(min(math.cos(angle), math.cos(wanted.angle)), 0.0)
             taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
             braking = max(
@@ -291,8 +290,7 @@ class ExcitationController:
             return CurrentCommand.without_authority(error)
         if self._phase is _Phase.MOVING:
             pulse = self._pulse()
-            # A manoeuvre may continue if the body can still be stopped within the angle bound or moves
-            # inwards.
+            # A manoeuvre continues if the body can still stop within the bound or moves inwards.
             outward = rate if angle >= 0.0 else -rate
             braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
             has_room = abs(angle) + 0.5 * max(outward, 0.0) ** 2 / braking < self._bound

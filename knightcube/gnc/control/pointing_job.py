@@ -270,8 +270,7 @@ def slew_table(
     times = np.asarray(first + step * np.arange(FINE * begin.kept + 1), dtype=float)
     wanted = references(law, ahead, times)
     flown = path.references(times[:count] - first)
-    # The residual dipole moment is added to the table, because the pointing law subtracts the estimate in
-    # flight.
+    # The pointing law subtracts the residual dipole moment in flight, so it is added to the table.
     dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual
     stop = count + round(TAIL / step)
     tracked = _joined(flown, wanted.until(stop + 1))
@@ -369,8 +368,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
     wanted = references(
         law_of(job.target, job.axes, path.quaternion[-1], ahead, LEAD + path.horizon), ahead, times
     )
-    # The residual dipole moment is added to the table, because the pointing law subtracts the estimate in
-    # flight.
+    # The pointing law subtracts the residual dipole moment in flight, so it is added to the table.
     dipole = path.dipoles(times[:count] + 0.5 * step - LEAD) + wish.residual
     tracked = _joined(path.references(times[:count] - LEAD), wanted)
     gain, torque_part = _tracking(tracked, ahead, dipole, begin, job.weights)

@@ -258,8 +258,7 @@ class SunAcquisition:
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
         torque = torque + (speed**2 * seeking.inertia) @ _rotation_to_sun(seeking.axis, sun)
-        # A torque about the Sun direction, which disturbs the pointing least, cancels the torque along the
-        # field.
+        # A torque about the Sun direction cancels the torque along the field.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun
         return torque - spread * (float(field @ torque) / float(field @ spread))

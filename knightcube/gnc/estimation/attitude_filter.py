@@ -541,8 +541,7 @@ class AttitudeFilter:
         enough = min(max(accepted, self.REJECTIONS_AT_THE_START), self.REJECTIONS_TO_RESTART)
         if kind is not MeanRateMeasurement and in_a_row >= enough:
             self._history.restart(None)
-            # The measurements contradict the prior. The prior may be a wrong estimate from before the last
-            # boot.
+            # The contradicted prior may be a wrong estimate from before the last boot.
             self._prior = slow_prior(self._model.body, self._settings)
             self._layout = error_state(self._model.body, self._settings, self._prior)
             self._refused_in_a_row = {}

@@ -359,8 +359,7 @@ class FieldRate:
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings
-        # The error of the gyroscopic torque remains correlated until the body has rotated by about one
-        # radian.
+        # The gyroscopic torque error is correlated until the body has rotated by about one radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
         # The filter is linearised, so products of the errors of rate, inertia and field change act as noise.

@@ -691,8 +691,7 @@ class FreeFilter:
         """
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
-        # The rotation since the measurement is computed from the estimated rate, and its error follows from
-        # the error of the rate.
+        # The rotation since the measurement is estimated from the rate, and has an error due to the rate.
         rows[:, ATTITUDE], rows[:, RATE] = _EYE, -age * _EYE
         misaligned = CAMERA if by_stars else HORIZON
         rows[:, misaligned] = _EYE
@@ -864,8 +863,7 @@ BODY: IntArray = np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA]
 LEARNED = {"body": BODY, "coils and body": np.r_[BODY, COILS]}
 """Indices of the estimated states that the motion can contradict: the entry `body` applies without coil
 currents, and the entry `coils and body` with coil currents."""
-# If all these states are doubled, the motion is the same, because inertia, dipoles and torques have a common
-# scale.
+# Inertia, dipoles and torques have a common scale: doubling all these states does not change the motion.
 _SCALED: FloatArray = np.zeros(STATES)
 _SCALED[LEARNED["coils and body"]] = 1.0
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))

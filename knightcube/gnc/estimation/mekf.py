@@ -127,8 +127,7 @@ def innovation(
     argument `change` is needed for rate samples whose age is estimated.
     """
     size, noise = SIZE + 3 * len(state.kept), measurement.covariance
-    # Measured directions and fields need no projection onto the y axis, because the attitude of a suspended
-    # body has no variance about x and z.
+    # Directions and fields need no projection, as a suspended body has no attitude variance about x and z.
     if isinstance(measurement, DirectionMeasurement):
         return _direction(state, measurement, size)
     if isinstance(measurement, FieldMeasurement):
@@ -169,8 +168,7 @@ def _mean_rate(state: FilterState, measurement: MeanRateMeasurement, size: int) 
     x, y, z = measurement.rate.tolist()
     square = px * px + py * py + pz * pz
     angle = math.sqrt(square)
-    # The factor 1/p^2 - (1 + cos p) / (2 p sin p) tends to 1/12, and differs from it by less than 1e-6 below
-    # 0.03 rad.
+    # The factor 1/p^2 - (1 + cos p) / (2 p sin p) is within 1e-6 of its limit 1/12 below 0.03 rad.
     second = 1.0 / 12.0 if angle < 0.03 else 1.0 / square - 0.5 / (angle * math.tan(0.5 * angle))
     by_error = np.array(skew((px, py, pz)))
     by_error = (_EYE + 0.5 * by_error + second * (by_error @ by_error)) / span

@@ -222,8 +222,8 @@ def free_roll(
 def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
     """Return the function for the direction to an object that moves on a straight line relative to the body.
 
-    At the time `since`, s, the object is in `direction` (3,). The relative velocity of the object divided by
-    the distance is `velocity` (3,), 1/s, which is zero for a fixed direction.
+    At the time `since`, s, the unit vector `direction` (3,) points to the object. The relative velocity of
+    the object divided by the distance is `velocity` (3,), 1/s, which is zero for a fixed direction.
     """
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
@@ -237,7 +237,7 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
 
-    The law starts with the given attitude (4,), rotated by the least angle so that `axis` is aligned.
+    The law starts with the given attitude (4,) after the smallest rotation that aligns `axis`.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)
@@ -290,7 +290,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
     """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
     cosine = float(start @ end)
-    if cosine < -1.0 + 1e-9:  # for opposite directions, any axis normal to them is suitable
+    if cosine < -1.0 + 1e-9:  # opposite directions: any axis normal to both
         return vector
     return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
 
@@ -302,7 +302,7 @@ def _any_across(axis: FloatArray) -> FloatArray:
 
 
 def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return right-handed frames (n, 3, 3) whose rows are `first`, the common normal, and their product."""
+    """Return right-handed frames (n, 3, 3) with rows `first`, the common normal, and their cross product."""
     normal = np.cross(first, second)
     sine = np.linalg.norm(normal, axis=1, keepdims=True)
     if float(np.min(sine)) < MINIMUM_SINE:

@@ -68,7 +68,7 @@ class SingleAxisPlant:
 
     Attributes:
         inertia: J, kg m^2.
-        torque_constant: torque per current n A B of the coil at theta = 0, N m/A.
+        torque_constant: torque per current of the coil at theta = 0 (n A B), N m/A.
         resistance: resistance of the coil, ohm.
         current_limit: largest absolute value of the coil current, A.
         stiffness: torsional stiffness k of the thread, N m/rad.
@@ -369,7 +369,7 @@ class PolynomialPath:
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> PathSample:
-        """Return the motion at `now_ns`: the initial motion before the path starts, a coast after it ends."""
+        """Return the motion at `now_ns`: the initial motion before the path, a coast after the path."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
             angle = self.end_angle + self.end_rate * (elapsed - self.horizon)
@@ -378,8 +378,7 @@ class PolynomialPath:
                 return PathSample(math.copysign(farthest, angle), 0.0, 0.0)
             return PathSample(angle, self.end_rate, 0.0)
         s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
-        # Clenshaw's recurrence is computed with Python floats, which are faster than numpy arrays of twenty
-        # elements.
+        # Clenshaw's recurrence is faster with Python floats than with numpy arrays of twenty elements.
         twice = 2.0 * s
         a1 = a2 = b1 = b2 = c1 = c2 = 0.0
         for a, b, c in self.series[:-1]:

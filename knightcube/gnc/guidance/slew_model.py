@@ -114,7 +114,7 @@ EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the components A(q) v (n, 3) of vectors v in body axes.
 
-    If q is not a unit quaternion, the components are multiplied by |q|^2.
+    If q is not a unit quaternion, the returned components are those of a unit quaternion times |q|^2.
     """
     v, s = q[:, :3], q[:, 3:]
     inner = np.sum(v * vector, axis=1, keepdims=True)
@@ -285,7 +285,7 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return, for each time, the fraction of its interval before the time, and data of the interval.
+        """Return the position (0 to 1) of each time in its interval, and data of the interval.
 
         The interval lies between two knots of the curve. The data are the length, the first value, the change
         of the value, and the slopes at both ends.
@@ -441,7 +441,7 @@ class BoresightEnd:
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return whether the boresight at an attitude (4,) of zero error is not opposite to the direction."""
+        """Return whether the boresight at an attitude (4,) of zero error is not opposite the direction."""
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
@@ -534,8 +534,8 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
 
 
 NODES = 24
-"""Default number of collocation intervals. Compared with 48 intervals, the heat of a slew differs by less
-than 0.1 %, and the shortest duration of a slew by less than 0.6 %."""
+"""Default number of collocation intervals. The heat of a slew differs by less than 0.1 % from the heat on 48
+intervals, and the shortest duration by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
@@ -615,8 +615,8 @@ def check(task: SlewTask) -> None:
             raise PlanningError(
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
             )
-        # The cones move by some degrees during a slew. An end attitude that is deep inside a
-        # cone therefore remains inside it, whatever the duration of the slew.
+        # The cones move by only a few degrees during a slew.
+        # An end attitude deep inside a cone is therefore inside for any duration of the slew.
         if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
             clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
             if float(clearance[0]) >= -_DEEP:

@@ -68,7 +68,7 @@ _STEPS = 4
 """Number of Runge-Kutta steps per collocation interval, an even number."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
 """Largest number of corrections of a path, error at the nodes (half angle, rad) below which the corrections
-end, and error at the nodes above which the corrections have failed."""
+end, and error at the nodes above which the plan of the path fails."""
 
 
 def closed(
@@ -280,7 +280,7 @@ def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
 
 
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the violations (cones, 2 nodes), rad, of the margins to the cones between neighbouring points.
+    """Return the largest violation (cones, 2 nodes), rad, of each cone's margin between neighbouring points.
 
     The required margin is `_ROOM`, or the angle between cone and camera axis at the start or at the end of
     the path, if this angle is smaller.
@@ -383,8 +383,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
         except PlanningError as error:
             failed = error
         else:
-            # Plans are compared first by the duration, if it exceeds the requested duration, and then by the
-            # cost.
+            # Plans rank by their duration if it was extended, and then by their cost.
             if order.time_cost is None:
                 value = (plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0, plan.energy)
             elif math.isinf(order.time_cost):
@@ -491,12 +490,13 @@ def plan_slew(
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
             default is three times `duration`.
-        window: length of the time interval in which the slew may begin, s, at the time of minimum energy.
+        window: length of the time interval in which the slew begins at the time of minimum energy, s.
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
             energy plus `time_cost` times the duration. If the time cost is infinite, the shortest slew is
             planned; if it is None, the duration is fixed.
         pointing_axis: unit vector (3,) of the body axis that points to the targets.
-        across_axis: unit vector (3,) of the body axis, normal to `pointing_axis`, at which a roll begins.
+        across_axis: unit vector (3,) of the body axis, normal to `pointing_axis`, from which a roll is
+            measured.
         camera_axis: unit vector (3,) of the body axis outside the cones, or None for `pointing_axis`.
         cones: half angles of the exclusion cones of Sun and Moon, and angle from the Earth's limb, rad.
         nodes: number of collocation intervals, 8 to 96.

@@ -47,7 +47,7 @@ next node."""
 EQUATIONS: IntArray = np.r_[10:17, 24:31]
 """Indices of the 14 multipliers of an interval among the 31 elements of the interval."""
 _BAND = 33
-_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, including the rows for fill-in by pivoting
+_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, including fill-in by pivoting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -392,7 +392,7 @@ _HALVINGS = 7
 _CORRECTED, _CORRECTIONS = 4, 2
 """Number of step halvings that include second-order corrections, and number of corrections per halving."""
 _HEAVIER = 1.2
-"""Weight of the constraint violation in the merit function, relative to the largest Lagrange multiplier."""
+"""Weight of the constraint violation in the merit function, divided by the largest Lagrange multiplier."""
 _FAR = 0.03
 """Sum of the constraint violations above which the second derivatives of the equations are omitted."""
 _DAMPED = 3e-3
@@ -407,9 +407,10 @@ FIRST_BARRIER = 1e-3
 class Iterate:
     """An iterate of the interior point method.
 
-    The Lagrange multipliers of the equations are at their indices in the vector (size,) of all elements. The
-    slack and dual variables are those of the inequalities g >= 0. The derivative (size,) of the Lagrangian
-    without the inequalities, with respect to all unknowns and multipliers, is `slope`.
+    The array `multipliers` (size,) contains the Lagrange multipliers of the equations at the indices that the
+    layout assigns to them. The slack and dual variables belong to the inequalities g >= 0. The attribute
+    `slope` is the derivative (size,) of the Lagrangian without the inequalities, with respect to all unknowns
+    and multipliers.
     """
 
     linear: LinearisedEquations
@@ -515,8 +516,7 @@ class SlewProgram:
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
         change = factors.solve(right)
-        # The curvature d.H.d of the step d follows from H d + C' l = a and C d = b, and is equal to a.d -
-        # b.l.
+        # The step d satisfies H d + C' l = a and C d = b, so its curvature d.H.d equals a.d - b.l.
         equal, primal = self._equal, self._primal
         bend = right[primal] @ change[primal] - right[equal] @ change[equal]
         if bend <= 1e-8 * min(convex, 1.0) * float(change[primal] @ change[primal]):
@@ -603,7 +603,7 @@ class NewtonRun:
         """Return the optimum found within `maximum` more Newton steps, or None if no optimum was found."""
         if self.is_over:
             return None
-        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only shortens the next step
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only shortens the step
             return self._run(maximum)
 
     def _run(self, maximum: int) -> Iterate | None:

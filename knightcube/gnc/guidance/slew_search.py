@@ -223,22 +223,23 @@ _COSINES = 6
 """Number of cosine terms that describe the time dependence of the torque about each axis."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights in the fit of the momentum path: of the error of the end attitude (per rad), of the depth inside an
-exclusion cone (per unit of cosine), and of the mode amplitudes."""
+"""Weights of the residuals of the momentum fit: error of the end attitude (per rad), depth inside an
+exclusion cone (per unit of cosine), and mode amplitudes."""
 _ROOM = 0.03
 """Margin between a guess and an exclusion cone, as a difference of cosines."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
 """Largest change of the mode amplitudes in an iteration of the momentum fit."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Heat of a mode below which the mode is discarded (first value), and singular value below which a direction
-of the end momentum is not controlled (second value). Both values are relative to the largest heat and to the
-largest singular value."""
+"""Heat of a mode, divided by the largest heat of a mode, below which the mode is discarded (first value).
+Singular value, divided by the largest singular value, below which a direction of the end momentum is not
+controlled (second value)."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
 """End error (rad), and depth inside a cone (as a difference of cosines), above which a guess is tried after
 all other guesses."""
 _SAME = 0.1
-"""Relative difference of mode amplitudes below which two momentum curves count as equal."""
+"""Difference of mode amplitudes, as a fraction of the amplitudes, below which two momentum curves count as
+equal."""
 
 
 def guesses(equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -> list[Trajectory]:
@@ -248,8 +249,7 @@ def guesses(equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -
     """
     motion, found = equations.motion, []
     for states in _MomentumFit(equations, craft, kept).found():
-        # The dipole is the smallest dipole that produces the component of the required torque across the
-        # field.
+        # The dipole is the smallest one that produces the required torque across the field.
         still = motion.flow(states, np.zeros((len(states), 3)))
         wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
         field = motion.field(states[:, :4])
@@ -259,10 +259,10 @@ def guesses(equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -
 
 
 def _curves(equations: Transcription, craft: SlewCraft) -> tuple[FloatArray, FloatArray]:
-    """Return a curve (n, 3) of the angular momentum from start to end, and d modes (d, n, 3) of its change.
+    """Return a curve (n, 3) of the angular momentum from start to end, and d additive modes (d, n, 3).
 
     The momentum is in kg m^2/s and ICRS axes. The modes preserve both ends, and are orthogonal, so that their
-    heats are additive. The torques of an amplitude of one rotate the body by about half a revolution.
+    heats are additive. A mode with the amplitude one rotates the body by about half a revolution.
     """
     field, start, end, scale = equations.around.field, equations.start, equations.end, equations.scale
     count = len(field)
@@ -389,7 +389,7 @@ _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02
 path and the longest duration without a path below which the shortening ends (second value). The three pairs
 are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
 _CROSSED = 1.3
-"""Angle by which a cone that a path crosses between two points is widened, relative to the depth of the path
+"""Angle by which a cone that a path crosses between two points is widened, divided by the depth of the path
 inside the cone."""
 _BEYOND = math.radians(0.02)
 """Additional angle (rad) by which a cone that a path crosses between two points is widened."""
@@ -400,8 +400,7 @@ _LOST, _EASED_STEP = 1.5, 1.03
 """Ratio of the dipole to the dipole limit above which an integrated path is abandoned (first value). The
 second value is an additional factor for the duration of a path whose dipole exceeds the limit by less."""
 _PEAK = 0.9
-"""Ratio of the largest dipole to the dipole limit for which the first duration of the continuation is
-chosen."""
+"""Ratio of the largest dipole to the dipole limit at the first duration of a continuation."""
 
 
 class HorizonContinuation:
@@ -552,10 +551,10 @@ class HorizonContinuation:
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
 """Number of collocation intervals of each successive search, and its budget of work. When the work, measured
 in Newton steps times intervals, exceeds the budget, no further guess is tried. A search with a work of 1,000
-(in this unit) takes about 0.1 s. Ten intervals are too coarse for paths around exclusion cones, because
-coarse paths around cones differ too much from paths on the fine grid."""
+(in this unit) takes about 0.1 s. Searches with exclusion cones begin with 12 intervals, because on ten
+intervals a path around a cone differs too much from the path on the fine grid."""
 _WALKS = 1.8
-"""Work, relative to the budget of a search, after which the continuation ends and returns the best path so
+"""Work, as a multiple of the budget of a search, after which the continuation ends with the best path so
 far."""
 _MAXIMUM_TRIED = 16
 """Largest number of initial guesses that are tried for one duration."""
@@ -618,7 +617,7 @@ class SlewSearch:
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
     def _tried(self, paths: list[SolvedPath]) -> Iterator[SolvedPath]:
-        """Yield the paths; after the trial of each, reset the cones and the dipole limit of the solver."""
+        """Yield the paths; after each trial, reset the cones and the dipole limit of the solver."""
         for path in paths:
             yield path
             self._widened, self.solver.share = 0, 1.0
@@ -665,7 +664,7 @@ class SlewSearch:
             yield batch
 
     def _late(self, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield paths found, without the dipole limit, from the deferred guesses, least violation first."""
+        """Yield paths without the dipole limit from deferred guesses, in order of constraint violation."""
         for descent in sorted(deferred, key=lambda descent: descent.lack):
             if self.solver.work > self._budget:
                 break
@@ -681,7 +680,7 @@ class SlewSearch:
             if (kept and energy(start) >= min(map(energy, kept))) or self.solver.work > self._budget:
                 break
             if any(math.isclose(energy(start), known, rel_tol=1e-4) for known in self._known):
-                continue  # a path of the same energy was already tried without success
+                continue  # a path of the same energy was tried without success
             self._known.append(energy(start))
             found = self._walker.within(start)
             if found is not None:

@@ -154,12 +154,11 @@ def prey_paths(task: SlewTask, horizon: float) -> Iterator[FloatArray]:
 
 
 def _end_attitude(end: End, near: FloatArray) -> FloatArray:
-    """Return the attitude (4,) at the end; if the roll is free, that with the least rotation from `near`."""
+    """Return the attitude (4,) at the end, which is the closest to `near` if the roll is free."""
     if isinstance(end, AttitudeEnd):
         return end.quaternion
     seen = shown(near[None], end.direction[None])[0]
-    # The half-way quaternion between the direction in the body axes at `near` and the boresight axis has no
-    # roll.
+    # The half-way quaternion from the direction at `near` to the boresight, body axes, has no roll.
     half = np.append(np.cross(end.axis, seen), 1.0 + float(seen @ end.axis))
     if float(np.linalg.norm(half)) < 1e-6:  # opposite directions
         half = np.append(tangent_basis(end.axis)[0], 0.0)
@@ -375,7 +374,8 @@ class VmcProgram:
     def excess(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return excesses (n, 6 + cones) over the limits at n points, and the gradients (n, 6 + cones, k).
 
-        An excess over the dipole limit is relative to the usable limit, a fraction `share` of it.
+        An excess over the dipole limit is divided by the usable limit, which is the fraction `share` of the
+        dipole limit.
         """
         values, slopes = self._cost.values(y)
         limit = self.share * self._task.craft.limit / self._unit
@@ -431,7 +431,7 @@ class VmcProgram:
             solver.add_inequality_mconstraint(limits, np.full(int(imposed.sum()), _MET))
         try:
             found = np.asarray(solver.optimize(start))
-        except SOLVER_STOPS:  # rounding limits the progress near an optimum
+        except SOLVER_STOPS:  # near an optimum, rounding errors limit the progress
             found = last
         else:
             if solver.last_optimize_result() not in CONVERGED:

@@ -52,7 +52,7 @@ ProgramAt = Callable[[float], PathProgram]
 initial guess of this duration (the prey path of virtual motion camouflage)."""
 
 SHORTEST_COST = 7.0
-"""Time cost in the search for the shortest duration, relative to the largest coil power R Imax^2. An infinite
+"""Time cost in the search for the shortest duration, divided by the largest coil power R Imax^2. An infinite
 time cost would give the bang-bang path, whose energy is up to 1 % above the optimum for the same duration.
 With SHORTEST_COST, the duration is about 0.3 % longer than the shortest duration, and the energy is within
 0.25 % of the optimum."""
@@ -214,7 +214,10 @@ class HorizonSearch:
         return program, trial
 
     def _resumed(self, program: PathProgram, warm: FloatArray, asked: float, longest: float) -> Trial | None:
-        """Return the path found by a warm start, with limits at once if `warm` exceeds them, or None."""
+        """Return the path found by a warm start, or None.
+
+        The limits are imposed at once if the start reaches a limit.
+        """
         start = program.beside_prey(warm, asked)
         worst = float(np.abs(program.ratios(start)).max())
         if not worst < _START_BELOW:
@@ -329,12 +332,13 @@ def plan(
     Rates are body rates in rad/s. The argument `reference` is the reference point q_r of Sease, eq. (5.10),
     which must lie beyond the range of q2, and `q2_limit` is the upper bound of |q2|. The duration is extended
     to at most `max_stretch` times the requested duration. An extended duration is about 0.3 % longer than the
-    shortest on `nodes` nodes, and at most 1.5 % longer than that of the bang-bang path.
+    shortest duration on `nodes` nodes, and at most 1.5 % longer than the duration of the bang-bang path.
 
     If `time_cost`, W, is given, the path minimises energy plus `time_cost` times duration. The optimised
     duration is between SHORTEST_WITH_TIME_COST s and `max_stretch` times `horizon`, which is the initial
     guess. The argument `last` is the path followed until now, with an origin relative to the start of the new
-    path. The initial guess is the remaining part of the path `last`. The energy is selected by `cost`.
+    path. The initial guess is the remaining part of the path `last`. The argument `cost` selects the kind of
+    energy.
 
     Raises PlanningError if an argument is outside its limits, or if no permitted duration is feasible.
     """
@@ -381,10 +385,11 @@ def plan(
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
     """Return the difference (N,), on the nodes, between the rest of the path `last` and its initial guess.
 
-    The initial guess is the cubic with the same end states as the rest of the path. The result is None if
-    nothing of the path remains.
+    The initial guess is the cubic with the same end states as the rest of the path. The result is None if the
+    path `last` has ended.
 
-    Added to the initial guess of another path, the difference gives the boundary states of that path.
+    Adding the difference to the initial guess of another path does not change the boundary states of that
+    path.
     """
     if last is None:
         return None
@@ -474,8 +479,9 @@ def _check(
 class PlanJob:
     """A planning job for a path of `horizon` s between two states, which consist of q2 and rate (rad/s).
 
-    The job has a `number`, and the path starts at `origin_ns`. The attribute `last` is the path followed
-    until now, with an origin relative to `origin_ns`. The other attributes are arguments of `plan`.
+    The attribute `number` identifies the job, and the path starts at `origin_ns`. The attribute `last` is the
+    path followed until now, with an origin relative to `origin_ns`. The other attributes are arguments of
+    `plan`.
     """
 
     number: int
@@ -543,8 +549,9 @@ def plan_step(
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
-        time_cost: cost of time, W, for minimum energy plus cost times duration; None for a fixed duration.
-        minimise: "heat" for the integral of R I^2, or "supply" for that of V |I|, the energy of the supply.
+        time_cost: cost of the duration, W, which is added to the energy; None for a fixed duration.
+        minimise: "heat" for the integral of R I^2, or "supply" for the integral of V |I|, the energy from the
+            supply.
         nodes: number of nodes of the path, 8 to 40.
         max_stretch: largest ratio of the duration to `horizon`.
 

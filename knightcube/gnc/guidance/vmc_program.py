@@ -90,8 +90,7 @@ def discretisation(count: int) -> Discretisation:
     fine = lgl_rule(2 * count)
     dense = -np.cos(np.linspace(0.0, np.pi, DENSE_POINTS))
     slopes = rule.differentiation[[0, -1]]
-    # The values at the nodes next to the ends change so that q' at the ends remains constant (Sease, eqs.
-    # (5.11), (5.12)).
+    # The values next to the ends change so that q' at the ends stays constant (Sease, eqs. 5.11, 5.12).
     next_to_ends = np.linalg.solve(slopes[:, [1, -2]], -slopes[:, 2:-2])
     free = np.zeros((count, count - 4))
     free[2:-2] = np.eye(count - 4)
@@ -189,15 +188,15 @@ def time_scale(horizon: float) -> FloatArray:
 
 LIMIT_TOLERANCE = 3e-4
 """Largest relative amount by which a path may exceed a limit on the dense grid. Between the points of the
-dense grid, the relative excess then stays below 1e-3."""
+dense grid, the path then exceeds a limit by less than the fraction 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
 """Relative margin by which an imposed limit is tightened, so that peaks between the imposed points do not
 exceed the limit. Without this margin of the imposed limits, the exchange method converges slowly."""
 
 SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
-"""Exceptions with which a run of NLopt ends without a result. NLopt 2.11 raises `nlopt.runtime_error`, and
-older versions raise Python's RuntimeError."""
+"""Exceptions that a run of NLopt without a result raises. NLopt 2.11 raises `nlopt.runtime_error`, and older
+versions raise Python's RuntimeError."""
 CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 """Results of converged runs of NLopt."""
 _EXCHANGES = 10
@@ -256,16 +255,15 @@ class PathProgram:
         self, plant: SingleAxisPlant, family: PathFamily, q2_limit: float, horizon: float, cost: PathCost
     ) -> None:
         self.plant, self._cost = plant, cost
-        # The ends of the path are given, so the margin to the limit of q2 is smaller if an end is close to
-        # the limit.
+        # The margin to the limit of q2 is smaller if a given end of the path is close to the limit.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * float(np.abs(family.still[[0, -1]]).max()))
-        # Intermediate paths of the optimiser may exceed |q2| = 0.707, at which the computed current is
-        # infinite. A value of q2 above the limit is clamped, so that the current stays finite.
+        # Intermediate paths of the optimiser may exceed |q2| = 0.707, at which the current is infinite.
+        # A value of q2 above the limit is clamped, so that the current stays finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * family.grid.cost_weights
         self.bang_power = plant.resistance * plant.current_limit**2
-        # The family is rescaled so that the energy has a unit Gauss-Newton Hessian. SLSQP starts with a unit
-        # matrix as Hessian, so the first step from the initial guess (prey path) is the Gauss-Newton step.
+        # The family is rescaled so that the energy has a unit Gauss-Newton Hessian.
+        # SLSQP starts with a unit Hessian, so its first step from the initial guess is a Gauss-Newton step.
         observed = family.observed(family.grid.cost)
         prey = observed.trajectory(np.zeros(family.size), horizon)
         _, slopes = self._current(prey, horizon)
@@ -349,9 +347,9 @@ class PathProgram:
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
-        # If the start is already the optimum, NLopt reports that rounding errors limit the progress, which is
-        # not a failure. At an optimum, half the squared gradient with respect to the whitened parameters is
-        # small; it estimates the energy that a further step could save.
+        # If the start is already the optimum, NLopt reports limited progress due to rounding errors.
+        # This report is not a failure if a further step could save little energy.
+        # That energy is estimated by half the squared gradient with respect to the whitened parameters.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
@@ -372,7 +370,7 @@ class PathProgram:
             if worst <= 1.0 + LIMIT_TOLERANCE:
                 return trial if converged else None
             if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
-                return None  # the optimiser has not satisfied an imposed limit
+                return None  # the run violated an imposed limit
             added = _peaks(latest) & ~chosen
             ratios = np.where(added, latest, ratios)
             chosen = chosen | added
@@ -414,7 +412,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except SOLVER_STOPS:
-            # NLopt raises such an error for trivial and infeasible problems, after a negligible line search.
+            # NLopt raises these after a negligible line search, for trivial and infeasible problems.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in CONVERGED
 
