@@ -183,7 +183,7 @@ def test_the_text_states_each_constant_with_its_uncertainty_and_its_configured_v
     assert lines[3] == f"  gain:             +3.00000e-01 +- 1.0e-02 rad/s^2/A, configured {gain:.4g}"
     assert lines[4].startswith("  torsion:          -2.00000e-02 +- 2.0e-02 1/s^2, configured ")
     assert lines[8].startswith("  delay:            +5.00000e-02 +- 6.0e-02 s, configured 0")
-    assert lines[11].startswith("  inertia:            1.10000e-03 +- 1.0e-05 kg m^2")
+    assert lines[11].startswith("  inertia:           1.10000e-03 +- 1.0e-05 kg m^2")
     assert lines[11].endswith(" 25 % prior, 75 % motion with dipole and field")
     assert lines[13].endswith("T          75 % magnetometer and prior, 25 % motion with inertia and dipole")
     assert lines[14].startswith("  torque constant:   2.90000e-05 +- 3.0e-07 N m/A")
