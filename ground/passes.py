@@ -232,7 +232,7 @@ class OrbitPrediction:
     def eclipses(self) -> list[tuple[datetime, datetime]]:
         """Return start and end of each eclipse in the span.
 
-        At both times, half of the Sun's disc is visible.
+        At the start and at the end of an eclipse, half of the Sun's disc is visible.
         """
         dates = np.array([julian_date(at) for at in self._at])
         # The Sun's direction changes slowly, so that 25 ephemeris values a day are sufficient.

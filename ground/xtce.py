@@ -324,7 +324,7 @@ def _add_verifiers(command: Element, layout: Layout) -> None:
             _add_condition(either, "verification_stage", dict(STAGES)[stage])
         window_of = {"timeToStopChecking": window, "timeWindowIsRelativeTo": "commandRelease"}
         SubElement(verifier, "CheckWindow", window_of)
-        if kind in {"Complete", "Failed"}:  # only these verifiers may return a parameter
+        if kind in {"Complete", "Failed"}:  # other verifiers cannot return a parameter
             SubElement(verifier, "ReturnParmRef", {"parameterRef": "verification_text"})
 
 

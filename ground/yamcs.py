@@ -74,7 +74,10 @@ enabled: true
 authModules: [{class: org.yamcs.security.YamlAuthModule}]
 """
 USERS, USER = "etc/users.yaml", "admin"
-"""Password file, and user name. Without the file, Yamcs accepts a publicly known default password."""
+"""File of Yamcs's password, and name of Yamcs's user.
+
+Without the file, Yamcs accepts a publicly known default password.
+"""
 
 _INSTANCE = """\
 services:

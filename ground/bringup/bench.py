@@ -145,7 +145,7 @@ class Session:
         return device
 
     def wait(self, seconds: float, each: Callable[[], None] | None = None) -> None:
-        """Wait, and call `each` every 25 ms."""
+        """Wait for `seconds` s, and call `each` every 25 ms."""
         until_ns = self.rig.clock.now_ns() + round(seconds * SECOND_NS)
         while (now_ns := self.rig.clock.now_ns()) < until_ns:
             if each is not None:

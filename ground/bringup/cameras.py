@@ -49,7 +49,7 @@ def step_dark(session: Session) -> Outcome:
     if findings:
         pass
     elif np.array_equal(first, second):
-        if level > 0.0:  # a camera with a low black level may show zeros behind its cap
+        if level > 0.0:  # a camera with a low black level may deliver only zeros with the cap on
             text = f"all frames are equal ({level:.0f} counts)"
             cure = "check sensor, cable, gain and `pixel_format`"
             findings.append(Finding("camera", "no signal", text, cure))
@@ -121,7 +121,7 @@ def _format_faults(part: str, camera: Camera | WideCamera, frames: Sequence[Fram
 
 
 def _dead_lines(first: FloatArray, second: FloatArray) -> str:
-    """Return a text about the numbers of rows and columns that two frames share exactly, or an empty text."""
+    """Return a text about rows and columns that are identical in two frames, or an empty text."""
     same = first == second
     rows, columns = int(same.all(axis=1).sum()), int(same.all(axis=0).sum())
     return f"{rows} rows and {columns} columns do not change" if rows or columns else ""
@@ -171,7 +171,7 @@ def _no_light(dark: Outcome | None, pixels: Image, level: float, sources: int) -
 
 
 def psf_width(pixels: Image) -> tuple[float, int]:
-    """Return the PSF width (standard deviation, px) and the number of stars; NaN for fewer than 5 stars.
+    """Return the PSF width (standard deviation, px; NaN for fewer than 5 stars) and the number of stars.
 
     Stars that are many pixels wide are measured in binned frames.
     """
@@ -299,7 +299,7 @@ def step_wide(session: Session) -> Outcome:
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
-    """Return the cameras whose covering darkens the frame `pixels`, given its frame for each covered lens."""
+    """Return the cameras whose covering darkens a frame: `pixels` uncovered, `covered` by covered camera."""
     level = float(np.mean(pixels))
     levels = {key: float(np.mean(frame)) for key, frame in covered.items()}
     darkest = min(levels.values())

@@ -104,8 +104,8 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
 
     The result of a flight contains its random parameters and those performance measures that have a limit.
     The limits are those of the section `requirements` for a satellite, and those of the thesis for a testbed.
-    Case k does not depend on the number of runs. Each flight lasts `duration` s, or as configured if it is
-    None. Raises UsageError for a key or a distribution that the configuration does not allow.
+    Case k does not depend on the number of runs. Each flight lasts `duration` s, or as configured if
+    `duration` is None. Raises UsageError for a key or a distribution that the configuration does not allow.
     """
     text = read_text(path)
     base = read_document(text, str(path)).values
@@ -168,7 +168,7 @@ def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, 
 
 
 def _below(holder: Any, step: Any, one: Variation, path: Sequence[Any]) -> Any:
-    """Return the item `step` of a container. Raises UsageError, which suggests similar keys."""
+    """Return the item `step` of a container. Raises UsageError, with similar keys, if it is missing."""
     if isinstance(holder, dict) and step in holder:
         return holder[step]
     if isinstance(holder, list) and isinstance(step, int) and step < len(holder):

@@ -52,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Calibrate the camera, and print and write the result. The exit status is 1 with too few pictures."""
+    """Calibrate the camera, and print and write the result. The exit status is 1 if the calibration fails."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)

@@ -155,7 +155,7 @@ def _first_packets(
 
 
 def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
-    """Start a process that writes to a new log file, and return it; `stack` ends the process."""
+    """Start a process that writes to a new log file, and that `stack` ends, and return the process."""
     file = stack.enter_context(log.open("w", encoding="utf-8"))
     process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     stack.callback(_end, process)

@@ -323,7 +323,7 @@ def _print(text: str) -> None:
 
 
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
-    """Return the console that the options describe; `stack` closes its resources."""
+    """Return the console that the options describe, with resources that `stack` closes."""
     from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles, by_socket, flying  # noqa: PLC0415  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415

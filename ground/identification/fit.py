@@ -16,7 +16,7 @@ prior of the delay is about 20 ms, and the prior noise levels are uncertain by a
 noise cannot explain, such as the release, a jolt or an outlier, restart the filter.
 
 The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
-The inertial unit's attitude filter or air currents can correlate the innovations, which are then not white.
+The inertial unit's attitude filter or air currents can make the innovations correlated, that is, not white.
 If the innovations are not white, each standard deviation is at least the sandwich estimate (Huber 1967) over
 segments of the record.
 
@@ -374,7 +374,10 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return `restarts` and the samples that exceed the gate. Raises IdentificationError for too many."""
+    """Return the restarts, with the samples beyond the gate.
+
+    Raises IdentificationError if they are too many.
+    """
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(
@@ -421,7 +424,7 @@ def _step(passed: Innovations, constants: MotionConstants) -> tuple[FloatArray, 
 
 
 def _inverse(information: FloatArray) -> FloatArray:
-    """Return the inverse of an information matrix. Raises IdentificationError if it is singular."""
+    """Return the inverse of an information matrix. Raises IdentificationError for a singular matrix."""
     scale = 1.0 / np.sqrt(np.diag(information))
     correlation = information * np.outer(scale, scale)
     if not np.all(np.isfinite(correlation)) or np.linalg.cond(correlation) > 1e12:

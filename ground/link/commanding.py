@@ -167,7 +167,7 @@ def command(
     show: Show,
     ended: Callable[[list[Report]], bool] = lambda _: False,
 ) -> list[Report]:
-    """Send a command, pass its reports to `show` and return them. Raises FlightError without a report.
+    """Send a command, `show` its reports and return them. Raises FlightError if no report arrives.
 
     The call ends with the final report, when `ended` is true for the list of received reports, or after
     `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
@@ -345,14 +345,14 @@ class FileSession:
         return bool(found)
 
     def completed(self) -> bool:
-        """Return whether the satellite reports a command as completed. Raises FlightError after a failure."""
+        """Return whether the satellite has completed a command. Raises FlightError for a failed command."""
         reports = self.reports()
         if problem := failed(reports):
             raise FlightError(problem)
         return any(report.stage is Stage.COMPLETED for report in reports)
 
     def received_file(self, name: str) -> bool:
-        """Return whether a file has been received completely. Raises FlightError if its transfer has failed.
+        """Return whether a file has been received completely. Raises FlightError if the transfer has failed.
 
         The satellite reports a transfer as completed after the ground has received the file.
         """

@@ -200,8 +200,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        If the first report states that the frame's counter was used before, it is also the final report.
-        After other reports, such a report means that a third party has replayed the frame, and it is skipped.
+        If the first report states that the frame's counter was used before, it is also the final report. A
+        later report of a used counter is skipped, because a third party has replayed the frame.
         """
         reported = False
         for _, packet in self.packets(seconds):

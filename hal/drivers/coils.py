@@ -16,7 +16,7 @@ Zero current is commanded by low levels at both inputs of all bridges, because t
 its register ALL_LED_OFF_H even without a configuration. If a leg of a bridge is stuck high, low inputs would
 drive current through the coil, so this bridge is braked (both inputs high) immediately afterwards.
 
-Instead of a PWM chip with H-bridges, bridges DRV8830 (TI SLVSAB2) with an I2C interface and a regulated
+Instead of a PWM chip with H-bridges, DRV8830 bridges (TI SLVSAB2) with an I2C interface and a regulated
 output voltage can drive the coils, one bridge for each coil. The output voltage has 58 steps of 0.08 V, and
 no values between zero and 0.48 V. To produce voltages between the steps on average, a periodic job writes the
 step nearest to the sum of requested voltage and accumulated error. The DRV8830 bridges have the interface of

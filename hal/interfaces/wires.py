@@ -136,8 +136,8 @@ class SpiDevice(Protocol):
 class Wires(Protocol):
     """Connections to the devices, opened by name: those of the board, or emulated connections.
 
-    A connection that is already open is returned again, and all connections are closed at the end of the
-    flight.
+    A second request for a connection returns the open connection, and all connections are closed at the end
+    of the flight.
     """
 
     def serial(self, device: str, baud_rate: int) -> SerialPort:
