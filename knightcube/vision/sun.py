@@ -191,8 +191,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     # Off the axis, a pinhole camera stretches a disc by at most the squared secant of the field angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch
-    # A truncated disc that shows less than half of its width is excluded, because its visible edge is too
-    # short.
+    # A truncated disc with less than half of its width visible is excluded, because its edge is too short.
     narrowest = settings.least_radius * camera.focal_length - settings.stride
     patches, wide = _bright_patches(image, settings, narrowest, 2.0 * reach)
     read = camera.columns * len(range(settings.stride // 2, camera.rows, settings.stride))
@@ -231,8 +230,7 @@ def _bright_patches(
     bright = image[stride // 2 :: stride] >= settings.level
     if not bright.any():
         return [], False
-    # Only the smallest rectangle around all bright pixels is labelled, because the time for labelling grows
-    # with the number of pixels.
+    # Only the smallest rectangle around all bright pixels is labelled, which saves computing time.
     down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
     top, left = int(down[0]), int(across[0])
     labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])
@@ -412,7 +410,7 @@ _LEAST_POINTS = 6
 """Minimum number of points for the fit of a circle."""
 _CIRCLE_STEPS = 10
 _LAST_STEP = 1e-2
-"""Step of the circle fit below which the iteration ends, relative to the error of a point."""
+"""Step of the circle fit, as a fraction of the error of a point, below which the iteration ends."""
 _MOST_CORRELATED = 0.9
 """Largest assumed correlation between the errors of neighbouring points."""
 _TUKEY = 4.685
@@ -499,8 +497,7 @@ def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
         for apart in sorted({max(count // part, 1) for part in (3, 4, 6, 8)})
     ]
     first, second, third = np.moveaxis(points[np.concatenate(triples)], 1, 0)
-    # The circumcentre, relative to the first point, is the intersection of the perpendicular bisectors of two
-    # chords.
+    # The circumcentre, relative to `first`, is the intersection of two perpendicular bisectors.
     b, c = second - first, third - first
     cross = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     sound = np.abs(cross) > 1e-9 * np.sum(b * b + c * c, axis=1)
@@ -522,10 +519,10 @@ _SIGMAS = 3.0
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _SHARES = (1.0 / 6.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 5.0 / 6.0, 1.0)
-"""Angular distances of the tested directions from the coarse Sun direction, relative to the largest distance.
+"""Angular distances of tested directions from the coarse Sun direction, as fractions of the largest.
 """
 _CONTRADICTED = 5.0
-"""Largest accepted angle between measured and coarse Sun direction, in standard deviations of the latter."""
+"""Largest accepted deviation of the measured from the coarse Sun direction, in standard deviations."""
 _CUT = np.radians(0.05)
 """Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 
@@ -561,8 +558,8 @@ def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[Cam
     angle = np.arange(_RING) * (2.0 * np.pi / _RING)
     root = np.linalg.cholesky(sun.tangent_covariance)
     ring = _SIGMAS * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ root.T @ sun.basis
-    # If the normals of the lit strings lie in one plane, one angle is nearly undetermined. The tested
-    # directions are therefore spaced by equal angles.
+    # One angle is nearly undetermined if the normals of the lit strings lie in one plane.
+    # The tested directions therefore have equal angular spacing.
     reach = np.linalg.norm(ring, axis=1, keepdims=True)
     spaced = (ring / reach * np.tan(share * np.arctan(reach)) for share in _SHARES)
     around = np.concatenate([sun.direction[None, :], *(sun.direction + offset for offset in spaced)])

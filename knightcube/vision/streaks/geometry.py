@@ -352,8 +352,9 @@ def _ideal_arguments(
     return (pinhole.focal_length, *pinhole.centre), (rate, acceleration, higher), stars, time
 
 
-# The compiled forms do not include a vibration, which is rare. The numpy forms compute with arrays of m
-# vectors (..., 3, m), and return transposed views. None of these functions applies the distortion.
+# The compiled forms do not include a vibration, which is rare.
+# The numpy forms compute with arrays of m vectors (..., 3, m), and return transposed views.
+# None of these functions applies the distortion.
 
 
 def _positions_of(view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
@@ -437,7 +438,7 @@ def _sensitivities_of(
     # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
     # The vector psi at the time t is the integral over t' of the rotation from t' to t.
     flow = _flow(view[0], there)
-    # For psi, the body is assumed to rotate at the mean rate since mid-exposure (error of higher order).
+    # In this integral, the mean rate since mid-exposure is used, which causes an error of higher order.
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
     if motion.higher_terms.any() or motion.vibration.exists:
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)
@@ -715,7 +716,7 @@ class Shutter:
 
     def delay(self, rows: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
         """Return the exposure delay of `rows` relative to the middle row, in units of the exposure time."""
-        # The two scalars get the type of `rows`, so that float32 arrays are not converted to float64.
+        # Scalars get the type of `rows`, so that float32 arrays are not converted to float64.
         return np.asarray((rows - rows.dtype.type(self.middle)) * rows.dtype.type(self.delay_per_row))
 
 
@@ -771,15 +772,15 @@ class Course:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakScene:
-    """The unknowns of the fit: the motion, the width of the point spread, and the stars.
+    """The unknowns of the fit: the motion, the width of the point spread function (PSF), and the stars.
 
     Attributes:
         motion: rotation of the camera over the exposure.
-        width: standard deviation of the point spread convolved with a pixel, px.
+        width: standard deviation of the PSF convolved with a pixel, px.
         stars: positions of the n stars at mid-exposure (n, 2), px.
         light: flux of each star over the exposure (n,), counts.
         sky: sky level around each star relative to the frame's background (n,), counts per pixel.
-        trusted: whether each star contributes to motion and point spread (n,).
+        trusted: mask (n,) of the stars that contribute to the fit of motion and PSF width.
     """
 
     motion: CameraMotion
@@ -791,13 +792,13 @@ class StreakScene:
 
     @classmethod
     def of(cls, motion: CameraMotion, sigma: float, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return a scene of trusted stars, with the point spread `sigma` (px) without pixel convolution."""
+        """Return a scene of trusted stars, with a PSF of standard deviation `sigma` (px)."""
         count, width = len(stars), float(np.hypot(sigma, 0.29))
         return cls(motion, width, stars, light, np.zeros(count), np.ones(count, dtype=np.bool_))
 
     @property
     def sigma(self) -> float:
-        """The standard deviation (px) of the point spread without pixel convolution."""
+        """The standard deviation (px) of the PSF without pixel convolution."""
         return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
 
     def select(self, chosen: BoolArray | IntArray) -> StreakScene:

@@ -51,8 +51,8 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
-# Number of processed pixels per frame after which no further motion is fitted. A fit in progress is always
-# completed. The work on one frame can therefore reach twice the limit.
+# Number of processed pixels per frame after which no further motion is fitted.
+# A fit in progress is completed, so that the number of processed pixels can reach twice this limit.
 _MOST_WORK = 1_600_000
 # Fixed work of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
@@ -84,10 +84,10 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px) in the first iteration, of a star without effect on the motion, above which pixels are
-# selected again. Later iterations ignore these displacements, which are often poorly known.
+# First-iteration displacement (px) of a star outside the motion fit above which pixels are selected again.
+# Later iterations ignore the displacements of such stars, which are often poorly known.
 _FAINT_DRIFT = 3.2
-# Change of the angular acceleration, relative to the rotation, above which the pixels are selected again.
+# Change of the angular acceleration, as a fraction of the rotation, above which pixels are selected again.
 _GROWN = 0.1
 # Step of the shared parameters (standard deviations) below which the fit, after this step, has converged.
 SETTLED = 0.4
@@ -162,7 +162,7 @@ class FitProblem:
 
     @property
     def undecided(self) -> bool:
-        """Whether the choice between a constant and a changing rate is left to a score test."""
+        """Whether a score test decides between a constant and a changing rate."""
         return self.settings.rate_model == "auto" and not self.growing
 
     def windows(self, scene: StreakScene) -> FitWindows:
@@ -316,7 +316,7 @@ def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint:
 
 
 def misfit(evaluation: Evaluation, stars: IntArray | slice = slice(None)) -> float:
-    """Return the median chi-square per degree of freedom of the selected `stars`, or NaN without stars."""
+    """Return the median chi-square per degree of freedom of the selected `stars`, or NaN for no stars."""
     freedom = np.maximum(evaluation.pixels[stars] - ALONE - 1.0, 1.0)
     return float(np.median(evaluation.chi2[stars] / freedom)) if len(freedom) else float("nan")
 
@@ -335,7 +335,7 @@ _WITHIN = 10
 _WITHIN_SAMPLES = 10
 # Distances (px) from a star's path at which the pixels are sampled.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
-# Mean counts of the three central pixels across a streak, relative to the flux per px along the streak.
+# Mean counts of the three central pixels across a streak, as a fraction of the flux per px along it.
 _MIDDLE = 0.287
 # Ratio of measured to expected intensity below which a segment of a streak counts as dark.
 _HALF = 0.5
@@ -345,10 +345,10 @@ _LEAST_VALID = 0.7
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
-# Lower limit of a star's speed, relative to the mean speed, in the expected intensity, which the point
-# spread keeps finite where the star is nearly at rest.
+# Lower limit of a star's speed in the expected intensity, as a fraction of the mean speed.
+# The PSF keeps the intensity finite at points at which the star is nearly at rest.
 _SLOW = 0.5
-# Minimum intensity beyond a streak end that counts as a trail, relative to the streak's mean intensity.
+# Minimum intensity beyond a streak end that counts as a trail, as a fraction of the mean intensity.
 _TRAIL = 0.08
 # Largest fraction of dark segments in a streak without gaps.
 _DARK = 0.15
@@ -521,7 +521,7 @@ def _band_means(
     return mean, deviation
 
 
-# Half the length of the search range around a modelled streak end, relative to the path length.
+# Half the length of the search range around a modelled streak end, as a fraction of the path length.
 _REACH = 0.08
 # Minimum and maximum of half the length (px) of the search range around a streak end.
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
@@ -529,7 +529,7 @@ _LEAST_REACH, _MOST_REACH = 10.0, 40.0
 _STEPS = 41
 # Minimum significance (standard deviations) of the flux near a streak end for the end to be measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Upper limit of a sample's intensity relative to the expected value, which limits the effect of other stars.
+# Upper limit of a sample's intensity, as a multiple of the expected value, because of other stars.
 _CAP = 2.0
 # Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3
@@ -616,13 +616,13 @@ _TRUST_SIGMAS = 3.5
 _END_FLOOR = 0.01
 # Model error (px) of the width of a streak, assumed when the motions of the stars are compared.
 _WIDTH_FLOOR = 0.002
-# Distance (half strip widths) between two streaks below which they are fitted together.
+# Distance between two streaks below which they are fitted together, in half widths of a strip of pixels.
 _NEAR = 1.4
 # Displacement (px) of the streak ends during the fit above which the search for faint stars is repeated.
 _FAR = 6.0
 # Maximum number of searches for faint stars.
 _MOST_REPEATS = 2
-# Relative error of the modelled counts of a subtracted star on a pixel.
+# Error of the modelled counts of a subtracted star on a pixel, as a fraction of these counts.
 _SUBTRACTION_ERROR = 0.35
 # Maximum total number of pixels in all fit windows, counted once per window, for memory and time.
 _MOST_PIXELS = 60_000
@@ -723,7 +723,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # The old fit is deleted and its windows are popped, which frees tens of MB during the next fit.
+    del done  # The old fit is deleted and its windows are removed from the list, which frees tens of MB.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
@@ -780,7 +780,7 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return which stars in the motion fit agree with the majority, or all of them if too few agree."""
+    """Return the stars in the motion fit that agree with the majority, or all stars if too few agree."""
     equations = star_equations(rough.evaluation, camera.free)
     before = rough.scene.trusted
     if equations is None:

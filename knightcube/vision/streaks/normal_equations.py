@@ -5,7 +5,7 @@ converges to the maximum likelihood for Poisson noise. The residual of a pixel i
 flux of all stars, so that streaks may cross. The four parameters of each star are eliminated from the
 equations, which leaves the shared parameters (rate, acceleration, width). Stars that share pixels are
 coupled, and a few conjugate-gradient iterations account for the coupling. The equations without the coupling
-are the preconditioner.
+are the preconditioner of these iterations.
 
 Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
 than the image of a single star, and the flux of a neighbouring star shifts the ends of a streak. Blended
@@ -36,10 +36,10 @@ SHARED = 7
 ALONE = 4
 """Number of parameters of a single star: x, y, flux and sky level."""
 
-# Margin (standard deviations) between the modelled counts and saturation below which a pixel is excluded. The
-# modelled counts are used, because a selection by the measured counts would be biased by their noise.
+# Margin (standard deviations) between modelled counts and saturation below which a pixel is excluded.
+# A selection by measured instead of modelled counts would be biased by their noise.
 _MARGIN = 3.0
-# Allowance for model errors in the exclusion of outliers, relative to the modelled counts of a pixel.
+# Allowance for model errors in the exclusion of outliers, as a fraction of a pixel's modelled counts.
 _UNRESOLVED = 0.1
 # Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.
 _AT_ONCE = 128
@@ -58,7 +58,8 @@ class Evaluation:
     Attributes:
         information: Fisher information (n, SHARED + ALONE, SHARED + ALONE) from the pixels of each star, on
             the shared parameters and on the parameters of that star.
-        gradient: gradient (n, SHARED + ALONE) of the log-likelihood with respect to the same parameters.
+        gradient: gradient (n, SHARED + ALONE) of the log-likelihood with respect to the shared parameters and
+            the parameters of each star.
         chi2: chi-square of the residuals on the pixels of each star (n,).
         pixels: number of fitted pixels of each star (n,).
         crowds: derivatives of the modelled counts on the pixels that several stars share.
@@ -78,9 +79,10 @@ class Evaluation:
 class SharedPixels(NamedTuple):
     """Derivatives of the modelled counts at the e pixels that several stars share, sorted by block of pixels.
 
-    The coefficients `matrix` (b, i, SHARED + ALONE) combine i `images` (i, e) into derivatives for
-    the parameters of the `star` of each block (b,). Each block has a `first` shared pixel (b,). Each pixel
-    has a `slot` (e,) in the list of all shared pixels, and a `weight` (e,), its inverse variance.
+    The coefficients `matrix` (b, i, SHARED + ALONE) combine i `images` (i, e) into derivatives for the
+    parameters of the `star` of each block (b,). The array `first` (b,) contains the index of the first shared
+    pixel of each block. The arrays `slot` (e,) and `weight` (e,) contain the index of each pixel in the list
+    of all shared pixels, and its inverse variance.
     """
 
     star: IntArray
@@ -138,7 +140,7 @@ def model_images(
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
     """Return the images that are combined to model long streaks, and the images and derivatives of spots.
 
-    The last image of each long streak is not initialised. It is a buffer for the residuals.
+    The last image of each long streak is an uninitialised buffer for the residuals.
     """
     camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
     images = streak_model.images(*camera, scene.stars[long], scene.width, windows.strips)
@@ -181,7 +183,7 @@ def _add(
 
 
 _Pixels = tuple[IntArray, BoolArray, Float32Array, Float32Array, Float32Array]
-"""Slot, inside, signal, floor and ceiling of `BlockPixels`."""
+"""Attributes `slot`, `inside`, `signal`, `floor` and `ceiling` of `BlockPixels`."""
 
 
 def residuals(
@@ -189,9 +191,9 @@ def residuals(
 ) -> tuple[Float32Array, Float32Array]:
     """Return weights and residuals of pixels for the modelled counts `total` of all fitted pixels.
 
-    The weight is the inverse variance, or 0 for an excluded pixel. The `limits` are the gain and the clip.
-    Pixels whose residuals exceed `clip` standard deviations plus a tenth of the modelled counts are excluded;
-    `clip` 0 excludes none.
+    The weight is the inverse variance, or 0 for an excluded pixel. The `limits` are the gain (electrons per
+    count) and the residual limit `clip`. Pixels whose residuals exceed `clip` standard deviations plus a
+    tenth of the modelled counts are excluded; `clip` 0 excludes none.
     """
     (slot, inside, signal, floor, ceiling), (gain, clip) = pixels, limits
     model = total.take(slot)
@@ -306,7 +308,7 @@ def _scalar_product(a: Any, b: Any) -> Any:
 
 @loop_helper
 def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
-    """Add the products `gram` of images to the gradient and to the lower half of one star's information."""
+    """Add the products `gram` of images to one star's gradient and lower half of the information matrix."""
     images, count = matrix.shape
     along = np.empty(images)
     for q in range(count):
@@ -360,7 +362,7 @@ def _spot_images(
 ) -> Float32Array:
     """Return derivatives (n, SHARED + ALONE + 1, p, p) of n spots of p x p pixels with respect to parameters.
 
-    The last element along the second axis is not initialised. It is a buffer for the residuals.
+    The last element along the second axis is an uninitialised buffer for the residuals.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
@@ -377,7 +379,8 @@ def _spot_images(
 class Solution:
     """One Gauss-Newton step of the fit, and the covariance of the parameters.
 
-    The step consists of changes of the shared parameters (SHARED,) and of each star's own (n, ALONE).
+    The step consists of changes of the shared parameters (SHARED,) and of each star's own parameters (n,
+    ALONE).
     """
 
     shared: FloatArray
@@ -544,7 +547,7 @@ def _coupled(
     return solution(evaluation.information, crowds, common, eliminated, free, right, rounds)
 
 
-# Squared residual norm, relative to the squared norm of the first step, at which conjugate gradients stop.
+# Ratio of the squared residual norm to that of the right-hand side at which conjugate gradients stop.
 _CONVERGED = 1e-2
 
 _NONE = np.zeros(0, np.int64)
@@ -637,7 +640,7 @@ def solution(
 
     The arguments are the information of `Evaluation`, the shared pixels of strips and of patches, the number
     of shared pixels (`common`), the solution without coupling (`eliminated`), the mask (s,) of the fitted
-    shared parameters, the right-hand side (s + n a,), and the maximum number of iterations. With 0 `rounds`,
+    shared parameters, the right-hand side (s + n a,), and the maximum number of iterations. If `rounds` is 0,
     the coupling is neglected.
     """
     x, image, z = np.empty_like(right), np.empty_like(right), np.empty_like(right)
@@ -817,7 +820,7 @@ def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | N
 def consistent_stars(
     estimates: FloatArray, deviations: FloatArray, floors: FloatArray, sigmas: float
 ) -> BoolArray:
-    """Return which stars' estimates (n, k) all lie within `sigmas` deviations of the weighted medians, (n,).
+    """Return a mask (n,) of the stars whose k estimates (n, k) lie within `sigmas` deviations of the medians.
 
     The model errors `floors` (k,) are added in quadrature to the standard `deviations` (n, k).
     """
@@ -848,7 +851,7 @@ def disagreement(change: FloatArray, deviation: FloatArray) -> float:
 
 
 def contradiction(alone: StarEquations) -> float:
-    """Return the chi-square per degree of freedom of all stars' estimates about their common solution.
+    """Return chi-square per degree of freedom of the differences of all stars' estimates from their solution.
 
     In contrast to `disagreement`, this test uses all combinations of parameters that a star determines, each
     with the noise of that star.

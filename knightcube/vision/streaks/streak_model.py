@@ -14,17 +14,18 @@ flux.
 In this equation, g is a Gaussian of standard deviation w, Phi the cumulative normal distribution, k the
 curvature of the arc, and s0 and s1 the coordinates along the arc at the start and end of the exposure. With a
 rolling shutter, s0 and s1 depend on the pixel's row. The integration over the square pixel is included in the
-width w by w^2 = sigma^2 + 1/12, where sigma is the width of the point spread. The fourth cumulant of a
-uniform distribution over the pixel, -1/120 along each axis, corrects the profile across the path. The
-following equation gives the change dm of the counts if a parameter displaces the path at time t by c(t).
+width w by w^2 = sigma^2 + 1/12, where sigma is the width of the point spread function (PSF). The fourth
+cumulant of a uniform distribution over the pixel, -1/120 along each axis, corrects the profile across the
+path. The following equation gives the change dm of the counts if a parameter displaces the path at time t by
+c(t).
 
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
 In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
 per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with
 coefficients for each block of pixels. One basis image is n/w^2 m multiplied by the distance along the path
-from the centre of the block, with a correction at the streak ends. It describes a linear change of c_n within
-a block of pixels.
+from the centre of the block, with a correction at the streak ends. This image describes a linear change of
+c_n within a block of pixels.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
 instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
@@ -178,8 +179,8 @@ def images(
 ) -> Float32Array:
     """Return images (b, IMAGES + 1, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The argument `width` is the width w of the point spread, px. The last image of each block is not
-    initialised; the calling function sets it.
+    The argument `width` is the width w of the PSF, px. The last image of each block is not initialised; the
+    calling function sets it.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
@@ -190,7 +191,7 @@ def images(
 
 
 _BlockLines = tuple[IntArray, IntArray, FloatArray]
-"""Corner, step and time of `Strips`."""
+"""Attributes `corner`, `step` and `time` of `Strips`."""
 
 
 def _draw_numpy(

@@ -38,8 +38,8 @@ class LikelihoodSettings:
         saturation: smallest count at which a pixel is saturated. If `saturation` is None, the highest count
             of the frame is used if several pixels have that count, otherwise the maximum of the integer type.
         saturated_fraction: smallest fraction of saturated pixels for which a frame is rejected.
-        psf_sigma: initial standard deviation of the point spread, px. If `psf_sigma` is 2 px or more, the
-            frame is binned.
+        psf_sigma: initial standard deviation of the point spread function (PSF), px. If `psf_sigma` is 2 px
+            or more, the frame is binned.
         rate_model: `constant` for a constant rate, `accelerating` for a linearly changing rate, or `auto` to
             let a score test decide.
         line_time: delay between the exposures of successive rows, s. The line time is positive for a rolling
@@ -62,8 +62,8 @@ class LikelihoodSettings:
             in spite of a large misfit.
         worst_shaking: largest accepted vibration common to all streaks, as displacement across the streaks
             (px) or as relative change of brightness along them.
-        worst_uncertainty: largest accepted relative uncertainty (one standard deviation) of the rate from
-            model errors.
+        worst_uncertainty: largest accepted standard deviation of the rate from model errors, as a fraction of
+            the rate.
         sign_sigmas: minimum significance (standard deviations) of the prior rate along the rotation axis, for
             a decision on the sign of the rotation.
         knowledge: standard deviations of the camera's calibration parameters.
@@ -106,7 +106,7 @@ class LikelihoodSettings:
 
     @property
     def shutter_unstated(self) -> bool:
-        """Whether the type of shutter is unknown, so that it may be a rolling shutter."""
+        """Whether the shutter may be a rolling shutter because its type is unknown."""
         return self.line_time is None and self.line_time_sigma > 0.0
 
 
@@ -148,7 +148,7 @@ REASONS = {
     StreakStatus.SATURATED: "the frame is overexposed",
     StreakStatus.FROZEN: "the frame is the same as the previous one",
 }
-"""One-line reasons for a missing rate, which are used if a result has no more detailed reason."""
+"""One-line reasons why no rate is reported, which are used if a result has no more detailed reason."""
 
 
 def no_rows(*shape: int) -> Callable[[], FloatArray]:
@@ -223,7 +223,7 @@ class MotionResult(FrameMotion):
             about 1 px.
         faint_flux: (m,) counts.
         faint_significance: flux of each of the m faint stars divided by its standard deviation (m,).
-        psf_sigma: fitted standard deviation of the point spread, px.
+        psf_sigma: fitted standard deviation of the PSF, px.
         misfit: median chi-square per degree of freedom of the bright stars.
         rate_model: fitted model of the rate, `constant` or `accelerating`.
         acceleration: fitted angular acceleration (3,), rad/s^2, or None if it was not fitted.
@@ -251,7 +251,7 @@ class MotionResult(FrameMotion):
     line_time_sigma: float = 0.0
 
     def __repr__(self) -> str:
-        """Return status, rate, uncertainty and number of stars, or the reason, in one line."""
+        """Return one line of text: status, rate, uncertainty and number of stars, or the reason."""
         if self.rate is None or self.covariance is None:
             return f"<MotionResult {self.status.value}: {self.reason}>"
         sigma = float(np.sqrt(np.trace(self.covariance)))

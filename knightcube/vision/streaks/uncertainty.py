@@ -2,9 +2,9 @@
 
 The covariance due to photon noise is a lower limit. The covariance is increased by the scatter of the stars
 beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
-all stars equally and therefore cause no scatter. One error is a point spread with an unexpected width or
-profile, which moves the ends of all streaks. The other error is vibration of the body. The residuals at the
-streak ends and along the streaks limit the errors from point spread and vibration.
+all stars equally and therefore cause no scatter. These errors are a point spread function (PSF) with an
+unexpected width or profile, which moves the ends of all streaks, and vibration of the body. The residuals at
+the streak ends and along the streaks limit the errors from PSF and vibration.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from knightcube.vision.streaks.vibration import (
     vibration_covariance,
 )
 
-# Minimum sensitivity of a pixel to a displacement of a streak, relative to the block's most sensitive pixel.
+# Minimum sensitivity of a pixel to a streak's displacement, as a fraction of its block's largest sensitivity.
 _LEAST_SENSITIVITY = 0.02
 
 
@@ -141,11 +141,11 @@ def correct(
 ) -> CalibrationCorrection | None:
     """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
 
-    The information (n, k, k) and the score (n, k) are those of `StarEquations`. The scatter of the stars has
-    the variance `spread`, relative to their noise. Each of m calibration errors of one standard deviation
-    changes each star's estimate by `apparent` (n, k, m); errors with a specified standard deviation come
-    first, and are `described` in number. The estimated errors are in addition to the errors `counted` (m,),
-    in standard deviations, which the fit has already corrected.
+    The information (n, k, k) and the score (n, k) are those of `StarEquations`. The argument `spread` is the
+    ratio of the variance of the stars' scatter to the variance of their noise. Each of m calibration errors
+    of one standard deviation changes each star's estimate by `apparent` (n, k, m); the first `described`
+    errors have a specified standard deviation. The estimated errors are in addition to the errors `counted`
+    (m,), in standard deviations, which the fit has already corrected.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -260,7 +260,7 @@ _ASIDE = 3
 _SHARES = np.concatenate([np.arange(0.15, 0.96, 0.1), [0.97, 0.98, 0.99]])
 # Trial ratios of the path length of a reversing motion to the fitted path length.
 _LENGTHS = np.concatenate([np.arange(0.95, 1.1, 0.01), np.arange(1.1, 1.71, 0.05)])
-# Relative error of the modelled brightness profile across a star's path.
+# Error of the modelled brightness profile across a star's path, as a fraction of the brightness.
 _PROFILE_ERROR = 0.05
 # Upper limit of a single star's contribution to the chi-square improvement by a reversal.
 _MOST_IMPROVEMENT = 100.0
@@ -270,9 +270,9 @@ class _PathLight(NamedTuple):
     """Sums over the pixels of a streak that determine chi-square for any intensity along its path.
 
     The distances along the path (k,), px, are counted from the point at which the image of the star is at
-    rest. With the counts d and the weight w of a pixel, and the point-spread profile g across the path, the
-    sums are those of w g^2 (`square`), w g d (`cross`) and w g (`plain`) over the pixels nearest to each
-    point, and those of w, w d and w d^2 (`moments`) over all pixels.
+    rest. A pixel has the counts d, the weight w and the value g of the PSF profile across the path. The sums
+    of w g^2 (`square`), w g d (`cross`) and w g (`plain`) extend over the pixels nearest to each point of the
+    path, the sums of w, w d and w d^2 (`moments`) over all pixels.
     """
 
     places: FloatArray
@@ -349,7 +349,7 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
     for each trial motion.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
-    # The variable `before` is the flux up to each boundary between the samples along the path.
+    # The variable `before` is the flux before each boundary between the samples along the path.
     # A negative ratio of durations describes a motion that starts after the point of rest.
     share, root = shares[:, None, None], np.sqrt(np.clip(edges / lengths[:, None], 0.0, 1.0))
     before = np.maximum(root, -share) + np.minimum(root, np.maximum(share, 0.0)) + np.minimum(share, 0.0)
@@ -366,9 +366,9 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 _CONJUGATE = 12
 # Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
 _UNCHECKED = (2, 4.0)
-# Relative difference between fitted and configured point-spread variance below which it is neglected.
+# Difference between fitted and configured PSF variance, as a fraction, below which it is neglected.
 _SAME_SPREAD = 0.02
-# Ratio of a streak end's error to the root of the difference of fitted and configured PSF variance.
+# Ratio of a streak end's error to the square root of the difference of fitted and configured PSF variance.
 _END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
@@ -376,13 +376,13 @@ _END_FLOOR = 0.12
 _END_SHOWN = 1.5
 # Ratio of the uncertainty of the streak ends to the upper limit of their displacement.
 _END_CHANCE = 0.5
-# Ratio of the streak ends' error (px) to the vibration across (px) or along (relative) all streaks.
+# Ratio of the streak ends' error (px) to the vibration across (px) or along (brightness fraction) streaks.
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
 # Remaining calibration error (standard deviations) below which the lens correction counts as converged.
 _SMALL_ERROR = 0.2
-# Relative uncertainty of the rotation due to lens errors above which the lens is always corrected.
+# Uncertainty of the rotation due to lens errors, as a fraction, above which the lens is always corrected.
 _WORTHWHILE = 0.002
 # Ratio of covariance to noise covariance above which model errors are the cause (three sigma).
 _BEYOND_NOISE = 9.0
@@ -394,8 +394,8 @@ class RotationUncertainty:
 
     Attributes:
         rotation: rotation vector (3,), corrected for significant calibration errors, rad.
-        covariance: (3, 3) rad^2.
-        model_error: uncertainty from model errors, relative to the rotation. If the type of shutter is
+        covariance: covariance (3, 3) of `rotation`, rad^2.
+        model_error: uncertainty from model errors, as a fraction of the rotation. If the type of shutter is
             unspecified, its uncertainty is included only in the covariance.
         common_motion: deviation from the smooth motion that is common to all streaks, such as vibration.
         aside: displacement of streaks across their paths that would explain the residuals, px.
@@ -436,7 +436,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     ends = float(np.sqrt(2.0) * np.hypot(end, shaken) / result.length)
     # If the fit did not converge, the uncertainty includes its last step.
     covariance = noise * spread * (1.0 + last.last_step**2)
-    # The error common to all streak ends changes the rotation angle; that of the axis is assumed equal.
+    # An error common to all streak ends changes the rotation angle; the axis is assumed to be as uncertain.
     longer = ends**2 * float(rotation @ rotation)
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
@@ -452,10 +452,11 @@ class _LensEffect:
     """Effect of calibration errors on the rotation over the exposure, as in `CalibrationCorrection`.
 
     The correction `step` (3,), rad, and the covariances (3, 3), rad^2, are those of the rotation vector. The
-    `error` (m,) remains after the correction of `counted` (m,) by the fit, both in standard deviations.
+    fit has corrected the calibration errors `counted` (m,), and the errors `error` (m,) remain, both in
+    standard deviations.
 
     Attributes:
-        spread: variance of the scatter of the stars, relative to their noise.
+        spread: ratio of the variance of the stars' scatter to the variance of their noise.
         seen: whether the calibration errors estimated from the stars are significant.
     """
 
@@ -533,16 +534,16 @@ def _lens_effect(
 
 
 def _scatter(equations: StarEquations, scene: StreakScene) -> float:
-    """Return the variance of the scatter of the stars, relative to their noise."""
+    """Return the ratio of the variance of the stars' scatter to the variance of their noise."""
     return max(disagreement(*estimates_of(equations, scene)), contradiction(equations))
 
 
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
-    """Return the uncertainty (px) of streak ends due to a point spread that may differ from the model.
+    """Return the uncertainty (px) of streak ends due to a PSF that may differ from the model.
 
-    If the residuals at the streak ends are not significant, the point spread has the modelled profile, with
-    the same width along and across the streaks. Significant residuals at the streak ends indicate a different
-    profile of the point spread or an unresolved fast vibration, which shifts the apparent ends.
+    If the residuals at the streak ends are not significant, the PSF has the modelled profile, with the same
+    width along and across the streaks. Significant residuals at the streak ends indicate a different profile
+    of the PSF or an unresolved fast vibration, which shifts the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described

@@ -25,7 +25,7 @@ from knightcube.vision.streaks.normal_equations import model_images, residuals
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Addition to this threshold, relative to the brightest modelled pixel of the same line.
+# Part of this residual limit, as a fraction of the brightest modelled pixel of the same line.
 _FOREIGN_SHARE = 0.6
 
 
@@ -35,7 +35,8 @@ class StreakResiduals:
 
     Attributes:
         star: index in the scene of the star of each block (b,).
-        time: time at which the star crosses each line of pixels (b, LINES), exposures since mid-exposure.
+        time: time at which the star crosses each line of pixels (b, LINES), in exposure times since
+            mid-exposure.
         images: images that are combined to model a streak, on lines of k pixels (b, IMAGES, LINES, k).
         weight: inverse variance of each pixel (b, LINES, k), 0 for excluded pixels.
         residual: measured minus modelled counts of each pixel (b, LINES, k).
@@ -79,7 +80,8 @@ _SIGNIFICANT = 4.0
 class CommonMotion:
     """RMS vibration common to all streaks (deviation from the smooth motion), or 0 if not significant.
 
-    The streaks are displaced across their paths, px, and their brightness changes relatively along them.
+    The attribute `across` is the displacement of the streaks across their paths, px. The attribute `along` is
+    the change of brightness along the paths, as a fraction of the brightness.
     """
 
     across: float = 0.0
@@ -87,7 +89,7 @@ class CommonMotion:
 
 
 def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
-    """Return the vibration common to the streaks that determine the motion, or zero without long streaks.
+    """Return the vibration common to the streaks that determine the motion, or 0 if none is long.
 
     At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
     changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
@@ -139,7 +141,7 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
     return float(np.sqrt(common / weight))
 
 
-# Number of time bins for the fit of a vibration, and half the time that they cover, in exposures.
+# Number of time bins for the fit of a vibration, and half of their total duration, in exposure times.
 _FINE_BINS, _RANGE = 512, 0.56
 # Prior standard deviation (px) of a vibration, and of the errors of position, rate and acceleration.
 _USUAL, _LOOSE = 1.0, 10.0
@@ -157,7 +159,7 @@ _MOST_STEPS, _CONVERGED = 4, 0.02
 _MOST_DETUNED = 0.3
 # Largest accepted amplitude of a vibration, px.
 _LARGEST = 2.5
-# Ratio of the rotation's error to the amplitude that is lost by averaging over the point spread.
+# Ratio of the rotation's error to the loss of amplitude by averaging over the point spread function.
 _LOST_SHARE = 2.0
 # Start and end of the exposure, relative to mid-exposure and in units of the exposure time.
 _ENDS = np.array([-0.5, 0.5])
@@ -201,9 +203,9 @@ def fit_vibration(
 def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
     """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
 
-    The point spread averages a vibration of short wavelength. The model of the streaks neglects the averaging
-    by the point spread, which also reduces the fitted amplitudes. The corresponding error of the streak ends
-    is included.
+    The point spread function averages a vibration whose wavelength along the streaks is short. The model of
+    the streaks neglects this averaging, so that the fitted amplitudes are too small. The corresponding error
+    of the streak ends is included.
     """
     vibration = scene.motion.vibration
     if not vibration.exists or not len(left.star):
@@ -224,7 +226,8 @@ class _RotationSums:
     """Normal equations of rotation, rate, and rotations at start and end, in each of b time bins.
 
     The equations consist of the Fisher information (b, 4, 3, 4, 3) and the gradient (b, 4, 3) of the
-    log-likelihood (`score`). The middles of the bins (b,) are in exposures since mid-exposure.
+    log-likelihood (`score`). The attribute `time` (b,) contains the middles of the bins, in exposure times
+    since mid-exposure.
     """
 
     time: FloatArray
