@@ -82,8 +82,7 @@ class Build:
         else:
             self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
         with tempfile.TemporaryDirectory() as folder:
-            # A copy of the sources is built, because a killed build leaves files that a later build would
-            # include.
+            # A killed build leaves files that later builds would include, so a copy of the sources is built.
             source = Path(folder) / "source" if not options.dry_run else self._source
             if not options.dry_run:
                 shutil.copytree(self._source, source, symlinks=True, ignore=_NOT_BUILT)

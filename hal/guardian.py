@@ -324,8 +324,8 @@ class GuardianLine:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Signals to the flight's process group must not reach the guardian. If the guardian is
-                # stopped, the kernel continues it when its parent dies.
+                # Signals to the flight's process group must not reach the guardian.
+                # The kernel continues a stopped guardian when its parent dies.
                 process_group=0,
             )
         except OSError as error:

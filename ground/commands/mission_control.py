@@ -186,9 +186,9 @@ def _mission_zero(packets: Sequence[bytes]) -> datetime | None:
 class Replay:
     """Replay of recorded packets as files, which the Yamcs data link `recorded` reads.
 
-    Yamcs reads and deletes a file as soon as it appears. A file is therefore written under another name and
-    then renamed. The next file is written after Yamcs has deleted the previous file, so that Yamcs reads the
-    packets in order.
+    Yamcs reads and deletes a file as soon as it appears. Each file is therefore written under another name
+    and renamed when it is complete. The next file is written after Yamcs has deleted the previous file, so
+    that Yamcs reads the packets in order.
     """
 
     def __init__(self, packets: Sequence[bytes], folder: Path, speed: float | None, begun: float) -> None:

@@ -60,8 +60,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if host and port.isdigit() and not Path(to).exists():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, (host, int(port)), data, timeout, to)
-    # A flight process that runs as a service cannot access /tmp, so the socket for the answer is created in
-    # the folder that contains the socket of the flight process.
+    # The answer's socket is beside the flight's socket, because a flight as a service has no access to /tmp.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (

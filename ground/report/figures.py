@@ -226,7 +226,7 @@ def cage_figure(signals: RunSignals) -> Figure | None:
 
 def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
     """Return the figure of a planned path with q2, rate, current and nodes (Sease 2013, Fig. 5.4 to 5.6)."""
-    last = plan.horizon * (1.0 - 1e-12)  # just before the path's end, where the target is held
+    last = plan.horizon * (1.0 - 1e-12)  # just before the end of the path, after which the target is held
     time, nodes = np.linspace(0.0, last, 401), np.minimum(plan.node_times, last)
     figure = Figure(figsize=(OVERVIEW[0], 0.75 * OVERVIEW[1]), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)

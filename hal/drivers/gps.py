@@ -18,9 +18,9 @@ above 18 km or 515 m/s, so that a satellite needs a receiver with firmware witho
 
 A receiver with the driver `nmea` sends sentences by itself, about once a second. The sentence RMC contains
 date, time, ground speed and course, and the sentence GGA contains the position with altitude, quality and
-number of satellites. Two sentences RMC and GGA with the same time make a reading. NMEA does not provide a
-vertical velocity; the driver computes it from the altitudes of two fixes. NMEA does not provide an accuracy;
-the driver reports the horizontal dilution of precision times an assumed range error.
+number of satellites. A pair of sentences RMC and GGA with the same time gives one reading. NMEA does not
+provide a vertical velocity; the driver computes it from the altitudes of two fixes. NMEA does not provide an
+accuracy; the driver reports the horizontal dilution of precision times an assumed range error.
 """
 
 from __future__ import annotations
