@@ -29,7 +29,7 @@ from flight.app.devices import (
     open_devices,
     simulated_rig,
 )
-from flight.app.run import RunRequest, RunResult, begin_folder, open_log
+from flight.app.run import RunRequest, RunResult
 from flight.app.service import (
     Chosen,
     EndingSignals,
@@ -46,7 +46,14 @@ from flight.app.service import (
 )
 from flight.link import events
 from flight.link.commands import Channel, open_udp, open_unix
-from flight.link.telemetry.log import FlightLog, Recorder
+from flight.link.telemetry.log import (
+    DISK_TROUBLE,
+    FlightLog,
+    Recorder,
+    begin_run,
+    find_runs,
+    open_segment,
+)
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, BodyKind, FlightBody, Planner
 from flight.loop.commanding import CommandTask, OnboardParameters
@@ -120,8 +127,8 @@ def open_flight(
     """
     if rig.realtime:
         use_numpy_forms()
-    flight_log = open_log(folder, "flight", rig, config, stack, patient)
-    performance_log = open_log(folder, "performance", rig, config, stack, patient)
+    flight_log = _open_log(folder, "flight", rig, config, stack, patient)
+    performance_log = _open_log(folder, "performance", rig, config, stack, patient)
     # The stored state is opened last, so that a boot in which the start fails is not counted.
     # The outer exit stack closes the stored state after the devices.
     after_coils = stack.enter_context(ExitStack())
@@ -275,7 +282,7 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
     """Open a flight. The run folder is removed from the archive if the opening fails."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
-    request, earlier = begin_folder(judged.request, judged.merged, config)
+    request, earlier = _begin_folder(judged.request, judged.merged, config)
     unflown = stack.enter_context(ExitStack())
     if request.archive is not None:
         unflown.callback(rmtree, request.out, ignore_errors=True)
@@ -625,3 +632,52 @@ def _imaging(
     lens = lens_knowledge(config, learned, body.estimation.learned_problems)
     settings = imaging_settings(camera, body, opened.frames, lens)
     return Imaging(source, settings, navigation, body.view, services, objects)
+
+
+_NEWEST = 4
+"""Number of newest runs whose folders are searched for the number of the last boot."""
+
+
+def _begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:
+    """Create the folder of the run, which is the next folder of the archive if there is an archive.
+
+    Return the request with the path of the new folder, and the folders of the newest earlier runs.
+
+    Raises UsageError for a folder that already contains a run, and for a folder that cannot be written. A
+    flight computer with an archive flies despite disk errors, and its logs wait until the disk works.
+    """
+    earlier: list[Path] = []
+    if request.archive is not None:
+        earlier = find_runs(request.archive)[-_NEWEST:]
+        logs_bytes = (2 if config.simulation is None else 3) * config.telemetry.budget_bytes
+        run = begin_run(request.archive, config.telemetry.archive_bytes, logs_bytes)
+        request = replace(request, out=run.folder)
+    out = request.out
+    if any(out.glob("*.ccsds")):
+        raise UsageError(f"{out} already contains a run: give another folder, or remove this one")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "config.yaml").write_text(text, encoding="utf-8")
+    except OSError as error:
+        if request.archive is not None and error.errno in DISK_TROUBLE:
+            return request, earlier
+        raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
+    return request, earlier
+
+
+def _open_log(
+    folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool
+) -> FlightLog:
+    """Open a log of the run, which is synchronised to disk once a second in real time."""
+    log = FlightLog(
+        folder,
+        stem,
+        clock=rig.clock,
+        segment_bytes=config.telemetry.segment_bytes,
+        budget_bytes=config.telemetry.budget_bytes,
+        sync_period_ns=SECOND_NS if rig.realtime else None,
+        patient=patient,
+        opener=open_segment if rig.host is None else rig.host.opener(open_segment),
+    )
+    stack.callback(log.close)
+    return log
