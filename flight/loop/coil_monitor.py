@@ -294,7 +294,8 @@ class CoilMonitor:
     """Detects broken coils from the commands and readings of the last seconds.
 
     Corrections are reviewed, and broken coils are tried again, below the body rate `tumble_rate` (rad/s). The
-    attribute `correction` holds the signs and gains of the coils.
+    attribute `correction` holds the signs and gains of the coils. The class has over 350 lines, because its
+    methods share the state of one suspected fault from its detection to its diagnosis.
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:

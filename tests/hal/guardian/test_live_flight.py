@@ -33,7 +33,8 @@ def test_a_killed_flight_is_seen_at_once_and_not_after_the_time_out(campaign: Ca
 
 
 def test_without_its_guardian_a_stopped_flight_drives_the_coils_on(campaign: Campaign) -> None:
-    assert _hurt(campaign, UNGUARDED).zero_after == float("inf"), "the alarm of these tests can ring"
+    after = [_hurt(campaign, act).zero_after for act in UNGUARDED]
+    assert float("inf") in after, "the coil current stays, so the other tests of this file can fail"
 
 
 @pytest.mark.parametrize("act", ["SIGSTOP", "hang, other threads alive", "hang, interpreter held"])

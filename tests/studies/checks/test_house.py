@@ -41,7 +41,7 @@ def test_the_command_prints_one_object_and_its_status_says_whether_all_limits_ar
 
 def test_a_cycle_an_opening_and_a_star_fix_enter_few_files() -> None:
     entered = measure()
-    assert "flight/loop/control_cycle.py" in entered["control cycle"]
+    assert "flight/loop/flight_loop.py" in entered["control cycle"]
     assert "flight/app/flight.py" in entered["opening of a flight"]
     assert "knightcube/vision/star_tracker.py" in entered["star fix"]
     assert {name: len(files) for name, files in entered.items() if len(files) > LIMITS[name]} == {}
