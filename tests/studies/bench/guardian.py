@@ -28,5 +28,5 @@ def main(rounds: Annotated[int, "of all faults"] = 3) -> int:
         zero = max(hurt.zero_after for hurt in hurts)
         back = max((hurt.recovered for hurt in hurts if hurt.recovered is not None), default="-")
         table.add(runs=len(hurts), mA_before=before, zero_after_s=zero, recovered_s=back, act=act)
-    guarded = [hurt for act, hurts in found.items() if act != UNGUARDED for hurt in hurts]
+    guarded = [hurt for act, hurts in found.items() if act not in UNGUARDED for hurt in hurts]
     return int(any(hurt.zero_after > 0.5 for hurt in guarded))
