@@ -381,7 +381,7 @@ def probe_sensors(rig: Rig, unit: SensorsSection) -> str:
 
 
 def files_sensors(unit: SensorsSection) -> Sequence[str]:
-    """Return the SPI devices, and the I2C buses other than that of the coils."""
+    """Return the SPI devices, and the I2C buses other than the coils' bus."""
     buses = [device_file(sensor.bus) for sensor in unit.sensors if sensor.bus is not None]
     return list(dict.fromkeys([*buses, *(sensor.spi for sensor in unit.sensors if sensor.spi)]))
 

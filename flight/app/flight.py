@@ -399,7 +399,7 @@ def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSetti
     """Return the timing of the horizon cameras; all cameras use the shortest configured periods."""
     fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
-    margin_ns = min(SECOND_NS // 2, period_ns // 10)  # allows for a late run of the task
+    margin_ns = min(SECOND_NS // 2, period_ns // 10)  # margin for a late start of the task
     return HorizonCameraSettings(
         [round(camera.exposure * SECOND_NS) for camera in cameras],
         period_ns - margin_ns,
@@ -423,7 +423,7 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None
     velocity = None if section.velocity is None else np.array(section.velocity)
-    # A flight camera makes no mirrored images, and the configuration gives its focal length.
+    # Images of a flight camera are not mirrored, and the focal length is configured.
     identification = IdentificationSettings(mirror=False, hint_error=1.0)
     accuracy = camera.accuracy
     lens = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion)

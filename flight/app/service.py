@@ -652,7 +652,7 @@ def _text(path: Path, data: bytes) -> str:
 
 
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
-    """Return the configuration as text (`text`, or that of the file) and as values.
+    """Return the configuration as text (`text`, or the file's text) and as values.
 
     Changes that the request makes to a configuration affect only the values. Raises ConfigError and
     UsageError.

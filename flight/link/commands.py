@@ -578,7 +578,7 @@ class DatagramChannel:
         return news
 
     def answer(self, data: bytes, sender: Any) -> None:
-        """Send an answer to a sender if it has an address."""
+        """Send an answer to a sender, if the sender has an address."""
         if sender:
             with suppress(OSError):
                 self._socket.sendto(data, sender)

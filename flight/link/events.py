@@ -281,7 +281,7 @@ class Mode(IntEnum):
     SUN = 7
     """The satellite points to the Sun."""
     POINT = 8
-    """The satellite points to the configured targets or to a commanded one."""
+    """The satellite points to the configured targets or to a commanded target."""
 
     @property
     def label(self) -> str:

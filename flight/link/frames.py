@@ -219,7 +219,7 @@ class PacketAssembler:
 
 
 def _packet_starts(data: bytes) -> list[int]:
-    """Return the offset of each packet in `data`. The last offset is that of the incomplete packet."""
+    """Return the offset of each packet in `data`. The last offset is the start of the incomplete packet."""
     starts = [0]
     while (begin := starts[-1]) + HEADER_BYTES <= len(data):
         end = begin + HEADER_BYTES + 1 + int.from_bytes(data[begin + 4 : begin + 6], "big")

@@ -11,16 +11,16 @@ in Yamcs.
 The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
 CRC-32. Both files are overwritten in place, one after the other, so that a full disk does not prevent the
 update and a crash damages at most one copy. If the two copies differ, the copy with the newer key or the
-higher counter is used. One folder holds the security associations of one end of the link, and only the
+higher counter is used. One folder contains the security associations of one end of the link, and only the
 folder's owner may read them.
 
 A folder of keys that was restored from a backup contains old counters, with which old commands would be
 executed again. The satellite therefore keeps a reference folder (argument `witness`), which no backup may
-contain. The reference folder holds the newest association of each SPI and the digests of all replaced keys.
-An association is outdated if the reference folder has the same key with a higher counter, or if its key was
-replaced. A new key that is not in the reference folder is accepted from any folder. If the association of the
-primary command SPI is outdated, its commands are refused until a command of the reserve SPI sets a new key.
-The other SPIs continue with the key and counter in the reference folder.
+contain. The reference folder contains the newest association of each SPI and the digests of all replaced
+keys. An association is outdated if the reference folder has the same key with a higher counter, or if its key
+was replaced. A new key that is not in the reference folder is accepted from any folder. If the association of
+the primary command SPI is outdated, its commands are refused until a command of the reserve SPI sets a new
+key. The other SPIs continue with the key and counter in the reference folder.
 
 A gate checks the CRC, spacecraft, SPI, MAC and counter of a frame in this order. A refused frame has no
 effect except on the count of refusals by cause. The counter of an accepted frame is stored durably before the
@@ -159,7 +159,7 @@ class Vault:
     """Folder of stored security associations, which several processes of the same user may share."""
 
     def __init__(self, folder: Path, witness: Path | None = None) -> None:
-        """Open a folder. Raises UsageError if it does not exist or if other users may read its files.
+        """Open a folder. Raises UsageError for a missing folder, or if other users may read its files.
 
         On a satellite, `witness` is the path of the reference folder, which is created if possible.
         """
@@ -190,7 +190,7 @@ class Vault:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against writes by other processes. Raises FlightError if this fails."""
+        """Lock the folder against writes by other processes. Raises FlightError if that is impossible."""
         with ExitStack() as stack:
             try:
                 file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -202,14 +202,14 @@ class Vault:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Lock the folder against a second link process. Raises UsageError if it is locked."""
+        """Lock the folder against a second link process. Raises UsageError if it is already locked."""
         with locked(self._folder / _OWNER, f"{self._folder}: another link process uses these counters"):
             yield
 
     def read(self, name: int | str) -> Association | None:
         """Return the newest valid copy of an association, or None if both copies are missing or damaged.
 
-        If both copies are older than the association in the reference folder, the latter is returned. For an
+        An association in the reference folder that is newer than both copies is returned instead. For an
         outdated primary command SPI, the result is None, because its counters could be repeated.
         """
         newest = max(self._copies(name), default=None)

@@ -279,10 +279,10 @@ class BodyTargets(Protocol):
         """Return the configured target that is in force at a mission time."""
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError if this kind of body cannot reach it."""
+        """Return the target of command `number`. Raises UsageError for an unreachable target."""
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
-        """Return a target that holds the present attitude, or the nearest one that can be held."""
+        """Return a target that holds the present attitude, or the nearest attitude that can be held."""
 
     def can_hold(self, estimate: Estimate) -> bool:
         """Return whether the coils can hold the present attitude."""
@@ -334,7 +334,7 @@ class BodyEstimation(Protocol):
     """The estimation of a body, and the measurements that it uses.
 
     Each kind of body inherits from `BodyEstimation`, and implements all methods without a default. The
-    default methods are those of a body without an orbit.
+    default methods suit a body without an orbit.
 
     Attributes:
         filter: filter that estimates attitude, rate and parameters of the body.
@@ -414,8 +414,8 @@ class BodyEstimation(Protocol):
 class BodyControl(Protocol):
     """Guidance and control of a body.
 
-    Each kind of body inherits from `BodyControl`. The default methods are those of a body that does not
-    follow objects.
+    Each kind of body inherits from `BodyControl`. The default methods suit a body that does not follow
+    objects.
 
     Attributes:
         modes: modes that exist for this kind of body.

@@ -335,7 +335,7 @@ class StuckLeg:
         self._await()
 
     def _release_next(self) -> None:
-        """Release the next bridge; end the search after the last one."""
+        """Release the next bridge; end the search after the last bridge."""
         if not self._left:
             self.reset()
             return

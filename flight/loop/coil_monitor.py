@@ -30,8 +30,8 @@ every few seconds as a check, even if no fault is suspected.
 
 A reversed coil draws the same supply current as a healthy coil, so only the motion of the body can reveal it.
 A coil that rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil
-whose torque is too small is used with its estimated gain. The class `CoilCorrection` holds sign and gain of
-each coil, and converts between the actual coil currents, which determine the supply current, and the
+whose torque is too small is used with its estimated gain. The class `CoilCorrection` contains sign and gain
+of each coil, and converts between the actual coil currents, which determine the supply current, and the
 effective currents, with which healthy coils would cause the same torque. A correction made in a tumble is
 reviewed when the body is slower than `tumble_rate`. The motion then confirms the coil's sign, or the sign is
 changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current until the body
@@ -122,8 +122,8 @@ class SelfTest:
     changed. Duration and current of a test follow from the gyro's noise, so that a test measures the gain of
     a healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a test is the
     angular acceleration times the square of the duration of one of the four quarters. `CoilResponse`
-    evaluates the response, with the errors of the inertia as nuisance parameters. The current monitor
-    compares the supply current with the command, as at any other time.
+    evaluates the response, with the errors of the inertia as nuisance parameters. During a test, the supply
+    current is also compared with the command, as at any other time.
     """
 
     def __init__(self, response: CoilResponse, rate_noise: float, settings: SelfTestSettings) -> None:
@@ -294,8 +294,8 @@ class CoilMonitor:
     """Detects broken coils from the commands and readings of the last seconds.
 
     Corrections are reviewed, and broken coils are tried again, below the body rate `tumble_rate` (rad/s). The
-    attribute `correction` holds the signs and gains of the coils. The class has over 350 lines, because its
-    methods share the state of one suspected fault from its detection to its diagnosis.
+    attribute `correction` contains the signs and gains of the coils. The class has over 350 lines, because
+    its methods share the state of one suspected fault from its detection to its diagnosis.
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:
@@ -365,7 +365,7 @@ class CoilMonitor:
 
     @property
     def _unknown(self) -> str:
-        """The reason why a coil's current may differ from its command; empty if none differs."""
+        """The reason why a coil's current may differ from its command; empty if all currents agree."""
         return self._leg.suspicion or self._strangeness or self._weak
 
     @property
@@ -445,7 +445,8 @@ class CoilMonitor:
                 self.correction.confirm(axis)
                 self._tell(axis, f"{response.text(axis)} while the body is slow: the sign is confirmed")
         known = self._verdicts.keys() | self._rests.keys() | self._settings.absent
-        # An uncommanded current also produces a torque, which could be mistaken for that of a reversed coil.
+        # An uncommanded current also produces a torque, which could be mistaken for the torque of a reversed
+        # coil.
         if not self._leg.suspicion and (not self._strangeness or self._prime is not None):
             for axis in response.axes(Finding.REVERSED):
                 if axis not in known:

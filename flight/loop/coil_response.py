@@ -220,7 +220,7 @@ class CoilResponse:
             dipoles = np.eye(3) * dipoles
         strongest = float(np.linalg.norm(dipoles, axis=0).max())
         self._per_field = strongest * np.linalg.inv(settings.inertia).T
-        # Row a is the axis of coil a, scaled by its dipole relative to that of the strongest coil.
+        # Row a is the axis of coil a, scaled by its dipole relative to the strongest coil's dipole.
         self._directions: FloatArray = dipoles.T / strongest
         self._count_of_coils = coils = len(self._directions)
         self._free = np.flatnonzero(settings.free)
@@ -374,7 +374,7 @@ class CoilResponse:
         times, spans, rates, fields, currents = zip(*self._samples, strict=True)
         self._samples.clear()
         count = len(times)
-        # Row a holds the acceleration per ampere of coil a with the dipole d_a per ampere: J^-1 (d_a x B).
+        # Row a is the acceleration per ampere of coil a with the dipole d_a per ampere: J^-1 (d_a x B).
         per_ampere = self._directions @ cross_matrices(np.array(fields)) @ self._per_field
         steps = np.array(currents)[:, :, None] * per_ampere * np.array(spans)[:, None, None]
         steps[0] += self._asked
@@ -440,7 +440,7 @@ class CoilResponse:
     def _solved(self, rows: FloatArray, span: float) -> MotionFit:
         """Fit all gains freely, and fit each gain under the assumption that the other coils are healthy.
 
-        `rows` (m, f, n + 3 + k) are those of m neighbouring bins, and `span` is the time (s) from bin to bin.
+        `rows` (m, f, n + 3 + k) belong to m neighbouring bins, and `span` is the time (s) from bin to bin.
         """
         count, coils = len(self._free), self._count_of_coils
         matrix, outputs = self._inputs_and_outputs(rows, span)

@@ -52,7 +52,7 @@ PROVEN_NS = 60_000_000_000
 
 
 class OnboardParameters:
-    """The table of onboard parameters in force."""
+    """The table of onboard parameters in use."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class OnboardParameters:
         self._loaded_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Apply the stored table if software and configuration permit it, and record the table in force."""
+        """Apply the stored table if software and configuration permit it, and record the table in use."""
         self._loaded_ns = now_ns
         if kept := self._table.values:
             # Keys that the stored table lacks, because another version wrote it, get their configured values.
@@ -102,7 +102,7 @@ class OnboardParameters:
         return ""
 
     def dump(self, now_ns: int) -> None:
-        """Record the table in force as a packet."""
+        """Record the table in use as a packet."""
         named = {
             field.name: self._values[key] for field, key in zip(PARAMETER_FIELDS, PARAMETER_KEYS, strict=True)
         }

@@ -454,7 +454,7 @@ class HealthWatch:
         self._ticker: Ticker | None = None
 
     def watch(self, groups: Sequence[RateGroup]) -> None:
-        """Watch the rate groups of the flight, of which the first one must be the control group."""
+        """Watch the rate groups of the flight, the first of which must be the control group."""
         self._control = groups[0]
         self._progress = GroupsAndWorkers(list(groups), list(self._workers))
         self._counted = (self._control.cycles, self._control.completed)

@@ -253,7 +253,7 @@ class AttitudeWatch:
         self._slow = HoldTimer(detumble.low_for)
 
     def adopt(self, settings: Modes) -> None:
-        """Replace the limits by those of a new table of onboard parameters."""
+        """Replace the limits by the values of a new table of onboard parameters."""
         self._fast = settings.tumble_rate
         self._lost.require(settings.lost_for)
         for timer in (self._known, self._spins):
@@ -306,7 +306,7 @@ class PointingWatch:
         self._off = HoldTimer(settings.hold_patience)
 
     def adopt(self, settings: Modes) -> None:
-        """Replace the limits by those of a new table of onboard parameters."""
+        """Replace the limits by the values of a new table of onboard parameters."""
         self._settings = settings
         self._off.require(settings.hold_patience)
 
@@ -339,7 +339,7 @@ SAFING_REACTIONS = {
 
 
 def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
-    """Return the modes in which a reaction has an effect: all modes, if it does not change the mode."""
+    """Return the modes in which a reaction has an effect: all for a reaction that keeps the mode."""
     trigger = SAFING_REACTIONS.get(reaction)
     if trigger is None:
         return frozenset(Mode)
@@ -423,7 +423,7 @@ class ModeControl:
         return self._targets.configured(mission_time_ns) if configured else self.wanted
 
     def adopt(self, modes: Modes) -> None:
-        """Replace the limits by those of a new table of onboard parameters."""
+        """Replace the limits by the values of a new table of onboard parameters."""
         self._settings = modes
         self._arrived.require(modes.arrived_for)
         self._pointing.adopt(modes)

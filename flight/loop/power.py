@@ -25,8 +25,8 @@ VOLTAGE_TIME = 60.0
 """Time constant (s) of the correction by the voltage if the battery's current is unknown, or if the
 integrated current contradicts the voltage."""
 CONTRADICTION = 0.25
-"""Difference between the integrated state of charge and that from the voltage, above which the latter is
-used."""
+"""Largest accepted difference between the integrated state of charge and the state of charge from the
+voltage. Beyond this difference, the value from the voltage is used."""
 LONGEST_STEP = 5.0
 """Longest time (s) over which one current is integrated, and largest age (s) of a reading."""
 STUCK_FOR, STUCK_RANGE = 10.0, 0.02

@@ -104,7 +104,7 @@ class KeptTable(StatePart, frozen=True, kw_only=True):
     """A table of onboard parameters that a command has loaded, with values by configuration key.
 
     Attributes:
-        before: values in use before this table was loaded; empty for those of the configuration.
+        before: values in use before this table was loaded; empty for the configured values.
         proven: whether the table has been in use long enough to be kept after an unclean shutdown.
         loads: number of tables that have been loaded so far.
     """
@@ -518,8 +518,8 @@ class Notices:
 class StateKeeper:
     """Keeps the stored state up to date from the start of a boot to its end.
 
-    The `record` and the parameters `learned` are those of earlier boots. The flag `counted` states whether
-    the number of this boot was written. The `table` of onboard parameters is to be used.
+    The `record` and the parameters `learned` come from earlier boots. The flag `counted` states whether the
+    number of this boot was written. The `table` of onboard parameters is to be used.
     """
 
     def __init__(
@@ -647,7 +647,7 @@ def open_state(
     """Open the stored state and count this boot, or return None if no state is stored.
 
     The sequence `runs` holds the folders of the newest runs, which contain files with boot numbers. The last
-    folder is that of the present run. When `stack` closes, the final state is written, as a clean end unless
+    folder belongs to the present run. When `stack` closes, the final state is written, as a clean end unless
     an exception was raised. A DeviceError counts as a clean end, because it is reported as a device error and
     safe mode would not help.
     """

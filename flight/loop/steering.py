@@ -5,8 +5,8 @@ direction of the torque is preserved. The sent commands are compared with the su
 motion (`flight.loop.coil_monitor`). When a coil is diagnosed as broken, a monitored condition becomes active
 and reports an event. The reaction to this event excludes the axis.
 
-All currents in the loop are effective currents: those of healthy coils with the same dipole. The coil drive
-converts effective currents to actual coil currents by the signs and gains that the coil monitor has
+All currents in the loop are effective currents, with which healthy coils would have the same dipole. The coil
+drive converts effective currents to actual coil currents by the signs and gains that the coil monitor has
 estimated.
 """
 
@@ -134,7 +134,7 @@ class CoilDrive:
         self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
 
     def adopt(self, modes: Modes) -> None:
-        """Replace the limits by those of a new table of onboard parameters."""
+        """Replace the limits by the values of a new table of onboard parameters."""
         self._watch.tumble_rate = modes.tumble_rate
 
     def isolate(self) -> None:

@@ -336,7 +336,7 @@ def lean_imports() -> None:
     This function must be called before scipy is imported. In scipy/_lib/array_api_compat, scipy copies every
     name that numpy lists, and so imports numpy's masked arrays, test support and Fortran reader. The function
     removes these modules from numpy's list of names; they can still be imported explicitly. The function also
-    keeps scipy from extending its docstrings. With different versions of numpy and scipy, the function may
+    prevents scipy from extending its docstrings. With different versions of numpy and scipy, the function may
     have no effect.
     """
     np.__all__ = [name for name in np.__all__ if name not in _SELDOM]

@@ -1,4 +1,4 @@
-"""The configurations of the testbed and of a satellite: sections beyond those that all bodies share."""
+"""The configurations of the testbed and of a satellite: sections in addition to the shared sections."""
 
 from __future__ import annotations
 
@@ -320,10 +320,10 @@ class PointingSection(Section, frozen=True, kw_only=True):
     which is perpendicular to it. An attitude error of `turn` rad, a rate error of `rate` rad/s and a dipole
     of `dipole` A m^2 have equal cost. A roll error of `roll` rad about `axis` has the same cost; without
     `roll`, a roll error costs as much as any other attitude error. The coils act for `act` s between pauses
-    for the magnetometer, which last as long as those of detumbling. Plans are renewed every `replan_period`
-    s. A coil that pointing rarely uses is tested by a short current every `coil_test` s; 0 switches the tests
-    off. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
-    of the star camera. The `planner` of slews is `collocation` or `vmc` (virtual motion camouflage). Without
+    for the magnetometer, which last as long as in detumbling. Plans are renewed every `replan_period` s. A
+    coil that pointing rarely uses is tested by a short current every `coil_test` s; 0 switches the tests off.
+    A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones` of
+    the star camera. The `planner` of slews is `collocation` or `vmc` (virtual motion camouflage). Without
     `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`, `OrbitConfig.slew_duration`).
     """
 
@@ -443,7 +443,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         return _LARGEST_PRESSURE * self.torque_sizes()[0], sum(self.dipole_errors()) * _FIELD
 
     def dipole_weight(self) -> float:
-        """Return the dipole (A m^2) whose cost equals that of an attitude error of `pointing.turn`.
+        """Return the dipole (A m^2) that costs as much as an attitude error of `pointing.turn`.
 
         The default is proportional to the square root of the mean moment of inertia, tuned for a 1U and a 3U
         CubeSat, and at most a fiftieth of the mean dipole limit.

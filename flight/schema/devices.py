@@ -160,11 +160,11 @@ class Winding(Section, frozen=True, kw_only=True):
 
     A positive current makes a dipole moment along `axis`, which may have any length. The dipole moment per
     ampere is `dipole_per_ampere` (m^2), or `turns` times `area` (m^2) of an air coil. On the testbed, these
-    values are in the section `plant`. The value `current_limit` (A) replaces that of the section `coils`. The
-    values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them, the coils use
-    the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are swapped. The
-    `position` (m, body axes) of the coil's centre relative to the inertial unit gives the field that
-    `knightcube bringup` expects at the magnetometer.
+    values are in the section `plant`. The value `current_limit` (A) replaces the limit in the section
+    `coils`. The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them,
+    the coils use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are
+    swapped. The `position` (m, body axes) of the coil's centre relative to the inertial unit gives the field
+    that `knightcube bringup` expects at the magnetometer.
     """
 
     axis: Vector
@@ -229,8 +229,8 @@ class Coils(Section, frozen=True, kw_only=True):
         """The coils in the order of the flight application; the last coil may be fictitious.
 
         If the coils lie in a plane, a fictitious coil along the normal of the plane is appended. This coil
-        has two free PWM channels. Its dipole moment is half that of the weakest coil, so that plans use it
-        little.
+        has two free PWM channels. The dipole moment of the fictitious coil is half the weakest coil's moment,
+        so that plans use it little.
         """
         axes = np.array([coil.direction() for coil in self.windings]).T
         if np.linalg.matrix_rank(axes, LEAST_SPREAD) == 3:
@@ -520,7 +520,7 @@ class Camera(Section, frozen=True, kw_only=True):
 
 
 class Gps(Section, frozen=True, kw_only=True):
-    """The GPS receiver on its own serial line, a u-blox receiver or (driver `nmea`) one that sends NMEA 0183.
+    """The GPS receiver on its own serial line, a u-blox receiver or (driver `nmea`) any NMEA 0183 receiver.
 
     The receiver reports a fix every `period` s; the position is unknown after `max_age` s without a fix.
     """

@@ -2,8 +2,8 @@
 
 Plain scalars follow the core schema of YAML 1.2: `1e-5` and `0o17` are numbers, `yes` and `12:30` are texts.
 Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected. A file with the key
-`extends` takes over the values of another file and replaces some of them. At the end of the module stand the
-types of values with their bounds, and the values of a pointing goal.
+`extends` takes over the values of another file and replaces some of them. The last part defines the types of
+values with their bounds, and the values of a pointing goal.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ configuration may import, in addition to the known objects."""
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
     """Return the object `module:object`; `known` maps short names to such objects. Raises ConfigError.
 
-    A flight computer imports only known objects and those in the file of the variable `KNIGHTCUBE_MODULES`.
+    A flight computer imports only known objects and the objects in the file that `KNIGHTCUBE_MODULES` names.
     """
     place = known.get(named, named)
     module, colon, name = place.partition(":")
@@ -225,8 +225,8 @@ def read_document(text: str, name: str) -> Document:
     """Return the values of a YAML text, including those of the files that it extends.
 
     The value of the key `extends` is a path relative to the file `name`, or the name of a packaged
-    configuration. Mappings are merged key by key; lists and scalars replace those of the extended file. Error
-    messages name the file that contains the value.
+    configuration. Mappings are merged key by key; lists and scalars replace the values of the extended file.
+    Error messages name the file that contains the value.
 
     Raises ConfigError, also if files extend each other in a circle, and UnreadConfigError if an extended file
     cannot be read.
@@ -247,7 +247,7 @@ def merged_text(text: str, name: str) -> str:
 def _extended(document: Document, above: tuple[str, ...]) -> Document:
     """Return a document merged with the file that it extends.
 
-    The names `above` are those of the files that extend this document, directly or through other files.
+    The names `above` belong to the files that extend this document, directly or through other files.
     """
     if EXTENDS not in document.values:
         return document

@@ -2,7 +2,7 @@
 
 Only the module of the requested command is imported, because a flight computer does not need the other
 commands. A command finishes its work even if its output is not read: if its pipe is closed (`| head`), if its
-terminal is gone, or if it was started without one (`>&-`).
+terminal is gone, or if its standard output is closed (`>&-`).
 """
 
 from __future__ import annotations

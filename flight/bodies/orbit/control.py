@@ -7,7 +7,7 @@ law. Far off the path, the rotation is damped before a new path is planned (`Pat
 `damping_dipole` of `knightcube.gnc.control.pointing_law`).
 
 While pointing, the coils are off at the beginning of each control window, so that the magnetometer can be
-read. At the end of the pause of a control window, one dipole is computed, which is held until the window
+read. At the end of the pause of a control window, one dipole is computed, which is commanded until the window
 ends. The dipole of a control window is increased, so that its mean over the window is the dipole that the law
 requires.
 """
@@ -72,7 +72,7 @@ class _MagneticLaw:
 
 
 class FieldDetumblingLaw(_MagneticLaw):
-    """Detumbles the body; the `detumbler` attribute holds the estimated rate and field."""
+    """Detumbles the body; the `detumbler` attribute contains the estimated rate and field."""
 
     def __init__(self, detumbler: FieldDetumbler, coils: CoilMap) -> None:
         """`coils` maps dipole moments to currents."""

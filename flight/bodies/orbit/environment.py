@@ -205,7 +205,7 @@ class EstimatedEnvironment:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the time is that of a GPS receiver."""
+        """Whether the time comes from a GPS receiver."""
         return self._utc_offset_ns is not None
 
     @property
@@ -418,7 +418,7 @@ class EstimatedEnvironment:
         return self._sequences[-1]
 
     def _is_in_time(self, offset_ns: int, time_ns: int) -> bool:
-        """Return whether the receiver's time is consistent with that of the used fixes."""
+        """Return whether the receiver's time is consistent with the times of the used fixes."""
         known = self._utc_offset_ns
         gate = TIME_GATE_NS + CLOCK_DRIFT * abs(time_ns - self._fixed_ns)
         return known is None or abs(offset_ns - known) <= gate

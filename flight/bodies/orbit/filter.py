@@ -1,6 +1,6 @@
 """The satellite's attitude filter, which runs `FreeFilter` in steps of at most one second.
 
-A step holds the coil commands and the measurements between two times. A step ends early when the coils are
+A step contains the coil commands and the measurements between two times. A step ends early when the coils are
 switched on or off, so that the dipole is nearly constant during a step. When a step has ended, the filter
 processes it with the mean commanded dipole and the mean of the gyro samples. Magnetometer samples are used
 only while the coils are off and their field has decayed. Within an incomplete step, the estimate is
@@ -8,14 +8,14 @@ propagated by the model. A measurement of a past time, such as a star fix, is ap
 filter returns to the beginning of the step that contains this time, and repeats all steps since then.
 
 The learned states are stored for the next boot in three parts, without the cross-covariance of different
-parts. The part `attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment
-of the star camera. The part `attitude-torques` holds the residual dipole in shadow and in sunlight and the
-torques. The part `body` holds the inertia and the matrix of the coils. The matrix of the coils applies to
-dipoles that were computed with the signs and gains from the coil monitor. These signs and gains are therefore
-stored too, in the entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s) for which the
-learned states were estimated. At the next boot, the covariance of each state grows by its random walk over
-the elapsed time, and by a fraction of its initial covariance, because switching a sensor off and on changes
-its bias.
+parts. The part `attitude-errors` contains the biases and matrices of gyro and magnetometer and the
+misalignment of the star camera. The part `attitude-torques` contains the residual dipole in shadow and in
+sunlight and the torques. The part `body` contains the inertia and the matrix of the coils. The matrix of the
+coils applies to dipoles that were computed with the signs and gains from the coil monitor. These signs and
+gains are therefore stored too, in the entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s)
+for which the learned states were estimated. At the next boot, the covariance of each state grows by its
+random walk over the elapsed time, and by a fraction of its initial covariance, because switching a sensor off
+and on changes its bias.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _places(*parts: slice) -> IntArray:
 
 
 _TORQUES = slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
-"""Slice of the slow states that holds the amplitudes of the disturbance torques."""
+"""Slice of the slow states that contains the amplitudes of the disturbance torques."""
 PARTS = {
     ERRORS: _places(GYRO, MAGNET, GYRO_MATRIX, FIELD_MATRIX, CAMERA),
     SOURCES: _places(DIPOLE, SUNLIT, TORQUES),
@@ -207,7 +207,7 @@ class StepReplay:
     """
 
     def __init__(self, settings: OrbitFilterSettings, dipoles: DipoleHistory) -> None:
-        """`dipoles` holds the commanded dipoles during the history."""
+        """`dipoles` contains the commanded dipoles during the history."""
         self._settings, self._dipoles = settings, dipoles
         self.free = FreeFilter(settings.inertia, settings.free, settings.slow)
         self.steps: deque[FilterStep] = deque()
@@ -476,7 +476,7 @@ class OrbitFilter:
     ) -> None:
         """Create a filter without an estimate; `around` returns the environment at a time, or None."""
         self._settings, self._around = settings, around
-        # Dipoles are kept longer than the history, because its first step may begin earlier.
+        # Dipoles are stored for longer than the history, whose first step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
         self._replay = StepReplay(settings, self._dipoles)
         self.contradictions = self._replay.contradictions
@@ -488,7 +488,7 @@ class OrbitFilter:
         self._shifted = 0.0  # additional dipole error (A m^2) of redundant coils in the present step
         self._shares = settings.coils.linear_shares(np.ones(len(settings.coils.current_limits), dtype=bool))
         self._placed_ns = 0  # time of the last attitude that was used
-        self._by_field = FieldRate(settings.by_field)  # used while the gyro gives no rate
+        self._by_field = FieldRate(settings.by_field)  # rate estimator for times without a gyro rate
         self._unknown_rate = settings.by_field.rate_start**2 * _EYE
         self.restarts = 0
         self.field_at_rest: tuple[int, float] | None = None
@@ -584,7 +584,7 @@ class OrbitFilter:
         coils, gain = self._settings.coils, self._settings.free.errors.coil_gain
         x, y, z = coils.dipole(currents).tolist()
         if coils.is_redundant:
-            # The matrix of the coils holds only for currents that are linear in the dipole.
+            # The matrix of the coils is valid only for currents that are linear in the dipole.
             shifted = coils.dipoles * (currents - self._shares @ currents)
             self._shifted = max(self._shifted, gain * float(np.linalg.norm(shifted)) / 3.0)
         self._dipoles.record(time_ns, (x, y, z), known)

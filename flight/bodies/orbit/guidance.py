@@ -432,7 +432,7 @@ coils can produce nearly every possible torque."""
 class PlannedCraft:
     """The planner's model of the satellite, with the inertia tensor (3, 3), kg m^2, in body axes.
 
-    The coils are driven in the fraction `duty` of a control window; `slew` holds the constraints of slews.
+    The coils are driven in the fraction `duty` of a control window; `slew` contains the constraints of slews.
     """
 
     inertia: FloatArray

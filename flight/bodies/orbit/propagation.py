@@ -1,6 +1,6 @@
 """Steps of the satellite's attitude filter, and propagation of its estimate from the end of the last step.
 
-A step holds the coil commands and the readings between two times.
+A step contains the coil commands and the readings between two times.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The testbed: a body on a thread in a fixed horizontal field, rotated about the thread by one coil.
 
-`TESTBED` builds the testbed from the configuration. Only this package uses the thread and q2, which is
-the second component of the quaternion.
+`TESTBED` builds the testbed from the configuration. Only this package depends on the suspension by a thread
+and on q2, the second component of the quaternion.
 """
 
 from __future__ import annotations

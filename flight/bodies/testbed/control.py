@@ -4,22 +4,22 @@ Paths are planned by one of three strategies. The strategy GOAL plans the whole 
 every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
 continuation of the step. Near the goal time, the last path is followed to its end. After the end of this
 path, each plan holds the target for one replanning period. If the body is displaced from its path, a new path
-is planned. The strategy RECEDING is that of the thesis: each plan reaches the target one whole planning
+is planned. The strategy RECEDING is described in the thesis: each plan reaches the target one whole planning
 horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan: the controller
 tracks the target itself.
 
-The control laws are B-dot detumbling and a controller of the rotation about the thread. In a Helmholtz cage,
-the magnetic field is that of an orbit, which the flight software predicts. The cage produces the field that a
-satellite would measure in its local orbital frame: x along the flight direction, z down, and y, the axis of
-the thread, opposite to the orbit normal. The rotation about the thread is therefore the pitch of an
+The control laws are B-dot detumbling and a controller of the rotation about the thread. A Helmholtz cage
+reproduces the magnetic field along an orbit, which the flight software predicts. The cage produces the field
+that a satellite would measure in its local orbital frame: x along the flight direction, z down, and y, the
+axis of the thread, opposite to the orbit normal. The rotation about the thread is therefore the pitch of an
 Earth-pointing satellite, in a field that rotates once per revolution and varies in strength. The cage
 produces only the two field components normal to the thread, multiplied by `scale`. The component along the
 thread would cause no torque about the thread.
 
 Both the cage's control computer and the flight software predict the field as a function of UTC, by the World
 Magnetic Model along the orbit of the two-line elements. The coil on body x has no torque while the field is
-parallel to its axis, so the coils on x and z share the torque about the thread in the way that needs the
-least current.
+parallel to its axis, so the torque about the thread is distributed over the coils on x and z with the least
+current.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from knightcube.errors import FlightError, UsageError
 def read_regular(path: Path, most: int) -> bytes | None:
     """Return the content of a file of at most `most` bytes, or None if the file does not exist.
 
-    Type and size are checked first. Raises OSError, also for a longer file or one that is not regular.
+    Type and size are checked first. Raises OSError, also for a longer file or a file that is not regular.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -201,7 +201,7 @@ class Store:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Create the folder if it does not exist. Raises UsageError if this fails."""
+        """Create the folder if it does not exist. Raises UsageError if it cannot be created."""
         self._folder = folder / "transfers"
         self.received = folder / "received"
         try:

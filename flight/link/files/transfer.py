@@ -7,7 +7,7 @@ repeated EOFs.
 A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next
 protocol data unit (PDU) whenever one can be sent. Replies are sent first, followed by PDUs of the open
 transfers in round-robin order. No method of an entity waits, and the caller states the current time. State
-that survives a restart of the process is kept in the store.
+that must survive a restart of the process is stored on disk (`flight.link.files.store`).
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class Ranges:
         self._begins[first:last], self._ends[first:last] = [begin], [end]
 
     def take(self, most: int) -> tuple[int, int]:
-        """Remove and return at most `most` bytes of the first range. Raises IndexError if there is none."""
+        """Remove and return at most `most` bytes of the first range. Raises IndexError for an empty set."""
         begin, end = self._begins[0], min(self._ends[0], self._begins[0] + most)
         self._begins[0] = end
         if end == self._ends[0]:

@@ -261,7 +261,7 @@ class TimetableError(FlightError):
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Schedule entry, numbered from 1: a command in words, due at the UTC `at_ns` (ns since 1970).
 
-    The values `spi` and `counter` are those of the frame that contained the scheduling command.
+    The values `spi` and `counter` come from the frame that contained the scheduling command.
     """
 
     number: _Count
@@ -310,7 +310,7 @@ class Timetable:
         return tuple(sorted(self._now.entries, key=lambda entry: (entry.at_ns, entry.number)))
 
     def add(self, at_ns: int, spi: int, counter: int, command: str) -> Entry:
-        """Add an entry and store the schedule. Raises TimetableError if it is full or not writable."""
+        """Add an entry and store the schedule. Raises TimetableError if the disk or the schedule is full."""
         if len(self._now.entries) >= MOST_ENTRIES:
             raise TimetableError(f"{MOST_ENTRIES} commands are scheduled already: delete one")
         entry = Entry(self._now.last + 1, at_ns, spi, counter, command)

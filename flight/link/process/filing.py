@@ -81,7 +81,7 @@ class Filing:
     """Executes the file commands and manages the file transfers on board. Not thread-safe."""
 
     def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
-        """Continue the transfers in `folder`; `log` holds the recorded runs. Raises UsageError."""
+        """Continue the transfers in `folder`; `log` contains the recorded runs. Raises UsageError."""
         self._folder = folder
         self._store = Store(folder)
         self._roots = {"log": log, "received": self._store.received}

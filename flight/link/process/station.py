@@ -558,7 +558,7 @@ class Station:
         try:
             frames = self._downlink.frames(now_ns)
             self._problem = ""
-        except FlightError as error:  # commands are still accepted, such as one that sets a new key
+        except FlightError as error:  # commands are still accepted, such as a command that sets a new key
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)
