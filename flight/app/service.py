@@ -186,7 +186,10 @@ class SeparationInhibit:
         self._elapsed: float | None = None
 
     def check(self, folder: Path, seconds: float) -> None:
-        """Store the time with power in `folder`. Raises InhibitedError while it is below `seconds` s."""
+        """Store the time with power in `folder`.
+
+        Raises InhibitedError while the time with power is shorter than `seconds` s.
+        """
         if seconds == 0.0:
             return
         path = folder / "powered"

@@ -144,7 +144,7 @@ class CommandError(FlightError):
 
 
 class MalformedError(CommandError):
-    """Raised for bytes that are not a command; never answered, so that two flights cannot answer forever."""
+    """Raised for bytes that are not a command; not answered, lest two flights answer each other forever."""
 
 
 class _Command:
@@ -544,7 +544,7 @@ class DatagramChannel:
         path: Path | None = None,
         peers: Sequence[IPv4Network] | None = None,
     ) -> None:
-        """Use a bound socket, which the channel closes, as it removes the file `path` of a UNIX socket.
+        """Use a bound socket; `close` closes the socket and removes the file `path` of a UNIX socket.
 
         Only datagrams from the networks `peers` are accepted, or all datagrams if `peers` is None.
         """

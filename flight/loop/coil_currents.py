@@ -139,7 +139,7 @@ def predict(
 
 
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
-    """Return the supply currents (n, v, k), A, of n bridges in v variants for the commands (n, k), A.
+    """Return the supply currents (n, v, k), A, of n bridges in v fault variants for commands (n, k), A.
 
     The current of each coil at a duty cycle of one is `full` (n, 1), A. Short circuits are not modelled: for
     the variant of a shorted coil, the current of a healthy coil is returned.

@@ -709,8 +709,8 @@ _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
 """Sign of the continuous current through the coil, for each kind of fault with a leg stuck high."""
 _LITTLE_RESPONSE = 0.4
 _DOUBTED_FOR_NS = 60_000_000_000
-"""Time (ns) after a diagnosis was found to be wrong. Within this time, the next diagnoses are rejected if the
-motion is inconclusive."""
+"""Time (ns) after a refuted diagnosis during which further diagnoses are rejected if the motion is
+inconclusive."""
 
 
 class MotionWitness:

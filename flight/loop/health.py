@@ -84,7 +84,7 @@ class ResourceSample:
 
 
 ResourceReader = Callable[[int], ResourceSample]
-"""Function that samples the board's resources at a time (ns), and does not raise."""
+"""Function that samples the board's resources at a time (ns), and raises no exceptions."""
 
 
 @dataclass(frozen=True, slots=True)

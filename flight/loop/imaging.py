@@ -634,7 +634,7 @@ class Imaging:
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
 
     def workload(self) -> tuple[int, int]:
-        """Return the numbers of exposures left out, and of frames that arrived or ended late."""
+        """Return the numbers of omitted exposures, and of frames that arrived or ended late."""
         return self._shed, self._late
 
     def begin(self, time_ns: int) -> None:

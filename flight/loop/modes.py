@@ -339,7 +339,7 @@ SAFING_REACTIONS = {
 
 
 def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
-    """Return the modes in which a reaction has an effect: all for a reaction that keeps the mode."""
+    """Return the modes in which a reaction has an effect: all, unless the reaction changes the mode."""
     trigger = SAFING_REACTIONS.get(reaction)
     if trigger is None:
         return frozenset(Mode)

@@ -227,7 +227,7 @@ class Navigation:
     def _or_magnetometer(
         self, polled: list[ImuReading], magnetometer: InertialUnit, now_ns: int
     ) -> list[ImuReading]:
-        """Return the unit's readings or, once the unit has been silent for a while, the magnetometer's."""
+        """Return the inertial unit's readings or, if these are too old, the magnetometer's readings."""
         if polled:
             self._unit_ns = polled[-1].time_ns
         fields: list[ImuReading] = []

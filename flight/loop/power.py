@@ -115,7 +115,7 @@ class PowerTask:
     def __init__(
         self, section: Power, monitors: Sequence[PowerMonitor], loads: Sheddable, services: Services
     ) -> None:
-        """Use the monitors of battery and, if fitted, bus."""
+        """Use the monitors of the battery and, if fitted, of the bus."""
         self._section, self._loads, self._facts = section, loads, services.facts
         self._recorder = services.recorder
         names, cells = ("battery monitor", "bus monitor"), section.battery.cells

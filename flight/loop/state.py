@@ -519,7 +519,7 @@ class StateKeeper:
     """Keeps the stored state up to date from the start of a boot to its end.
 
     The `record` and the parameters `learned` come from earlier boots. The flag `counted` states whether the
-    number of this boot was written. The `table` of onboard parameters is to be used.
+    number of this boot was written. The attribute `table` is the table of onboard parameters to be used.
     """
 
     def __init__(

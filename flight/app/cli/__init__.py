@@ -1,4 +1,4 @@
-"""The command line: a user error prints one line and gives exit status 2.
+"""The command line: a user error is reported in one line, with exit status 2.
 
 Only the module of the requested command is imported, because a flight computer does not need the other
 commands. A command finishes its work even if its output is not read: if its pipe is closed (`| head`), if its
@@ -25,12 +25,12 @@ _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
 
 class _Outlet(io.FileIO):
-    """File descriptor that discards all output once the reader has closed it, or after the first error."""
+    """Output file that discards all data after its reader has closed it, or after the first error."""
 
     _lost = False
 
     def write(self, data: Any, /) -> int:
-        """Return how many bytes were written or discarded. Raises OSError once, such as for a full disk."""
+        """Return how many bytes were written or discarded. Raises OSError for the first disk error."""
         try:
             if not self._lost:
                 return super().write(data)

@@ -224,7 +224,7 @@ class _LoopbackLine:
 
 
 def self_test() -> None:
-    """Run a link until it has executed one command, as a test of a release. Raises FlightError after 20 s."""
+    """Test a release: run a link until it has executed one command. Raises FlightError after 20 s."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as name:
         folder = Path(name)
         keys = [folder / "satellite" / "keys", folder / "ground"]

@@ -1,8 +1,8 @@
 """The commands `knightcube run`, which flies a configuration, and `knightcube check`.
 
-The function `probe` looks for the real devices that a configuration names. No device is configured, and no
-coil is driven. A device that does not respond is reported together with the suggested remedy. The serial port
-and the camera that a running flight uses are reported as busy.
+The function `probe` looks for the real devices that a configuration names. The function writes no settings to
+the devices and drives no coil. A device that does not respond is reported together with the suggested remedy.
+The serial port and the camera that a running flight uses are reported as busy.
 """
 
 from __future__ import annotations

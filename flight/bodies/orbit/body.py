@@ -188,7 +188,7 @@ class OrbitView:
         return {"target_q2": math.nan}
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return an angular rate that was measured from streaks as text."""
+        """Return an angular rate measured from streaks, as text."""
         return f"{np.rad2deg(rate.rate).round(3).tolist()} deg/s"
 
     def progress(self, output: ControlOutput | None) -> str:
@@ -394,7 +394,7 @@ class SatelliteControl(BodyControl):
         return self._objects.seeks
 
     def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Accept the confirmed tracks of objects, and choose the one to follow."""
+        """Accept the confirmed tracks of objects, and choose the track to follow."""
         self._objects.accept(tracks, now_ns)
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:

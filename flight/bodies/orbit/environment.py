@@ -101,7 +101,7 @@ class FixSequence:
         self._offered = 1
         self._strength = np.zeros(3)  # sum of squared field deviations from two orbits; number of fields
         self._is_refuted = False
-        self._shadowed = np.zeros(2)  # sunlit fixes at which each orbit predicts shadow
+        self._shadowed = np.zeros(2)  # number of sunlit fixes at which each orbit predicts shadow
 
     @property
     def confirmed(self) -> bool:
@@ -186,7 +186,7 @@ class EstimatedEnvironment:
         self._clock = clock
         self._fix: GpsFix | None = None
         self._is_confirmed = False  # whether the newest fix belongs to a confirmed orbit
-        self._is_doubted = False  # whether an orbit that began with few fixes was not confirmed
+        self._is_doubted = False  # whether an orbit from few fixes could not be confirmed
         self._start: FixSequence | None = None  # fixes since the start of an unconfirmed orbit
         self._sequences: list[FixSequence] = []
         self._utc_offset_ns: int | None = None
@@ -393,7 +393,7 @@ class EstimatedEnvironment:
         return False
 
     def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
-        """Return whether a fix sequence starts an orbit estimate, or continues one based on few fixes."""
+        """Return whether a fix sequence starts an orbit estimate, or continues an estimate from few fixes."""
         first = FIRST_FIXES if self._elements is None else 1
         known = self._elements is None or self._is_tight(sequence.first.julian_date)
         if not known or self._is_doubted or sequence.refuted or sequence.joined < first:

@@ -302,7 +302,7 @@ class StepReplay:
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
         """Treat the dipoles since a time as unknown, if the gate then accepts a rejected attitude.
 
-        Dipole errors that are too small for the gyro accumulate in the attitude.
+        Dipole errors that are too small to be measured by the gyro accumulate in the attitude.
         """
         doubts = [step.doubt for step in self.steps]
         used = self.doubt_since(min(since_ns, refused.time_ns))
@@ -487,7 +487,7 @@ class OrbitFilter:
         self._refused_attitudes = 0
         self._shifted = 0.0  # additional dipole error (A m^2) of redundant coils in the present step
         self._shares = settings.coils.linear_shares(np.ones(len(settings.coils.current_limits), dtype=bool))
-        self._placed_ns = 0  # time of the last attitude that was used
+        self._placed_ns = 0  # time (ns) of the last attitude that was used
         self._by_field = FieldRate(settings.by_field)  # rate estimator for times without a gyro rate
         self._unknown_rate = settings.by_field.rate_start**2 * _EYE
         self.restarts = 0

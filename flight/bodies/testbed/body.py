@@ -208,7 +208,7 @@ class ThreadView:
         return {"target_q2": math.nan if wanted is None else law_of(wanted).q2}
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return an angular rate that was measured from streaks as text."""
+        """Return an angular rate measured from streaks, as text."""
         return f"{rate.rate[1]:.5f} rad/s +- {math.sqrt(rate.covariance[1, 1]):.1e}"
 
     def progress(self, output: ControlOutput | None) -> str:

@@ -183,7 +183,7 @@ class _Waiting(Generic[T]):
 
 
 class ControlLine(Generic[T]):
-    """Client of the control process's command socket. The type T identifies a command to the caller."""
+    """Client of the control process's command socket. The type T identifies a command for the caller."""
 
     def __init__(self, target: Path, folder: Path) -> None:
         """Create the sockets for answers in `folder`, to which the control process must have access."""

@@ -201,7 +201,7 @@ _FLUSH_NS = 200_000_000
 
 
 class LiveQueue:
-    """Queue of live telemetry packets. Newer packets of the same type have replaced `thinned` packets."""
+    """Queue of live telemetry packets; `thinned` counts packets replaced by newer packets of their type."""
 
     def __init__(self, room: float) -> None:
         """Create a queue that keeps only the newest packet of each type once it contains `room` bytes."""

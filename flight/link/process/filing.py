@@ -187,7 +187,7 @@ class Filing:
         return [replace(done, stage=Stage.STARTED, text=text)]
 
     def _path(self, name: str) -> Path:
-        """Return the path of a file. Raises FileError unless it is in `log/` or `received/`."""
+        """Return the path of a file. Raises FileError for a file outside `log/` and `received/`."""
         root, _, rest = name.partition("/")
         if (problem := problem_of_name(name)) or root not in self._roots:
             raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
