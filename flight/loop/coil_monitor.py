@@ -511,7 +511,7 @@ class CoilMonitor:
         self._news.append(f"coil {COIL_NAMES[axis]}: {seen}; {self.correction.text(axis)}")
 
     def _end_rests(self, now_ns: int, speed: float) -> None:
-        """Use the axes that are kept at zero current again, if the body is slow or after ten minutes."""
+        """Use axes again that were kept at zero current, if the body is slow or after ten minutes."""
         oldest_ns = min(since_ns for since_ns, _ in self._rests.values())
         if speed <= self.tumble_rate or now_ns - oldest_ns > LONGEST_REST_NS:
             self._rests.clear()

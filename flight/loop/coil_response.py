@@ -668,7 +668,7 @@ class CoilCorrection:
         return True
 
     def weigh(self, axis: int, gain: float, sigma: float = 0.0) -> bool:
-        """Multiply the gain of a coil by `gain` +- `sigma`, up to a gain of 1; return whether it changed."""
+        """Multiply a coil's gain by `gain` +- `sigma`, up to a gain of 1; return whether the gain changed."""
         size = abs(float(self.factors[axis]))
         factor = min(gain, 1.0 / size)
         if factor == 1.0:

@@ -289,7 +289,7 @@ class FrameReport:
         now_ns: int,
         accepted: bool | None,
     ) -> None:
-        """Record an attitude measured with stars; `accepted` is None if the filter did not get it."""
+        """Record an attitude measured with stars; `accepted` is None if the filter was not updated."""
         if is_strange(solution):
             text = f"frame {frame.sequence}: {len(solution.points)} detected stars match no part of the sky"
             self._events.report(events.CAMERA_STRANGE, now_ns, text)

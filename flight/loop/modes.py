@@ -347,7 +347,7 @@ def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
 
 
 class ModeControl:
-    """Holds the mode state machine, and the targets that commands set.
+    """Runs the mode state machine, and stores the targets that commands set.
 
     The text `restart` states why the process must be restarted; it is empty if no restart is needed. A hold,
     a slew, the mode SUN or a command to point sets the target `wanted`.

@@ -214,7 +214,7 @@ class StepReplay:
         self.refused_gyros = self.refused_fields = self.contradicted = 0
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
-        self._innovation = "body", 0.0  # states that the newest gyro innovation tests, and its square
+        self._innovation = "body", 0.0  # tested states, and normalised square, of the newest gyro innovation
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:

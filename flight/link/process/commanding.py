@@ -383,7 +383,7 @@ class Scheduling:
             self._mode = int(layout.array(packet)[0]["mode"])
 
     def obey(self, directive: Scheduled | Deletion | Listing, done: Report, utc_ns: int) -> list[Report]:
-        """Execute a directive and return all reports about it; `done` is the report of its completion."""
+        """Execute a directive and return all reports about it; `done` is the report of completion."""
         try:
             match directive:
                 case Scheduled():

@@ -363,7 +363,7 @@ class Playback:
         self._done: Report | None = None
 
     def begin(self, play: Play, done: Report) -> list[Report]:
-        """Begin a playback and return the reports due now; `done` is the report of its completion."""
+        """Begin a playback and return the reports due now; `done` is the report of completion."""
         folder = self._log.folder(play.run)
         if folder is None:
             return [replace(done, stage=Stage.FAILED, text=f"there is no run {play.run}")]

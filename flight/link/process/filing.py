@@ -139,7 +139,7 @@ class Filing:
             yield one, report
 
     def obey(self, directive: FileDirective, done: Report, utc_ns: int, now_ns: int) -> list[Report]:
-        """Execute a file directive and return the reports due now; `done` is the report of its completion."""
+        """Execute a file directive and return the reports due now; `done` is the report of completion."""
         try:
             match directive:
                 case ListFiles(entity=entity, under=under):

@@ -384,7 +384,7 @@ def host_port(address: str) -> tuple[str, int]:
 
 
 def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
-    """Change a key on request of a command that arrived under `spi`. Return the problem, or "" on success."""
+    """Change a key as requested by a command with the SPI `spi`. Return the problem, or "" on success."""
     if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
         return f"there is no SPI {change.spi}"
     if not may_change(spi, change.spi):
