@@ -644,7 +644,7 @@ class Station:
         self._report(*reports)
 
     def _executed(self, directive: Executable, done: Report) -> list[Report]:
-        """Execute a directive and return the reports due now. The report `done` states its completion."""
+        """Execute a directive and return the reports due now; `done` is the report of completion."""
         match directive:
             case Play():
                 return self._playback.begin(directive, done)
