@@ -8,15 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from knightcube.astro.arrays import IntArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
+from knightcube.vision.startracker import lost_in_space
 from knightcube.vision.startracker.attitude_fit import MatchStatus, ScaleSteps, StarField, StarMatch, _refined
+from knightcube.vision.startracker.index import CELLS, FINE
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import (
+    BatchSizes,
     IdentificationSettings,
     _choose,
     _look_up,
+    batches_of,
     identify,
+    look_up,
+    middle_sized,
     neighbours,
+    spread_batches,
     triples,
 )
 from knightcube.vision.startracker.verification import _first_match
@@ -319,3 +327,222 @@ def test_identification_by_compiled_forms_gives_the_same_answers(
             np.testing.assert_allclose(other.fix.quaternion, one.fix.quaternion, atol=1e-12)
             np.testing.assert_allclose(other.fix.covariance, one.fix.covariance, rtol=1e-6)
     assert {one.status for one in expected} == {MatchStatus.IDENTIFIED, MatchStatus.NO_MATCH}
+
+
+def _spread_field(count: int, magnitude: bool = False) -> StarField:
+    draw = np.random.default_rng(count)
+    tangent = draw.uniform(-0.1, 0.1, (count, 2))
+    direction = np.column_stack([tangent, np.ones(count)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    brightness = np.arange(float(count)) if magnitude else None
+    return StarField(direction, np.full(count, 1e-5), (0.1, 0.1), magnitude=brightness)
+
+
+def test_batches_begin_with_triangles_of_the_brightest_stars() -> None:
+    """The batches of the brightest stars have their stated sizes, divided by the root of the scale steps.
+
+    Triangles with faint stars follow, and are computed last.
+    """
+    asked = []
+    faint = np.array([[3, 4, 5]])
+
+    def spread() -> list[IntArray]:
+        asked.append(True)
+        return [faint, faint[:0]]
+
+    sizes = BatchSizes((60, 100), (40, 80))
+    found = batches_of(_spread_field(30), sizes, 1, spread)
+    first, second = next(found), next(found)
+    assert not asked
+    whole = triples(12)
+    assert np.array_equal(first[0], whole[:60])
+    assert np.array_equal(second[0], whole[60:160])
+    assert not first[1]
+    assert not second[1]
+    ((third, with_faint),) = found
+    assert np.array_equal(third, faint)
+    assert with_faint
+    steps = [len(triangles) for triangles, _ in batches_of(_spread_field(30), sizes, 4, spread)]
+    assert steps == [30, 50, 1]
+    assert [len(t) for t, _ in batches_of(_spread_field(30), sizes, 10_000, spread)] == [20, 20, 1]
+    # All ten triangles of five stars are in the first batch.
+    assert [len(t) for t, _ in batches_of(_spread_field(5), sizes, 1, spread)] == [10]
+    assert [len(t) for t, _ in batches_of(_spread_field(12), sizes, 1, spread)] == [60, 100, 1]
+
+
+def test_spread_batches_contain_triangles_of_medium_size() -> None:
+    """The longest side is between 0.3 and 0.75 field widths; many or unranked points add their neighbours."""
+    field, sizes = _spread_field(40), BatchSizes((10,), (100, 300))
+    chosen = middle_sized(field, 400)
+    assert len(chosen) == 400
+    assert len({tuple(row) for row in chosen.tolist()}) == 400
+    corner = field.direction[chosen]
+    sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
+    lowest, highest = lost_in_space._MIDDLE_SIZES
+    assert sides.min() >= 0.2 * lowest
+    assert sides.max() <= 0.2 * highest
+    every = triples(40)
+    corner = field.direction[every]
+    sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
+    fitting = np.count_nonzero((sides >= 0.2 * lowest) & (sides <= 0.2 * highest))
+    assert len(middle_sized(field, 100_000)) == fitting
+    first, second = spread_batches(field, sizes)
+    assert np.array_equal(first, chosen[:100])
+    assert np.array_equal(second[:300], chosen[100:])
+    assert np.array_equal(second[300:], neighbours(field))
+    ranked = spread_batches(_spread_field(40, magnitude=True), sizes)
+    assert [len(batch) for batch in ranked] == [100, 300]
+    assert len(spread_batches(_spread_field(65, magnitude=True), sizes)[1]) > 300
+    assert len(spread_batches(_spread_field(64, magnitude=True), sizes)[1]) == 300
+    assert triples(7, shuffled=True).tolist() != triples(7).tolist()
+    assert sorted(triples(7, shuffled=True).tolist()) == sorted(triples(7).tolist())
+
+
+def test_matches_are_ranked_by_the_number_of_matches_with_the_same_pairs() -> None:
+    draw = np.random.default_rng(2)
+    observed = draw.integers(0, 6, (300, 3)).astype(np.uint16)
+    star = draw.integers(0, 9, (300, 3)).astype(np.uint16)
+    scale = draw.choice([0.97, 1.1], 300)
+    code = lost_in_space._codes(observed, star, scale, 0.9)
+    keys = [
+        [(one, two, scale[k]) for one, two in zip(observed[k].tolist(), star[k].tolist(), strict=True)]
+        for k in range(300)
+    ]
+    pairs = [pair for match in keys for pair in match]
+    expected = [sum(pairs.count(pair) for pair in match) for match in keys]
+    assert len(np.unique(code)) == len(set(pairs))
+    assert lost_in_space._votes(code).tolist() == expected
+    assert lost_in_space._counted_votes(code).tolist() == expected
+    order = sorted(range(300), key=lambda k: (-expected[k], k))
+    assert lost_in_space._most_voted(np.array(expected), 25).tolist() == order[:25]
+
+
+def test_the_frame_of_three_directions_rotates_with_them() -> None:
+    draw = np.random.default_rng(6)
+    corners = draw.normal(size=(3, 3)) * 0.1 + np.array([0.3, -0.2, 0.9])
+    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
+    frame = lost_in_space._frame(corners)
+    assert frame @ frame.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(frame) == pytest.approx(1.0)
+    middle = corners.sum(axis=0)
+    assert frame[0] == pytest.approx(middle / np.linalg.norm(middle))
+    # The second axis lies in the plane of the centre and the difference of the first two directions.
+    assert frame[1] @ (corners[0] - corners[1]) > 0.0
+    assert frame[2] @ (corners[0] - corners[1]) == pytest.approx(0.0, abs=1e-12)
+    turn = attitude_matrix(np.array([0.1, -0.5, 0.3, 0.8]) / np.linalg.norm([0.1, -0.5, 0.3, 0.8]))
+    assert lost_in_space._frame(corners @ turn.T) == pytest.approx(frame @ turn.T)
+    columns = np.ascontiguousarray(corners.T)
+    lost_in_space._into_frame(columns)
+    assert pytest.approx(frame) == columns.T
+
+
+def test_candidates_are_the_attitudes_of_the_matches_with_the_most_votes() -> None:
+    """A candidate has the attitude of its match; a match with two known pairs is not a new candidate."""
+    turn = attitude_matrix(np.array([0.2, 0.4, -0.1, 0.9]) / np.linalg.norm([0.2, 0.4, -0.1, 0.9]))
+    field = _spread_field(8)
+    guide = lost_in_space.stretched(field.direction, 1.04) @ turn
+    observed = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [4, 5, 6], [7, 3, 2]], dtype=np.uint16)
+    star = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [5, 4, 6], [7, 3, 2]], dtype=np.uint16)
+    scale = np.array([1.04, 1.04, 1.04, 1.04, 1.04])
+    code = lost_in_space._codes(observed, star, scale, 0.9)
+    none = np.zeros((0, 2), dtype=np.int64)
+    arguments = field.direction, guide, observed, star, scale, code
+    for form in (_choose.numpy_form, _choose.loop_form):
+        matrices, scales, tried = form(*arguments, none, 9, 0.9, 1.02)
+        # The second match shares two pairs with the first.
+        assert len(matrices) == 4
+        assert matrices[0] == pytest.approx(turn, abs=1e-9)
+        assert matrices[1] == pytest.approx(turn, abs=1e-9) or matrices[2] == pytest.approx(turn, abs=1e-9)
+        assert scales.tolist() == [1.02] * 4
+        assert tried.shape == (12, 2)
+        assert sorted(map(tuple, tried[:3].tolist())) == [(0, 0), (1, 1), (2, 2)]
+        known = np.array([[4, 4], [5, 5], [0, 0], [1, 1], [2, 2]])
+        matrices, scales, tried = form(*arguments, known, 1, 1.05, 1.2)
+        assert len(matrices) == 1
+        assert scales.tolist() == [1.05]
+        assert tried.shape == (8, 2)
+        assert tried[:5].tolist() == known.tolist()
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.93])
+def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
+    """A triangle of the index is found with its guide stars and the scale of the image.
+
+    A mirrored triangle is not found.
+    """
+    *_, star_of, _, _, _ = SKY.triangles.table
+    draw = np.random.default_rng(4)
+    found = mirrored = 0
+    for entry in draw.choice(len(star_of), 12, replace=False):
+        names = star_of[entry].astype(np.int64)
+        frame = lost_in_space._frame(SKY.stars.direction[names])
+        seen = SKY.stars.direction[names] @ np.stack([frame[1], frame[2], frame[0]]).T
+        seen = lost_in_space.stretched(seen, 1.0 / scale)
+        order = draw.permutation(3)
+        width = float(np.abs(seen[:, :2] / seen[:, 2:]).max()) + 0.01
+        limits = (scale, scale) if scale == 1.0 else (0.9, 0.96)
+        field = StarField(seen[order], np.full(3, 1e-6), (width, width), limits)
+        steps = ScaleSteps.of(field, 0.0015)
+        matches, read = look_up(field, SKY, steps, np.array([[0, 1, 2]]), 3.0, 0.0015, 10_000_000)
+        assert read >= len(matches)
+        for corners, names_found, at in zip(matches.observed, matches.star, matches.scale, strict=True):
+            assert limits[0] * (1.0 - 0.02) <= at <= limits[1] * (1.0 + 0.02)
+            if names_found.tolist() == names[order][corners].tolist() and set(names_found) == set(names):
+                found += 1
+                assert at == pytest.approx(scale, rel=2e-3)
+                break
+        matches, _ = look_up(field.mirrored(), SKY, steps, np.array([[0, 1, 2]]), 3.0, 0.0015, 10_000_000)
+        mirrored += any(set(row) == set(names) for row in matches.star.tolist())
+    assert found == 12
+    assert mirrored == 0
+
+
+def test_sides_of_triangles_are_sorted_with_their_opposite_corners() -> None:
+    """The first corner is opposite to the shortest side; the orientation is that of the sorted corners."""
+    field, triangles, scales = _spread_field(9), triples(9), np.array([0.9, 1.15])
+    corners, sides, left = lost_in_space._forms(field.direction, triangles, scales)
+    assert len(corners) == 2 * len(triangles)
+    for row, (abc, three, is_left) in enumerate(zip(corners, sides, left, strict=True)):
+        assert sorted(abc.tolist()) == triangles[row // 2].tolist()
+        at = lost_in_space.stretched(field.direction[abc], float(scales[row % 2]))
+        opposite = [np.linalg.norm(at[(k + 1) % 3] - at[(k + 2) % 3]) for k in range(3)]
+        assert three == pytest.approx(opposite)
+        assert np.all(np.diff(three) >= 0.0)
+        (ax, ay), (bx, by), (cx, cy) = field.direction[abc, :2] / field.direction[abc, 2:]
+        assert is_left == ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay) > 0.0)
+
+
+def test_places_in_a_cell_are_those_within_the_tolerance_of_a_ratio() -> None:
+    """A place in a cell is in the range if its middle, give or take half its width, is near the ratio."""
+    draw = np.random.default_rng(5)
+    ratio, slack = draw.uniform(0.2, 0.9, 60), draw.uniform(1e-4, 8e-3, 60)
+    cell = np.clip((ratio * CELLS).astype(np.int64) + draw.integers(-1, 2, 60), 0, CELLS - 1)
+    lowest, width = lost_in_space._places(ratio, slack, cell)
+    for k in range(60):
+        middle = (cell[k] + (np.arange(FINE) + 0.5) / FINE) / CELLS
+        near = np.flatnonzero(np.abs(middle - ratio[k]) <= slack[k] + 0.5 / (CELLS * FINE) + 1e-12)
+        limits = lost_in_space._place_limits(ratio[k], slack[k], int(cell[k]), CELLS, FINE)
+        assert limits == (lowest[k], lowest[k] + width[k])
+        if len(near):
+            assert limits == (near[0], near[-1])
+        else:
+            assert width[k] == 0
+
+
+def test_a_mirrored_field_or_a_wrong_scale_is_searched_only_if_allowed() -> None:
+    drawn = _drawn(ListKind(noise_px=0.2), 12)
+    field = drawn.field()
+    assert identify(field, SKY).status is MatchStatus.IDENTIFIED
+    assert identify(field.subset(np.arange(2)), SKY).status is MatchStatus.TOO_FEW_STARS
+    mirror = identify(field.mirrored(), SKY)
+    assert mirror.mirrored
+    assert mirror.status is MatchStatus.IDENTIFIED
+    only = IdentificationSettings(mirror=False)
+    assert identify(field.mirrored(), SKY, only).status is MatchStatus.NO_MATCH
+    wrong = replace(field.rescaled(1.15), scale=(0.98, 1.02))
+    found = identify(wrong, SKY)
+    assert found.status is MatchStatus.IDENTIFIED
+    assert not found.mirrored
+    assert found.scale == pytest.approx(1.0 / 1.15, rel=0.02)
+    trusted = IdentificationSettings(hint_error=1.0)
+    assert identify(wrong, SKY, trusted).status is MatchStatus.NO_MATCH
