@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
+from scipy.optimize import nnls
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
+from knightcube.vision.objects import star_light
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.star_light import (
     Patch,
@@ -21,9 +23,11 @@ from knightcube.vision.objects.star_light import (
     brightest_left,
     cut_patch,
     fit_stars,
+    light_on_path,
+    region_along,
 )
-from knightcube.vision.objects.streak_ends import segment_frame
-from knightcube.vision.objects.streak_images import star_path
+from knightcube.vision.objects.streak_ends import Segmented, segment_frame
+from knightcube.vision.objects.streak_images import pixels_near, star_path, straight_path, streak_at
 from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import deposit, rate_at, rotate, star_camera
 
@@ -222,3 +226,199 @@ def test_equations_that_are_not_positive_definite_are_refused() -> None:
     normal = np.array([[1.0, 2.0], [2.0, 1.0]])
     with pytest.raises(FlightError, match="not positive definite"):
         _brightnesses(normal, np.ones(2), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("inside", "middle", "expected"),
+    [
+        ([True] * 5, 2, [0, 1, 2, 3, 4]),
+        ([True, False, True, True, False, True], 3, [2, 3]),
+        ([False, True, True, False], 1, [1, 2]),
+        ([True, True, False, True], 3, [3]),
+    ],
+)
+def test_only_the_part_of_a_path_around_its_middle_is_followed(
+    inside: list[bool], middle: int, expected: list[int]
+) -> None:
+    assert star_light._around(np.array(inside), middle).tolist() == expected
+
+
+def test_the_end_of_light_is_the_mean_over_its_likelihood() -> None:
+    """The likelihood of an end grows with half of the gains up to it."""
+    sure = np.array([60.0, 60.0, 60.0, -60.0, -60.0])
+    assert star_light._end_of_light(sure) == pytest.approx((2.0, 0.0), abs=1e-6)
+    assert star_light._end_of_light(np.array([9.0, 0.0, 0.0])) == pytest.approx((1.0, np.sqrt(2.0 / 3.0)))
+    ratio = np.exp(0.5 * 2.0)
+    last, sigma = star_light._end_of_light(np.array([0.0, 2.0]))
+    assert last == pytest.approx(ratio / (1.0 + ratio))
+    assert sigma == pytest.approx(np.sqrt(ratio) / (1.0 + ratio))
+
+
+def _curve(bend: float) -> FloatArray:
+    """Return points 1 px apart on a straight or bent path of 60 px."""
+    part = np.linspace(0.0, 1.0, 2001)[:, None]
+    fine = np.array([20.3, 15.8]) + part * [48.0, 36.0] + bend * part * (1.0 - part) * np.array([-0.6, 0.8])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
+    at = np.arange(0.0, along[-1], 1.0)
+    return np.stack([np.interp(at, along, fine[:, axis]) for axis in (0, 1)], axis=1)
+
+
+@pytest.mark.parametrize("bend", [0.0, 12.0])
+def test_the_brightness_along_a_path_is_its_flux_per_length(bend: float) -> None:
+    """The brightness of a uniform streak is its flux divided by its length, and zero beyond its ends."""
+    curve = _curve(bend)
+    pixels = pixels_near(curve, 5.0, 80, 100)
+    lit = curve[15:46]
+    counts = streak_at(pixels, lit, 1.0) * 3100.0
+    weight = np.random.default_rng(1).uniform(0.5, 2.0, len(pixels))
+    light, share = star_light._light_along(pixels, counts, weight, curve, 1.0)
+    assert light[18:43] == pytest.approx(np.full(25, 100.0), rel=0.04)
+    assert light[:11] == pytest.approx(np.zeros(11), abs=1.0)
+    assert light[51:] == pytest.approx(np.zeros(len(curve) - 51), abs=1.0)
+    # The information per px is the integral of the squared profile across the path, 1/(2 sqrt(pi) width).
+    even = star_light._light_along(pixels, counts, np.full(len(pixels), 3.0), curve, 1.0)[1]
+    width = np.sqrt(1.0 + 1.0 / 12.0)
+    assert even[3:-3].mean() == pytest.approx(9.0 / (2.0 * np.sqrt(np.pi) * width), rel=0.03)
+    assert np.all(share >= 0.0)
+
+
+def test_the_light_on_a_path_is_zero_outside_the_frame() -> None:
+    curve = _curve(0.0)
+    image = np.zeros((40, 100), dtype=np.float32)
+    deposit(image, curve, 100.0 * len(curve), 1.0)
+    noisy = np.random.default_rng(2).normal(500.0, 1.0, image.shape) + image
+    found = light_on_path(_segmented(noisy), curve, 1.0)
+    inside = curve[:, 1] < 36.0
+    assert found[inside][4:] == pytest.approx(np.full(np.count_nonzero(inside) - 4, 100.0), abs=8.0)
+    assert np.all(found[curve[:, 1] > 43.0] == 0.0)
+
+
+def _segmented(image: FloatArray) -> Segmented:
+    return segment_frame(np.rint(image).astype(np.uint16), EndpointSettings())
+
+
+def test_pixels_are_weighted_by_noise_photons_and_the_error_of_the_model() -> None:
+    """The variance of 300 counts at 2 electrons per count is 12^2 + 150 + (10 % of 300)^2."""
+    signal = np.array([300.0, -50.0, 449.0, 451.0])
+    weight = star_light._pixel_weights(signal, 500.0, 12.0, 2.0, 1000.0)
+    assert weight[0] == pytest.approx(1.0 / np.sqrt(144.0 + 150.0 + 900.0))
+    assert weight[1] == pytest.approx(1.0 / 12.0)
+    assert weight[2] > 0.0
+    assert weight[3] == 0.0
+    image = signal.reshape(2, 2).astype(np.float32)
+    pixels = np.array([[0, 0], [1, 0], [1, 1]])
+    found, weights, expected = _counts_at(image, pixels, 500.0, 12.0, 2.0, 1000.0)
+    assert found.tolist() == [300.0, -50.0, 451.0]
+    assert weights == pytest.approx(weight[[0, 1, 3]])
+    # Only the noise of the background and of the photons is expected in chi-square.
+    assert expected == pytest.approx((144.0 + 150.0) / (144.0 + 150.0 + 900.0) + 1.0)
+
+
+def test_brightnesses_are_those_of_non_negative_least_squares() -> None:
+    draw = np.random.default_rng(3)
+    images = draw.uniform(0.0, 1.0, (4, 50)) * np.array([1.0, 30.0, 0.1, 5.0])[:, None]
+    data = np.array([40.0, 2.0, 0.0, 3.0]) @ images - 30.0 * images[2] + draw.normal(size=50)
+    found, chi_square = _brightnesses(images @ images.T, images @ data, float(data @ data))
+    expected, residual = nnls(images.T, data)
+    assert found == pytest.approx(expected, rel=1e-5, abs=1e-6)
+    assert chi_square == pytest.approx(residual**2, rel=1e-6)
+    assert np.any(found == 0.0)
+
+
+def test_trial_paths_of_stars_begin_and_end_at_the_corners() -> None:
+    """Of each corner, one path begins and one ends there; the other paths pass the middle of the region."""
+    corners = np.array([[200.0, 220.0], [300.0, 232.0]])
+    paths = star_light._star_paths(corners, _ROTATION, _CAMERA.pinhole, 4)
+    own = star_path(corners.mean(axis=0), _ROTATION, _CAMERA.pinhole)
+    length, extent = len(own), float(np.hypot(100.0, 12.0))
+    assert paths.shape == (4 + round(4.0 * extent / length) + 1, length, 2)
+    for number, corner in enumerate(corners):
+        assert paths[2 * number, 0] == pytest.approx(corner, abs=0.6)
+        assert paths[2 * number + 1, -1] == pytest.approx(corner, abs=0.6)
+    way = np.sign(own[-1, 0] - own[0, 0])
+    middles = paths[4:].mean(axis=1) @ [way, 0.0]
+    spacing = np.diff(middles)
+    # The middles are evenly spread over the extent of the region, and the first path is the last in time.
+    assert np.ptp(middles) == pytest.approx(extent, rel=0.03)
+    assert np.abs(spacing) == pytest.approx(np.full(len(spacing), extent / len(spacing)), rel=0.05)
+    far = star_light._star_paths(np.array([[10.0, 220.0], [500.0, 232.0]]), _ROTATION, _CAMERA.pinhole, 4)
+    assert len(far) == 4 + round(4 * star_light._LONGEST_CHAIN) + 1
+    point = star_light._star_paths(np.array([[200.0, 220.0], [201.0, 220.0]]), _ROTATION, _CAMERA.pinhole, 4)
+    assert len(point) == 4 + 4 + 1
+
+
+def test_the_excess_of_a_patch_is_that_of_chi_square_over_its_expectation() -> None:
+    patch = _patch([], 0.0, None, 9)
+    left = np.full(patch.signal.shape, 20.0)
+    patch.mask[:, 10:] = False
+    variance = _NOISE**2 + np.maximum(patch.signal, 0.0)
+    expected = np.sum(((400.0 - variance) * patch.weight**2)[:, :10])
+    assert patch.excess(left) == pytest.approx(expected)
+    # The noise of the smoothed image is that of white noise, summed with the squares of the kernel.
+    point = np.zeros((31, 31))
+    point[15, 15] = 1.0
+    kernel = _smoothed(point, 1.0)
+    assert patch.smoothed_noise == pytest.approx(_NOISE * np.sqrt(np.sum(kernel**2)), rel=0.01)
+    assert patch.smoothed(patch.signal) is patch.seen
+    assert patch.smoothed(left)[20, 45] == pytest.approx(20.0, rel=1e-3)
+
+
+def test_a_patch_is_cut_with_a_margin_around_its_region() -> None:
+    """The patch extends 8 px beyond the region. Streaks may continue beyond the border of the frame."""
+    image = np.random.default_rng(1).normal(500.0, 5.0, (120, 140))
+    deposit(image, straight_path(np.array([[40.0, 30.0], [80.0, 60.0]])), 30_000.0, 1.0)
+    deposit(image, straight_path(np.array([[100.0, 3.0], [136.0, 30.0]])), 25_000.0, 1.0)
+    segmented = _segmented(image)
+    order = np.argsort(segmented.regions.boxes[:, 2])
+    inner = cut_patch(segmented, int(order[0]), 1.0, 2.0, 65_535.0)
+    top, bottom, left, right = segmented.regions.boxes[order[0]]
+    assert inner.corner.tolist() == [left - 8, top - 8]
+    assert inner.signal.shape == (bottom - top + 16, right - left + 16)
+    assert inner.signal == pytest.approx(segmented.signal[top - 8 : bottom + 8, left - 8 : right + 8])
+    assert inner.mask[30 - top + 8, 40 - left + 8]
+    assert inner.mask.sum() == np.count_nonzero(segmented.regions.labels == segmented.regions.label[order[0]])
+    assert inner.beyond.tolist() == [0.0] * 4
+    assert (inner.gain, inner.psf_sigma) == (2.0, 1.0)
+    assert inner.noise == pytest.approx(5.0, rel=0.1)
+    edge = cut_patch(segmented, int(order[-1]), 1.0, 2.0, 65_535.0)
+    assert edge.beyond.tolist() == [np.inf, 0.0, 0.0, np.inf]
+    assert edge.corner[1] == 0.0
+    dark = cut_patch(segmented, int(order[0]), 1.0, 2.0, 600.0)
+    assert np.array_equal(dark.weight == 0.0, dark.signal + segmented.background.typical_level >= 570.0)
+    # The region along a line is that of most of its pixels.
+    labels = segmented.regions.label[order]
+    assert region_along(segmented, np.array([[40.0, 30.0], [80.0, 60.0]])) == labels[0]
+    assert region_along(segmented, np.array([[70.0, 52.0], [130.0, 26.0]])) in labels
+    assert region_along(segmented, np.array([[20.0, 100.0], [60.0, 100.0]])) == 0
+
+
+def test_stars_and_an_object_are_compared_by_chi_square() -> None:
+    """An object decreases chi-square to about the number of pixels, and has its flux.
+
+    Ends without light do not decrease chi-square.
+    """
+    path = star_path(np.array([245.0, 240.0]), _ROTATION, _CAMERA.pinhole)
+    ends = np.array([[225.0, 225.0], [262.0, 258.0]])
+    image = np.zeros((512, 512))
+    deposit(image, path, 20_000.0, 1.0)
+    deposit(image, ends[0] + np.linspace(0.0, 1.0, 501)[:, None] * np.diff(ends, axis=0), 12_000.0, 1.0)
+    noisy = 500.0 + image + np.random.default_rng(8).normal(0.0, np.sqrt(_NOISE**2 + image))
+    corners = np.concatenate([path[[0, -1]], ends])
+    light = StarLight(_segmented(noisy), corners, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
+    found = light.explain(ends)
+    assert found.flux == pytest.approx(12_000.0, rel=0.12)
+    assert found.chi_square == pytest.approx(light.expected, rel=0.25)
+    assert light.chi_square > 1.6 * light.expected
+    assert light.chi_square_with(ends) == pytest.approx(found.chi_square)
+    assert found.misfit < 1.3
+    assert found.misfit_of_stars > 2.5
+    assert light.expected < light.pixels
+    wrong = light.explain(np.array([[225.0, 258.0], [262.0, 225.0]]))
+    assert wrong.chi_square > 1.5 * found.chi_square
+    assert wrong.flux < 4_000.0
+    outside = light.explain(np.array([[10.0, 10.0], [40.0, 12.0]]))
+    assert outside.flux == 0.0
+    assert outside.misfit == np.inf
+    arguments = _segmented(noisy), corners, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0
+    known = StarLight(*arguments, [straight_path(ends)])
+    assert known.chi_square == pytest.approx(found.chi_square, rel=0.05)
