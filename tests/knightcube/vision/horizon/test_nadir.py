@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.reference.horizon import fit_circle
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.horizon import nadir as nadir_module
 from knightcube.vision.horizon.edges import find_edges
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
@@ -28,9 +30,11 @@ from knightcube.vision.horizon.nadir import (
     HorizonSolution,
     HorizonStatus,
     JointNadir,
+    NadirMeasurement,
     find_nadir,
     limited_normal,
     nadir_of_cameras,
+    nadir_of_uncertain_field,
 )
 from knightcube.vision.horizon.settings import (
     EdgeSettings,
@@ -519,3 +523,168 @@ def test_a_measurement_states_its_altitude_points_and_tangent_covariance(
     sphere = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
     assert sphere.nadir is not None
     assert 2e3 < sphere.nadir.altitude_sigma < limb_radius_sigma(600e3)
+
+
+_FOCAL_SIGMA = 0.02
+_TILT, _CLIMB = 0.03, 20e3
+"""Change of the nadir (rad) and of the altitude (m) per standard deviation of the focal length."""
+
+
+def _searched_by_focal_length(
+    best: float, width: float, refused: Callable[[float], bool]
+) -> Callable[..., SimpleNamespace]:
+    """Return a search whose horizon depends on the focal length, given in standard deviations from nominal.
+
+    The sum of the squared residuals of the horizon is ((step - best)/width)^2. The nadir tilts about y, and
+    the altitude grows, in proportion to the focal length. The trial is `refused` at some focal lengths.
+    """
+
+    def searched(_: Image, camera: Pinhole, *__: object) -> SimpleNamespace:
+        step = float(np.log(camera.focal_length / MODEL.lens.focal_length)) / _FOCAL_SIGMA
+        tilt = _TILT * step
+        direction = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+        own = 1e-6 * (np.eye(3) - np.outer(direction, direction))
+        nadir = NadirMeasurement(direction, own, 600e3 + _CLIMB * step, 5e3, 0.2, 40)
+        squares = np.full(60, ((step - best) / width) ** 2 / 60.0)
+        squares[0] = np.nan
+        squares[1] *= 2.0
+        status = HorizonStatus.REFUSED if refused(step) else HorizonStatus.FOUND
+        reason = f"refused at {step:.2f}" if refused(step) else ""
+        solution = HorizonSolution(status, reason, None if refused(step) else nadir)
+        horizon = SimpleNamespace(squares=squares, fit=SimpleNamespace(correlation=1.0, prior=0.0))
+        return SimpleNamespace(hypotheses=[horizon], solution=lambda: solution, measured=lambda _: nadir)
+
+    return searched
+
+
+def _uncertain(
+    monkeypatch: pytest.MonkeyPatch, best: float, width: float, refused: Callable[[float], bool]
+) -> HorizonSolution:
+    found = HorizonSolution(HorizonStatus.NO_HORIZON, "none", points=np.zeros((90, 2)))
+    monkeypatch.setattr(nadir_module, "find_nadir", lambda *_: found)
+    monkeypatch.setattr(nadir_module, "_contradiction", lambda _: "")
+    monkeypatch.setattr(nadir_module, "_search", _searched_by_focal_length(best, width, refused))
+    image = np.zeros((512, 512), np.uint8)
+    return nadir_of_uncertain_field(image, MODEL.lens, _FOCAL_SIGMA, settings=SETTINGS)
+
+
+@pytest.mark.parametrize(("best", "width"), [(0.8, 0.5), (-0.5, 2.0), (0.9, 0.1)])
+def test_an_uncertain_focal_length_is_weighted_by_its_probability(
+    best: float, width: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The nadir is the mean over the focal lengths, whose prior and misfit are both normal distributions.
+
+    The product of the two distributions has the mean b/(1 + w^2) and the variance w^2/(1 + w^2). The
+    covariance is that of one horizon plus that of the focal length.
+    """
+    found = _uncertain(monkeypatch, best, width, lambda _: False).nadir
+    assert found is not None
+    mean, variance = best / (1.0 + width**2), width**2 / (1.0 + width**2)
+    assert found.direction == pytest.approx([np.sin(_TILT * mean), 0.0, np.cos(_TILT * mean)], abs=2e-3)
+    assert found.altitude == pytest.approx(600e3 + _CLIMB * mean, abs=1.5e3)
+    across = np.array([np.cos(_TILT * mean), 0.0, -np.sin(_TILT * mean)])
+    assert across @ found.covariance @ across == pytest.approx(1e-6 + _TILT**2 * variance, rel=0.1)
+    assert found.covariance[1, 1] == pytest.approx(1e-6, rel=0.01)
+    assert found.altitude_sigma == pytest.approx(np.hypot(5e3, _CLIMB * np.sqrt(variance)), rel=0.06)
+    assert found.used == 40
+
+
+def test_an_uncertain_focal_length_is_refused_if_most_of_its_probability_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = _uncertain(monkeypatch, 0.8, 0.5, lambda step: step > 1.3)
+    assert few.status is HorizonStatus.FOUND
+    assert few.nadir is not None
+    # Refused horizons contribute to the mean.
+    assert few.nadir.altitude == pytest.approx(600e3 + _CLIMB * 0.64, abs=1.5e3)
+    most = _uncertain(monkeypatch, 0.8, 0.5, lambda step: step > 0.4)
+    assert most.status is HorizonStatus.REFUSED
+    assert most.nadir is None
+    # The reason is that of the most probable of the refused focal lengths.
+    assert abs(float(most.reason.removeprefix("refused at ")) - 0.64) < 0.3
+
+
+def test_an_image_without_edges_is_not_searched_again_with_other_focal_lengths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(*_: object) -> SimpleNamespace:
+        raise AssertionError
+
+    image = np.zeros((512, 512), np.uint8)
+    few = HorizonSolution(HorizonStatus.NO_HORIZON, "none", points=np.zeros((SETTINGS.some_edges - 1, 2)))
+    monkeypatch.setattr(nadir_module, "find_nadir", lambda *_: few)
+    monkeypatch.setattr(nadir_module, "_search", fails)
+    assert nadir_of_uncertain_field(image, MODEL.lens, 0.02, settings=SETTINGS) is few
+    some = replace(few, points=np.zeros((SETTINGS.some_edges, 2)))
+    monkeypatch.setattr(nadir_module, "find_nadir", lambda *_: some)
+    monkeypatch.setattr(nadir_module, "_search", lambda *_: SimpleNamespace(hypotheses=[]))
+    again = nadir_of_uncertain_field(image, MODEL.lens, 0.02, settings=SETTINGS)
+    assert (again.status, again.reason, again.nadir) == (HorizonStatus.NO_HORIZON, "none", None)
+
+
+def _vote(camera: int, tilt: float, edges: int, sigma: float = 1e-3) -> nadir_module._Vote:
+    return nadir_module._Vote(
+        camera, np.array([np.sin(tilt), 0.0, np.cos(tilt)]), sigma**2 * np.diag([1.0, 1.0, 0.0]), edges
+    )
+
+
+def test_nadirs_agree_within_the_quantile_of_their_difference() -> None:
+    """The variance of the difference is twice the sum of the variances.
+
+    A chi-square with two degrees of freedom exceeds 27.6 with a probability of 1e-6.
+    """
+    limit = np.sqrt(-2.0 * np.log(1e-6) * 2.0 * 5.0) * 1e-3
+    for share, agrees in ((0.99, True), (1.01, False)):
+        assert nadir_module._same(_vote(0, 0.0, 9), _vote(1, share * limit, 9, 2e-3)) == agrees
+    assert not nadir_module._same(_vote(0, 0.0, 9, 9.0), _vote(1, np.pi, 9, 9.0))
+
+
+def test_the_nadir_of_most_cameras_is_selected() -> None:
+    """The most cameras decide, then the most edges. Equal groups are ambiguous above 30 % of the edges."""
+    one, two, three = _vote(0, 0.0, 30), _vote(1, 1e-3, 20), _vote(2, 0.8, 90)
+    group, rival = nadir_module._agreed([three, one, two])
+    assert sorted(vote.camera for vote in group) == [0, 1]
+    assert rival == ""
+    group, rival = nadir_module._agreed([one, _vote(2, 0.8, 10)])
+    assert (len(group), rival) == (0, "the cameras show two horizons 45.8 deg apart")
+    group, rival = nadir_module._agreed([one, _vote(2, 0.8, 9)])
+    assert ([vote.camera for vote in group], rival) == ([0], "")
+    assert nadir_module._agreed([]) == ([], "")
+    # Two candidates of one camera do not support each other.
+    group, rival = nadir_module._agreed([_vote(0, 0.0, 30), _vote(0, 1e-4, 20), _vote(1, 0.8, 8)])
+    assert [vote.camera for vote in group] == [0]
+    assert [vote.edges for vote in group] == [30]
+    # Of two candidates of one camera, the nearer to the other camera's nadir is used.
+    group, _ = nadir_module._agreed([_vote(0, 3e-3, 30), _vote(1, 0.0, 20), _vote(0, 1e-3, 10)])
+    assert sum(vote.edges for vote in group) in (30, 50)
+    assert len(group) == 2
+
+
+def test_the_reason_is_that_of_the_most_favourable_camera() -> None:
+    none = HorizonSolution(HorizonStatus.NO_HORIZON, "no edges")
+    refused = HorizonSolution(HorizonStatus.REFUSED, "bright sky")
+    ambiguous = HorizonSolution(HorizonStatus.AMBIGUOUS, "two horizons")
+    assert nadir_module._why_none({3: none, 5: refused, 6: ambiguous}) == (
+        HorizonStatus.AMBIGUOUS,
+        "camera 6: two horizons",
+    )
+    assert nadir_module._why_none({3: none, 5: refused}) == (HorizonStatus.REFUSED, "camera 5: bright sky")
+    assert nadir_module._why_none({3: none}) == (HorizonStatus.NO_HORIZON, "camera 3: no edges")
+    assert nadir_module._why_none({}) == (HorizonStatus.NO_HORIZON, "no image")
+
+
+def test_a_solution_describes_itself_in_one_line() -> None:
+    sigma = np.radians([0.3, 0.1])
+    nadir = NadirMeasurement(
+        np.array([0.0, 0.6, 0.8]),
+        np.diag([sigma[0] ** 2, 0.0, 0.0]),
+        600e3,
+        1e3,
+        0.2,
+        30,
+    )
+    found = HorizonSolution(HorizonStatus.FOUND, nadir=nadir)
+    assert repr(found) == "<HorizonSolution found: nadir [0.00000, 0.60000, 0.80000], 1 sigma 0.3 deg>"
+    refused = HorizonSolution(HorizonStatus.REFUSED, "bright sky")
+    assert repr(refused) == "<HorizonSolution refused: bright sky>"
+    assert nadir.sigma == pytest.approx(sigma[0] / np.sqrt(2.0))

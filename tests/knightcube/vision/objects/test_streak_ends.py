@@ -8,21 +8,30 @@ from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.frame import box_sum, repair_hot_pixels
+from knightcube.vision.objects import streak_ends
+from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.streak_ends import (
+    Regions,
     _bounding_boxes,
     _corners_of_regions,
     centre_of_intensity,
     centre_of_rotation,
     chord_outward,
+    expected_sigma,
     extend,
+    find_corners,
     find_regions,
     gaussian_derivative_kernel,
     gaussian_kernel,
     gradient,
+    harris_cornerness,
     harris_response,
     kernel_radius,
     local_maxima,
+    measure_streaks,
+    near_border,
     pixels_of_region,
+    segment_frame,
     smoothed,
     structure_tensor,
     threshold_local,
@@ -30,7 +39,7 @@ from knightcube.vision.objects.streak_ends import (
 )
 from knightcube.vision.streaks.faint_stars import less_boxes
 from tests.support.compiled_forms import assert_forms_agree
-from tests.support.streak_frames import rate_at, star_camera, star_frame
+from tests.support.streak_frames import deposit, rate_at, star_camera, star_frame
 
 
 def test_the_box_sum_is_nine_times_the_uniform_filter() -> None:
@@ -262,3 +271,125 @@ def test_all_forms_find_the_same_corners_of_regions(half_width: int, upright: bo
     given = signal.astype(np.float32), labels, regions.boxes, regions.label, kernels, limits
     assert_forms_agree(_corners_of_regions, *given)
     assert _corners_of_regions(*given)[1].sum() > 1
+
+
+def _regions(boxes: list[list[int]]) -> Regions:
+    n = len(boxes)
+    return Regions(
+        np.zeros((60, 80), np.int32),
+        np.arange(1, n + 1),
+        np.array(boxes),
+        np.full(n, 100),
+        np.linspace(2000.0, 9000.0, n),
+        np.linspace(20.0, 47.0, n),
+    )
+
+
+def test_regions_near_any_border_may_be_truncated() -> None:
+    """A box of rows 5 to 54 and columns 5 to 74 has a distance of 5 px from each border of 60 x 80 px."""
+    inner = [5, 55, 5, 75]
+    boxes = [inner, [4, 55, 5, 75], [5, 56, 5, 75], [5, 55, 4, 75], [5, 55, 5, 76]]
+    assert near_border(_regions(boxes), (60, 80), 5).tolist() == [False, True, True, True, True]
+    assert not near_border(_regions(boxes), (60, 80), 4).any()
+
+
+_DRAWN = (
+    (np.array([[40.0, 30.0], [95.0, 52.0]]), 40_000.0),
+    (np.array([[30.0, 90.0], [80.0, 84.0]]), 12_000.0),
+    (np.array([[120.0, 40.0], [150.0, 100.0]]), 25_000.0),
+    (np.array([[2.0, 110.0], [40.0, 115.0]]), 30_000.0),
+    (np.array([[100.0, 112.0], [108.0, 113.0]]), 9_000.0),
+)
+
+
+def _frame() -> FloatArray:
+    """Return a frame of 180 x 130 px with three streaks, a truncated streak and a short streak."""
+    image = np.random.default_rng(6).normal(300.0, 6.0, (130, 180))
+    for ends, flux in _DRAWN:
+        deposit(image, ends[0] + np.linspace(0.0, 1.0, 801)[:, None] * np.diff(ends, axis=0), flux, 1.0)
+    return np.rint(image)
+
+
+def test_long_regions_inside_the_frame_are_candidates_the_strongest_first() -> None:
+    settings = EndpointSettings(gain=2.0)
+    found = segment_frame(_frame().astype(np.uint16), settings)
+    assert len(found.regions) == 5
+    candidates = found.candidates
+    assert candidates.length == pytest.approx([59.2, 67.1, 50.4], abs=2.0)
+    assert candidates.flux == pytest.approx([40_000.0, 25_000.0, 12_000.0], rel=0.03)
+    # The strength is the length divided by the expected error of the ends.
+    sigma = expected_sigma(candidates, found.background, settings)
+    assert np.all(np.diff(candidates.length / sigma) < 0.0)
+    density = candidates.flux / (candidates.length + 3.0)
+    noise = np.sqrt(6.0**2 + streak_ends._PEAK_FRACTION * density / 2.0) / density
+    assert sigma == pytest.approx(
+        np.hypot(settings.endpoint_floor, settings.endpoint_noise * noise), rel=0.03
+    )
+    for most in (1, 2):
+        few = segment_frame(_frame().astype(np.uint16), EndpointSettings(gain=2.0, most_streaks=most))
+        assert few.candidates.label.tolist() == candidates.label[:most].tolist()
+    # The brightest streak is saturated.
+    top = float(_frame()[25:60, 35:100].max())
+    clipped = segment_frame(_frame().astype(np.uint16), EndpointSettings(gain=2.0, saturation=top - 1.0))
+    assert sorted(clipped.candidates.length) == pytest.approx(sorted(candidates.length[1:]))
+    whole = segment_frame(_frame().astype(np.uint16), EndpointSettings(gain=2.0, saturation=top + 1.0))
+    assert len(whole.candidates) == 3
+    long = segment_frame(_frame().astype(np.uint16), EndpointSettings(least_length=100.0))
+    assert len(long.candidates) == 0
+    everywhere = segment_frame(_frame().astype(np.uint16), EndpointSettings(border=0))
+    assert len(everywhere.candidates) == 4
+    noise_level = found.background.typical_noise
+    significance = found.regions.flux / (noise_level * np.sqrt(found.regions.area))
+    limit = float(np.sort(significance)[2])
+    assert found.regions.is_significant(0.999 * limit, found.background).sum() == 3
+    assert found.regions.is_significant(1.001 * limit, found.background).sum() == 2
+
+
+@pytest.mark.parametrize("centre_of", ["response", "image"])
+def test_streaks_have_their_two_ends(centre_of: str) -> None:
+    """The two corners of a region are the ends of its streak.
+
+    The corners are up to 2 px inside the streak if the frame is the image of the centre of intensity.
+    """
+    settings = EndpointSettings(gain=2.0, centre_of=centre_of)  # type: ignore[arg-type]  # one of two words
+    segmented = segment_frame(_frame().astype(np.uint16), settings)
+    found = measure_streaks(segmented, settings)
+    own = measure_streaks(segmented, settings, harris_cornerness)
+    assert len(found) == len(own) == 3
+    assert own.endpoints == pytest.approx(found.endpoints, abs=1e-6)
+    truth = [ends for ends, _ in _DRAWN[:3]]
+    for ends, flux, sigma in zip(found.endpoints, found.flux, found.sigma, strict=True):
+        off = [min(np.abs(ends - each).max(), np.abs(ends[::-1] - each).max()) for each in truth]
+        best = int(np.argmin(off))
+        assert off[best] < (0.5 if centre_of == "response" else 2.5)
+        assert flux == pytest.approx(_DRAWN[best][1], rel=0.03)
+        assert 0.03 < sigma < 0.2
+    assert found.lengths == pytest.approx(np.linalg.norm(np.diff(found.endpoints, axis=1)[:, 0], axis=1))
+    assert found.candidate.tolist() == [0, 1, 2]
+    assert found.crowded == ()
+
+
+def test_regions_with_more_than_two_corners_are_reported_apart() -> None:
+    image = np.random.default_rng(6).normal(300.0, 6.0, (130, 180))
+    for ends in (np.array([[30.0, 30.0], [130.0, 90.0]]), np.array([[95.0, 38.0], [65.0, 83.0]])):
+        deposit(image, ends[0] + np.linspace(0.0, 1.0, 801)[:, None] * np.diff(ends, axis=0), 30_000.0, 1.0)
+    settings = EndpointSettings()
+    found = measure_streaks(segment_frame(np.rint(image).astype(np.uint16), settings), settings)
+    assert len(found) == 0
+    ((index, corners),) = found.crowded
+    assert index == 0
+    assert len(corners) >= 4
+    for place in ([30.0, 30.0], [130.0, 90.0], [95.0, 38.0], [65.0, 83.0]):
+        assert np.linalg.norm(corners - place, axis=1).min() < 1.0
+
+
+def test_corners_are_the_centres_of_intensity_around_peaks() -> None:
+    response = np.zeros((9, 12))
+    response[3, 4], response[3, 5], response[6, 9] = 8.0, 2.0, 5.0
+    response[6, 2] = 0.3
+    mask = np.ones((9, 12), dtype=np.bool_)
+    found = find_corners(response, mask, 0.05, 1, response)
+    assert found == pytest.approx(np.array([[4.2, 3.0], [9.0, 6.0]]))
+    assert len(find_corners(response, mask, 0.03, 1, response)) == 3
+    mask[3, 4] = False
+    assert find_corners(response, mask, 0.05, 1, response)[-1] == pytest.approx([9.0, 6.0])
