@@ -146,7 +146,7 @@ def test_an_object_beside_a_star_is_fitted_exactly_in_an_exact_image() -> None:
     def counts(values: FloatArray) -> FloatArray:
         x, y, dx, dy, flux, sky, other = values
         own, beside = (x, y, dx, dy, flux), (*at_corner[1][:4], other)
-        return (_drawn((22, 26), [own, beside], 1.1) + sky).ravel()
+        return np.asarray(_drawn((22, 26), [own, beside], 1.1) + sky).reshape(-1)
 
     true = np.array([12.3, 9.6, 2.0, -1.0, 4000.0, 3.0, 2500.0])
     steps = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1.0, 0.01, 1.0])

@@ -284,7 +284,7 @@ def test_the_brightness_along_a_path_is_its_flux_per_length(bend: float) -> None
 
 def test_the_light_on_a_path_is_zero_outside_the_frame() -> None:
     curve = _curve(0.0)
-    image = np.zeros((40, 100), dtype=np.float32)
+    image = np.zeros((40, 100))
     deposit(image, curve, 100.0 * len(curve), 1.0)
     noisy = np.random.default_rng(2).normal(500.0, 1.0, image.shape) + image
     found = light_on_path(_segmented(noisy), curve, 1.0)

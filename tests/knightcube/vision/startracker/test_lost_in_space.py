@@ -11,7 +11,14 @@ import pytest
 from knightcube.astro.arrays import IntArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.vision.startracker import lost_in_space
-from knightcube.vision.startracker.attitude_fit import MatchStatus, ScaleSteps, StarField, StarMatch, _refined
+from knightcube.vision.startracker.attitude_fit import (
+    MatchStatus,
+    ScaleSteps,
+    StarField,
+    StarMatch,
+    _refined,
+    stretched,
+)
 from knightcube.vision.startracker.index import CELLS, FINE
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import (
@@ -440,7 +447,7 @@ def test_candidates_are_the_attitudes_of_the_matches_with_the_most_votes() -> No
     """A candidate has the attitude of its match; a match with two known pairs is not a new candidate."""
     turn = attitude_matrix(np.array([0.2, 0.4, -0.1, 0.9]) / np.linalg.norm([0.2, 0.4, -0.1, 0.9]))
     field = _spread_field(8)
-    guide = lost_in_space.stretched(field.direction, 1.04) @ turn
+    guide = stretched(field.direction, 1.04) @ turn
     observed = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [4, 5, 6], [7, 3, 2]], dtype=np.uint16)
     star = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [5, 4, 6], [7, 3, 2]], dtype=np.uint16)
     scale = np.array([1.04, 1.04, 1.04, 1.04, 1.04])
@@ -477,7 +484,7 @@ def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
         names = star_of[entry].astype(np.int64)
         frame = lost_in_space._frame(SKY.stars.direction[names])
         seen = SKY.stars.direction[names] @ np.stack([frame[1], frame[2], frame[0]]).T
-        seen = lost_in_space.stretched(seen, 1.0 / scale)
+        seen = stretched(seen, 1.0 / scale)
         order = draw.permutation(3)
         width = float(np.abs(seen[:, :2] / seen[:, 2:]).max()) + 0.01
         limits = (scale, scale) if scale == 1.0 else (0.9, 0.96)
@@ -504,7 +511,7 @@ def test_sides_of_triangles_are_sorted_with_their_opposite_corners() -> None:
     assert len(corners) == 2 * len(triangles)
     for row, (abc, three, is_left) in enumerate(zip(corners, sides, left, strict=True)):
         assert sorted(abc.tolist()) == triangles[row // 2].tolist()
-        at = lost_in_space.stretched(field.direction[abc], float(scales[row % 2]))
+        at = stretched(field.direction[abc], float(scales[row % 2]))
         opposite = [np.linalg.norm(at[(k + 1) % 3] - at[(k + 2) % 3]) for k in range(3)]
         assert three == pytest.approx(opposite)
         assert np.all(np.diff(three) >= 0.0)
