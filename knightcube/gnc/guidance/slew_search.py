@@ -401,6 +401,9 @@ _LOST, _EASED_STEP = 1.5, 1.03
 second value is an additional factor for the duration of a path whose dipole exceeds the limit by less."""
 _PEAK = 0.9
 """Ratio of the largest dipole to the dipole limit at the first duration of a continuation."""
+_LEAST_COST = 1.1
+"""Ratio of the duration at which the continuation of a slew with a time cost begins to the estimated best
+duration."""
 
 
 class HorizonContinuation:
@@ -430,7 +433,7 @@ class HorizonContinuation:
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
-            ways = (self._over(start, time) for time in self._begins(start, shortest))
+            ways = (self._over(start, time) for time in self._begins(start, shortest, time_cost))
             begun = next(filter(None, ways), None)
             if begun is None:
                 continue
@@ -528,10 +531,20 @@ class HorizonContinuation:
         """Return the approximate shortest duration, s, of a path that satisfies the dipole limit."""
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
-    def _begins(self, start: SolvedPath, shortest: float) -> list[float]:
-        """Return the durations, s, at which the continuation of the path `start` may begin, ascending."""
+    def _begins(self, start: SolvedPath, shortest: float, time_cost: float) -> list[float]:
+        """Return the durations, s, at which the continuation of the path `start` may begin, the best first.
+
+        The heat of a slew is about inversely proportional to the third power of its duration T, so the heat
+        k / T^3 plus a time cost c T is least at T^4 = 3 k / c. With a time cost, the continuation begins near
+        this duration.
+        """
         time = max(self._fastest(start), shortest)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
+        if math.isfinite(time_cost):
+            heat = self._solver.energy(start) * start.horizon**3
+            cheapest = min(_LEAST_COST * (3.0 * heat / time_cost) ** 0.25, self._task.longest)
+            times += [each for each in (cheapest, math.sqrt(cheapest * start.horizon)) if each > time]
+            times.sort(key=lambda each: heat / each**3 + time_cost * each)
         if start.horizon == self._task.horizon and self._task.time_cost is None and start.horizon in times:
             times.remove(start.horizon)  # already tried
         task = self._task

@@ -31,6 +31,7 @@ from tests.support.recorded_slews import (
     problem,
     task_of,
 )
+from tests.support.small_slews import small_slew
 
 
 @pytest.mark.parametrize(
@@ -226,3 +227,16 @@ def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() 
     alone = replace(turned, weights=np.diag(turned.weights))
     careless = plan_order(replace(order, craft=alone, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert careless.path.heat(turned.weights) > 1.02 * along.energy
+
+
+def test_a_small_cost_of_time_gives_a_slow_slew_of_little_heat() -> None:
+    """A slew whose duration has a small cost takes long, although a slew in a fraction of the time exists.
+
+    A plan with a fixed duration bounds the cost of the plan with a free duration.
+    """
+    task = small_slew(nodes=8, horizon=240.0)
+    cost = 0.02
+    fixed, free = plan_task(task), plan_task(replace(task, time_cost=cost))
+    assert free.energy + cost * free.horizon <= 1.01 * (fixed.energy + cost * fixed.horizon)
+    assert free.horizon > 180.0
+    assert free.peak < 0.5
