@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import math
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
+import pytest
 
 from knightcube.astro.quaternion import angle_between, attitude_matrix
-from knightcube.gnc.guidance.slew_model import AttitudeEnd
-from knightcube.gnc.guidance.slew_search import SlewSolver, guesses
+from knightcube.gnc.guidance import slew_search
+from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath
+from knightcube.gnc.guidance.slew_search import (
+    LAST_BARRIER,
+    HorizonContinuation,
+    SlewSolver,
+    SolvedPath,
+    guesses,
+    transferred,
+)
 from tests.support.random_slews import slews
+from tests.support.small_slews import HEAT, LIMIT, small_slew
 
 
 def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep_the_cones() -> None:
@@ -40,3 +55,250 @@ def test_guesses_are_the_same_each_time() -> None:
     first, then = (guesses(equations, task.craft, solver.kept(equations)) for _ in range(2))
     assert len(first) == len(then) > 3
     np.testing.assert_array_equal(first[0].states, then[0].states)
+
+
+class Model:
+    """A solver of a slew with a known shortest duration, whose heat is that of a scaled rotation.
+
+    The dipoles of a slew of T s are proportional to 1/T^2, and its heat to 1/T^3.
+    """
+
+    def __init__(self, shortest: float, heat: float = 1e6) -> None:
+        self.shortest, self.heat = shortest, heat
+        self.work, self.share, self.extra = 0.0, 1.0, np.zeros((1, 20))
+        self.asked: list[tuple[int, float, float]] = []
+        self.refuses: set[int] = set()  # numbers of intervals on which no path is found
+        self.free_is_kept = True
+
+    def path(self, horizon: float, count: int = 10, factor: float = 1.0) -> Any:
+        """Return a path, whose heat is `factor` times that of the best path."""
+        return SimpleNamespace(horizon=horizon, factor=factor, equations=SimpleNamespace(count=count))
+
+    def energy(self, found: Any) -> float:
+        return float(found.factor * self.heat / found.horizon**3)
+
+    def peak(self, found: Any) -> float:
+        return float((self.shortest / found.horizon) ** 2)
+
+    def is_kept(self, found: Any) -> bool:
+        return self.peak(found) <= 1.0
+
+    def equations(self, time: float, count: int) -> Any:
+        return SimpleNamespace(scale=time, count=count)
+
+    def limited(self, start: Any, count: int, time: float, last: float) -> Any:
+        self.work += 10.0
+        self.asked.append((count, time, last))
+        shortest = self.shortest / math.sqrt(self.share)
+        if time < shortest * (1.0 - 1e-9) or count in self.refuses:
+            return None
+        return self.path(time, count, start.factor)
+
+
+def continuation(model: Model, budget: float = 1e9, **changes: Any) -> HorizonContinuation:
+    """Return the continuation of a small slew with the solver `model`."""
+    return HorizonContinuation(small_slew(nodes=24, **changes), cast(Any, model), budget)
+
+
+def test_a_minimum_time_slew_is_shortened_to_nearly_the_shortest_duration() -> None:
+    model = Model(100.0)
+    found = continuation(model, time_cost=MINIMUM_TIME).shortened(
+        [model.path(400.0), model.path(300.0)], 1.0, MINIMUM_TIME
+    )
+    assert found is not None
+    assert 100.0 <= found.horizon <= 100.5, "within half a per cent"
+    assert found.equations.count == 24, "on the fine grid"
+    assert model.asked[-1][2] == LAST_BARRIER
+
+
+def test_a_time_cost_ends_the_shortening_at_the_best_duration() -> None:
+    """Heat k/T^3 plus c T is least at T^4 = 3 k/c."""
+    model = Model(20.0, heat=1e6)
+    cost = 3e6 / 80.0**4
+    found = continuation(model, time_cost=cost).shortened([model.path(300.0)], 1.0, cost)
+    assert found is not None
+    value = model.energy(found) + cost * found.horizon
+    best = 1e6 / 80.0**3 + cost * 80.0
+    assert value <= 1.03 * best
+    assert found.horizon == pytest.approx(80.0, rel=0.15)
+
+
+def test_a_slew_is_shortened_no_further_than_the_requested_duration() -> None:
+    model = Model(100.0)
+    found = continuation(model, horizon=150.0).shortened([model.path(300.0)], 150.0, MINIMUM_TIME)
+    assert found is not None
+    assert found.horizon == pytest.approx(150.0)
+    assert min(time for _, time, _ in model.asked) >= 150.0
+
+
+def test_without_a_path_within_the_limits_nothing_is_found() -> None:
+    model = Model(600.0)
+    assert continuation(model, longest=640.0).shortened([model.path(300.0)], 1.0, MINIMUM_TIME) is not None
+    model.refuses = {10}
+    assert continuation(model).shortened([model.path(300.0)], 1.0, MINIMUM_TIME) is None
+    assert continuation(model).shortened([], 1.0, MINIMUM_TIME) is None
+    model.asked.clear()
+    assert continuation(model, longest=500.0).shortened([model.path(300.0)], 1.0, MINIMUM_TIME) is None
+    assert model.asked == [], "all durations are too long"
+
+
+def test_a_continuation_beyond_its_budget_returns_the_best_path_so_far() -> None:
+    model = Model(100.0)
+    few = continuation(model, budget=25.0).shortened([model.path(700.0)], 1.0, MINIMUM_TIME)
+    assert few is not None
+    assert few.horizon > 105.0
+    assert model.work < 60.0
+
+
+def test_a_path_is_lengthened_if_the_fine_grid_has_none_of_its_duration() -> None:
+    model = Model(100.0)
+    model.refuses = {24}
+    search = continuation(model)
+    assert search.shortened([model.path(300.0)], 150.0, MINIMUM_TIME) is None
+    fine = [time for count, time, _ in model.asked if count == 24]
+    assert len(set(np.round(fine, 6))) == 3, "the duration, and two longer ones"
+    assert max(fine) == pytest.approx(1.1 * min(fine))
+    assert 16 in {count for count, *_ in model.asked}, "by an intermediate grid"
+
+
+def test_a_coarse_path_without_limits_leads_to_a_path_on_the_fine_grid() -> None:
+    model = Model(100.0)
+    model.free = lambda equations, guess: model.path(equations.scale, equations.count)  # type: ignore[attr-defined]
+    limited = continuation(model).within(model.path(90.0))
+    assert limited is None, "too short"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(slew_search, "transferred", lambda start, equations: start)
+        model.asked.clear()
+        free = continuation(model).within(model.path(200.0))
+        assert free is not None
+        assert (free.horizon, free.equations.count) == (200.0, 24)
+        assert model.asked == [], "a path within the limits needs no limits"
+        model.free = lambda equations, guess: None  # type: ignore[attr-defined]
+        bound = continuation(model).within(model.path(200.0))
+    assert bound is not None
+    assert [(count, time) for count, time, _ in model.asked] == [(10, 200.0), (24, 200.0)]
+
+
+def test_paths_of_the_same_heat_count_once_in_the_order_of_their_heats() -> None:
+    model = Model(100.0)
+    paths = [model.path(200.0, factor=factor) for factor in (2.0, 1.0, 1.00005, 3.0, 1.001)]
+    found = continuation(model).distinct(paths)
+    assert [cast(Any, path).factor for path in found] == [1.0, 1.001, 2.0, 3.0]
+    assert continuation(model).distinct([]) == []
+
+
+@pytest.mark.parametrize(
+    ("peak", "horizon", "longest", "expected"),
+    [
+        (1.02, 240.0, 720.0, 240.0),  # the same duration with smaller dipoles
+        (1.6, 240.0, 720.0, None),  # too far beyond the limit
+        (1.02, 236.0, 720.0, "longer"),  # no smaller dipoles at this duration
+        (1.02, 236.0, 237.0, None),  # no time to be longer
+    ],
+)
+def test_a_path_beyond_its_limit_gets_smaller_dipoles_or_more_time(
+    peak: float, horizon: float, longest: float, expected: float | str | None
+) -> None:
+    model = Model(236.0)
+    search = continuation(model, horizon=horizon, longest=longest)
+    found = search.eased(model.path(horizon), peak)
+    if peak < 1.5:
+        assert model.share == pytest.approx(1.0 / peak)
+    if expected is None:
+        assert found is None
+    elif expected == "longer":
+        assert found is not None
+        assert 236.0 < found.horizon < 1.1 * 236.0
+        assert found.horizon >= 236.0 * math.sqrt(peak)
+    else:
+        assert found is not None
+        assert found.horizon == expected
+
+
+def test_a_slew_of_free_duration_beyond_its_limit_takes_longer() -> None:
+    model = Model(100.0)
+    found = continuation(model, time_cost=1.0).eased(model.path(150.0), 1.1)
+    assert found is not None
+    assert found.horizon > 150.0 * math.sqrt(1.1)
+
+
+def test_cones_are_widened_where_a_path_crosses_them_and_at_the_point_before() -> None:
+    model = Model(100.0)
+    model.extra = np.full((1, 20), 0.001)
+    depths = np.zeros((1, 20))
+    depths[0, 7], depths[0, 19] = 0.01, 0.02
+    found = continuation(model).widened(model.path(150.0, 24), depths)
+    assert found is not None
+    assert (found.horizon, found.equations.count) == (150.0, 24)
+    added = model.extra[0] - 0.001
+    assert np.flatnonzero(added > 0.0).tolist() == [6, 7, 18], "the last point is not widened"
+    assert added[6] == added[7] >= 0.01
+    assert added[18] >= 0.02
+    assert np.all(added[[6, 7]] < 0.02)
+
+
+@cache
+def _solved() -> SolvedPath:
+    task = small_slew()
+    solver = SlewSolver(task)
+    equations = solver.equations(240.0, 10)
+    for guess in guesses(equations, task.craft, solver.kept(equations)):
+        found = solver.free(solver.equations(240.0, 10), guess)
+        if found is not None:
+            return found
+    raise AssertionError("no guess converges")
+
+
+def solved_slew() -> tuple[SlewSolver, SolvedPath]:
+    """Return a new solver, and a converged path of 240 s without dipole limit."""
+    return SlewSolver(small_slew()), _solved()
+
+
+def test_heat_and_largest_dipole_of_a_path_are_those_of_its_dipoles() -> None:
+    solver, found = solved_slew()
+    dipoles = solver.unit * found.at.dipoles
+    share = (np.arange(500) + 0.5)[:, None] / 500.0
+    between = [dipoles[k] + share * (dipoles[k + 1] - dipoles[k]) for k in range(10)]
+    power = np.concatenate(between) ** 2 @ HEAT
+    assert solver.unit == pytest.approx(0.1)
+    assert solver.energy(found) == pytest.approx(240.0 * float(power.mean()), rel=1e-5)
+    assert solver.peak(found) == pytest.approx(float((np.abs(dipoles) / LIMIT).max()))
+    assert found.horizon == 240.0
+    assert solver.is_kept(found)
+    assert (solver.work, solver.steps) == (0, 0)
+    limited = solver.limited(found, 10, 240.0, LAST_BARRIER)
+    assert limited is not None
+    assert solver.work == 10 * solver.steps > 0
+    assert solver.energy(limited) == pytest.approx(solver.energy(found), rel=1e-3)
+    solver.share = 0.9 * solver.peak(found)
+    tight = solver.limited(found, 10, 240.0, LAST_BARRIER)
+    assert tight is not None
+    assert solver.peak(tight) <= solver.share * (1.0 + 1e-6)
+    assert solver.energy(tight) >= solver.energy(found)
+
+
+def test_a_transferred_path_keeps_its_shape_and_scales_its_dipoles() -> None:
+    solver, found = solved_slew()
+    same = transferred(found, solver.equations(300.0, 10))
+    np.testing.assert_array_equal(same.states, found.at.states)
+    np.testing.assert_allclose(same.dipoles, found.at.dipoles * (240.0 / 300.0) ** 2)
+    finer = transferred(found, solver.equations(240.0, 20))
+    assert finer.states.shape == (41, 7)
+    np.testing.assert_allclose(finer.states[::2], found.at.states, atol=1e-9)
+    np.testing.assert_allclose(finer.dipoles[::2], found.at.dipoles, atol=1e-12)
+    np.testing.assert_allclose(
+        finer.dipoles[1::2], 0.5 * (found.at.dipoles[1:] + found.at.dipoles[:-1]), atol=1e-12
+    )
+
+
+def test_a_similar_path_leads_to_the_path_of_the_task() -> None:
+    solver, found = solved_slew()
+    times = np.linspace(0.0, 240.0, 21)
+    states, dipoles = found.at.states, solver.unit * found.at.all_dipoles()
+    path = SlewPath(times, states[:, :4], states[:, 4:] / 240.0, np.zeros((21, 3)), dipoles)
+    before = solver.steps
+    again = solver.again(path)
+    assert again is not None
+    assert solver.steps - before <= 12
+    assert solver.energy(again) == pytest.approx(solver.energy(found), rel=1e-3)
+    np.testing.assert_allclose(again.at.states, states, atol=2e-3)
