@@ -263,7 +263,7 @@ def test_objects_are_fitted_within_the_image() -> None:
     assert patches._near(np.array([72.0, 50.0]), wide).flux == pytest.approx([9000.0])
 
 
-def test_objects_among_points_are_areas_that_are_no_catalogue_stars() -> None:
+def test_objects_among_points_are_areas_without_a_catalogue_star() -> None:
     """Areas far from catalogue stars are objects with a magnitude relative to the stars of the image."""
     objects = [*_POINTS, (30.2, 100.1, 0.0, 0.0, 9000.0 * 10.0**-1.6), (95.3, 30.6, 2.0, 1.0, 5000.0)]
     seen = survey(_seen(objects).astype(np.uint16), DetectionSettings(psf_sigma=_PSF, gain=1.0))
