@@ -9,8 +9,8 @@ A hot pixel is a bright pixel with dark neighbours. A point of light cannot caus
 neighbours, because the optics spread its light over several pixels. If a star's image has a standard
 deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the intensity
 of that pixel. Methods that need an image without gaps replace only those hot pixels that are detected with
-certainty. Fits of models to pixels exclude all suspected hot pixels. Excluding a pixel of a star by mistake
-does little harm.
+certainty. Fits of models to pixels exclude all suspected hot pixels. A fit is hardly affected if a pixel of a
+star is excluded by mistake.
 
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
 8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits.
@@ -110,7 +110,7 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
             of_row[1, block] = (1.0 - share) * variance[top, of] + share * variance[bottom, of]
         for block in range(-1, across):
             # Each pass covers the columns from the centre of one block to the next centre.
-            # The first pass covers the columns before the first centre.
+            # The first pass covers the columns before the first block centre.
             first = max(math.ceil(block * width + 0.5 * (width - 1)), 0)
             last = columns if block == across - 1 else math.ceil((block + 1) * width + 0.5 * (width - 1))
             _fill_row(signal[row], floor[row], pixels[row], of_row, max(block, 0), width, first, last)
@@ -158,7 +158,7 @@ def estimate_background(
 
 
 def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None) -> Background:
-    """Return the background in blocks, from the differences to the background `coarse` if it is not None."""
+    """Return the background in blocks; if `coarse` is given, from the pixels minus this background."""
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
     rows, columns = pixels.shape
@@ -298,7 +298,7 @@ def _places_in_blocks_numpy(
 
     The pixels `sample` (rows, columns) are divided into the blocks of `level` and `noise` (down, across). The
     pixels are normalised: the level of the block is subtracted, and the difference is divided by the noise.
-    The two returned arrays have the shape (down, across).
+    The two returned arrays, one for each rank, have the shape (down, across).
     """
     (rows, columns), (down, across) = sample.shape, level.shape
     block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
@@ -355,10 +355,10 @@ def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[Int
 def among_blocks(
     values: FloatArray, shape: tuple[int, int], column: npt.ArrayLike, row: npt.ArrayLike
 ) -> FloatArray:
-    """Return block values (down, across) interpolated bilinearly at n pixels, (n,).
+    """Return block values (down, across) interpolated bilinearly at n pixels, as an array (n,).
 
-    The blocks divide a frame with the rows and columns `shape`. The pixel coordinates are `column` (n,) and
-    `row` (n,). If `column` has several dimensions, the result has the same dimensions.
+    The frame that is divided into blocks has `shape` (rows, columns). The pixels have the coordinates
+    `column` (n,) and `row` (n,). If `column` has several dimensions, the result has the same dimensions.
     """
     x, y = (np.ascontiguousarray(place, dtype=float) for place in (column, row))
     return _among_blocks(np.ascontiguousarray(values), *shape, x.ravel(), y.ravel()).reshape(np.shape(column))
@@ -367,7 +367,7 @@ def among_blocks(
 def _among_blocks_numpy(
     values: FloatArray, rows: int, columns: int, column: FloatArray, row: FloatArray
 ) -> FloatArray:
-    """See `among_blocks`; the frame has `rows` and `columns`."""
+    """See `among_blocks`; `rows` and `columns` are the shape of the frame."""
     top, down = place_among_blocks(row, rows, values.shape[0])
     left, across = place_among_blocks(column, columns, values.shape[1])
     bottom = np.minimum(top + 1, values.shape[0] - 1)
@@ -453,7 +453,7 @@ class Moments:
         flux: sum of the counts above the background in each region (n,).
         centre: centroid of each region (n, 2), x and y, px.
         length: length of the uniform line that has the same second moments as each region (n,), px. The
-            length is about 0 for a round region.
+            attribute `length` is about 0 for a round region.
         thickness: rms width of each region across its long axis (n,), px.
         direction: angle from the x axis to the long axis of each region (n,), rad.
     """
@@ -628,7 +628,7 @@ def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> 
 
 
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
-"""Limits for the neighbours of a hot pixel.
+"""Upper limits of the brightness of the eight neighbours of a hot pixel.
 
 Each neighbour of a hot pixel must be darker than `_SHARPNESS` times the brightness of the hot pixel plus
 `_NOISE` standard deviations of the noise, and darker than `_MOST` times the brightness of the hot pixel.

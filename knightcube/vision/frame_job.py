@@ -224,7 +224,10 @@ class FrameFound:
 
 
 def run(job: FrameJob) -> FrameFound:
-    """Return attitude and rate from a frame. The worker process imports this function by its name."""
+    """Return attitude and rate of the camera from a frame.
+
+    The worker process imports this function by its name.
+    """
     tracker = job.tracker
     sky, problem = _sky(tracker)
     if tracker is None or sky is None:
@@ -445,7 +448,7 @@ def _motion(job: FrameJob) -> FrameMotion:
 
 
 def _no_motion(job: FrameJob) -> MotionResult:
-    """Return a result without a motion, for a frame of points."""
+    """Return a result without a rate, for a frame of point stars."""
     return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
 
 

@@ -8,11 +8,11 @@ estimators are imported at their first use, because the control process does not
 
 The spacecraft's own structure is masked in the images. A mask is configured (polygons or an image file), or
 is estimated from successive frames. While the limb moves over the image, the brightness of the scene changes
-repeatedly, whereas that of the structure stays constant. `StructureMap` compares the mean brightness of
-square blocks of pixels with that in the last counted frame. A frame is counted if a quarter of its blocks
-have changed. A block whose brightness did not change in `_QUIET_FRAMES` successive counted frames shows the
-spacecraft. A block whose brightness changes is at once removed from the mask, so that a wrong mask does not
-hide a limb.
+repeatedly, whereas the brightness of the structure stays constant. `StructureMap` compares the mean
+brightness of square blocks of pixels with that in the last counted frame. A frame is counted if a quarter of
+its blocks have changed. A block whose brightness did not change in `_QUIET_FRAMES` successive counted frames
+shows the spacecraft. A block whose brightness changes is at once removed from the mask, so that a wrong mask
+does not hide a limb.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ class StructureMap:
 
     Attributes:
         rows, columns: number of pixels of the images.
-        configured: mask of the blocks that contain configured structure (m, n).
+        configured: mask (m, n) of the blocks that contain spacecraft structure according to the
+            configuration.
         level: mean brightness of the blocks in the last counted frame (m, n); (0, 0) before the first frame.
         quiet: number of counted frames since the last change of each block (m, n).
     """
@@ -86,7 +87,7 @@ class StructureMap:
 
     @classmethod
     def of(cls, configured: BoolArray) -> StructureMap:
-        """Return a map with only the configured structure, given its mask `configured` (rows, columns)."""
+        """Return a map with only the structure in the configured mask `configured` (rows, columns)."""
         blocks = np.asarray(_blocks(configured.astype(float)) > 0.0)
         rows, columns = configured.shape
         return cls(rows, columns, blocks, np.zeros((0, 0)), np.zeros(blocks.shape, dtype=np.int64))
@@ -132,7 +133,7 @@ def _neighbours(blocks: BoolArray) -> IntArray:
 
 
 def _blocks(image: Image | FloatArray) -> FloatArray:
-    """Return the mean of each block of an image (rows, columns); incomplete blocks repeat the border."""
+    """Return the mean of each block of an image (rows, columns); border pixels fill incomplete blocks."""
     rows, columns = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -columns % _BLOCK)), mode="edge")
     m, n = padded.shape[0] // _BLOCK, padded.shape[1] // _BLOCK
@@ -147,8 +148,8 @@ class HorizonCameraJob:
         frames: images (rows, columns) by the index of their camera.
         cameras: all cameras.
         knowledge: prior knowledge, with directions and attitude in body axes.
-        strings: model of the solar strings and the currents (n,), A, of the strings. Without a recent reading
-            of the currents, `strings` is None.
+        strings: model of the solar strings and the currents (n,), A, of the strings. If there is no recent
+            reading of the currents of the solar strings, `strings` is None.
         response: response of the cameras' detectors to light intensity, or None for linear detectors.
         structure: maps of the spacecraft's own structure in the images, by the index of the camera.
         earth_only: indices of the cameras in whose images the Sun is not searched.
@@ -177,7 +178,7 @@ class MeasuredDirection:
 
     @property
     def sigma(self) -> float:
-        """The standard deviation per axis, rad: the root of the mean variance over both axes."""
+        """The standard deviation per axis, rad, computed from the mean variance over both axes."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 

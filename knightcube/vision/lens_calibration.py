@@ -3,14 +3,14 @@
 The fit is a weighted least-squares fit in pixels to all frames at once, with an unknown attitude for each
 frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. After
 the robust steps, matches with residuals above five standard deviations are rejected. The three attitude
-parameters of each frame are eliminated frame by frame with the Schur complement. The remaining system is 5 x
-5 for any number of frames.
+parameters of each frame are eliminated frame by frame with the Schur complement. After this elimination, the
+normal equations have five unknowns for any number of frames.
 
-The data may not determine all parameters. In a narrow field, a shift of the optical axis has nearly the same
-effect as a rotation of the camera, so that a single frame hardly separates the two. Each parameter therefore
-has a prior around an ideal lens with the initial focal length, the optical axis in the image centre and no
-distortion. Parameters whose standard deviation exceeds half the prior standard deviation are listed in
-`undetermined`.
+The frames may not determine all lens parameters. In a narrow field, a shift of the optical axis has nearly
+the same effect as a rotation of the camera, so that a single frame hardly separates the two. Each lens
+parameter therefore has a prior around an ideal lens with the initial focal length, the optical axis in the
+image centre and no distortion. Parameters whose standard deviation exceeds half the prior standard deviation
+are listed in `undetermined`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class LensPrior:
         centre: error of the optical axis in the image, per axis, px. The default `centre` allows for the
             position error of a sensor that was mounted by hand.
         k1, k2: errors of the radial distortion coefficients. The defaults allow any lens except a fisheye.
-        pixels: errors of aspect and shear. The default `pixels` means square pixels.
+        pixels: errors of the aspect and the shear of the pixels. The default `pixels` means square pixels.
         tangential: errors of the tangential distortion coefficients p1 and p2, by default zero.
     """
 
@@ -253,7 +253,7 @@ def _result(
 ) -> Calibration:
     """Return the calibration from the last step of the fit."""
     focal_length, x, y, k1, k2, *shape = last.fit.parameters.tolist()
-    # Terms with a prior that fixes them at zero are exactly zero in the lens.
+    # Lens terms that the prior fixes at zero are set to exactly zero.
     shape = [value if known < NONE**-2 / 4.0 else 0.0 for value, known in zip(shape, prior[5:], strict=True)]
     try:
         lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2, *shape)
@@ -345,7 +345,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
         else:
             omitted[term] = OmittedTerm((getattr(lens, term),), (sigma[term],), (0.0,))
         prior = replace(prior, **{term: _HELD[term]})
-        # The fit starts at the assumed values, and the small prior deviations keep the omitted terms there.
+        # The fit starts at the assumed values, and small prior standard deviations fix the omitted terms.
         assumed: dict[str, Any] = {
             name: gone.assumed if name == "centre" else gone.assumed[0] for name, gone in omitted.items()
         }
@@ -450,7 +450,7 @@ class CalibrationImage:
     def reason(self) -> str:
         """The reason why the image is not used for the calibration.
 
-        For an image that is used, the reason is empty.
+        For an image that is used, `reason` is empty.
         """
         return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
 
@@ -499,7 +499,7 @@ def calibrate_lens(
 
     Args:
         images: arrays (rows, columns) of counts, or colour images (rows, columns, 3), all of one shape.
-        fov_deg: approximate field of view across the columns, deg. Without it, 4 to 60 deg are tried.
+        fov_deg: approximate field of view across the columns, deg. If it is None, 4 to 60 deg are tried.
         progress: function that is called before each image with the number of the pass and the number of the
             image, both counted from 1.
 

@@ -159,7 +159,7 @@ def step(
     prior: FloatArray,
     expected: FloatArray,
 ) -> FitStep:
-    """Return lens and attitudes after one Gauss-Newton step.
+    """Return lens parameters and attitudes after one Gauss-Newton step of the calibration.
 
     The squared residuals of the stars of each frame have the `weights` (n,). The prior means `expected` (9,)
     of the lens parameters have the inverse variances `prior` (9,), or an information matrix. Raises
@@ -202,8 +202,9 @@ def _linearised(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weighted derivatives (2n, p) and (2n, 3) of n star positions, and weighted residuals (2n,).
 
-    The derivatives are with respect to p lens parameters (9 or 10) and to a small rotation. The lens
-    parameters are those of `Lens`. A small rotation moves a direction v by v x rotation.
+    The derivatives are with respect to p lens parameters (9 or 10) and to a small rotation. The first nine
+    lens parameters are the parameters of `Lens` in the order of PARAMETERS. A small rotation moves a
+    direction v by v x rotation.
     """
     misfit = residuals(frame, fit, number)
     usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
@@ -578,7 +579,7 @@ class _FrameFit:
         *,
         cut: bool = True,
     ) -> _FrameFit:
-        """Return the fit to a frame with the prior `known`. Outliers are excluded if `cut` is true.
+        """Return the fit to a frame with the prior `known`, without outliers if `cut` is true.
 
         The fit starts at the given `focal_length` (px) and `attitude` (4,).
         Raises CalibrationError if the frame does not determine its attitude, or if few stars agree.

@@ -4,9 +4,9 @@ A solar string is a series connection of solar cells on one face of the body, so
 same current. The current is proportional to the cosine of the angle between the Sun and the string's normal,
 and zero if the Sun is behind the string. The Earth also illuminates the strings, with at most a third of the
 intensity of the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light from the half
-of the sky that is centred on nadir e. This light causes correlated errors of the strings, which the
-covariance of the Sun direction includes. The correlation can be computed if nadir is known; otherwise its
-mean over all nadir directions is used.
+of the sky that is centred on nadir e. Light from the Earth causes correlated errors of the strings, which the
+covariance of the Sun direction includes. If the nadir direction is known, the correlation is computed;
+otherwise its mean over all nadir directions is used.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if one
 string fails in any way. The magnetic field does not determine the rotation about the field direction. The
@@ -175,7 +175,7 @@ def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """Return the mean currents (n,) due to Earth albedo, and the covariance (n, n) of the readings.
 
-    Both are normalised to the peak currents.
+    Currents and readings are normalised to the peak currents.
     """
     normals, square = strings.normals, strings.albedo_sigma**2
     own = strings.sigma**2 * np.eye(len(normals))

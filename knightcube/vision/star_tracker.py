@@ -80,7 +80,7 @@ class StarSolution:
 
     Attributes:
         status: outcome: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".
-        reason: one-sentence reason why the image was not solved. The reason is empty for a solved image.
+        reason: one-sentence reason why the image was not solved. For a solved image, `reason` is empty.
         right_ascension: right ascension of the boresight, ICRS, from 0 to 2 pi, rad.
         declination: declination of the boresight, ICRS, rad.
         roll: position angle of the image's upward direction (-y), north through east, 0 to 2 pi, rad.
@@ -92,7 +92,7 @@ class StarSolution:
             The field of view is fitted to the stars unless the camera is calibrated.
         field_of_view_sigma: standard deviation of the field of view, rad; 0 for a calibrated camera.
         log10_false_alarm: log10 of an upper limit of the probability that random points are solved.
-        mirrored: whether the image is a mirror image of the sky. The attitude of a mirror image is that of
+        mirrored: whether the image is a mirror image of the sky. For a mirror image, the attitude refers to
             the image after left and right are swapped.
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
             is None unless the stars are streaks and the exposure was given.
@@ -101,7 +101,7 @@ class StarSolution:
         sky_map: conversion between pixels of the image and ICRS directions; None unless solved.
         frame: all results of the star tracker, including the points that are not catalogue stars.
         index: sky index (catalogue of guide stars) at the epoch of the image. The star indices in
-            `frame.star` refer to this sky index.
+            `frame.star` refer to `index`.
     """
 
     status: str
@@ -176,7 +176,7 @@ class StarTracker:
         index: a sky index, or the path of a sky index file. None: the default index.
         learn: whether the lens parameters are estimated from the solved images, which must be taken by one
             camera. The attribute `lens` contains the estimated lens parameters. The accuracy of the given
-            field of view or camera is `settings.lens`, by default that of an uncalibrated camera.
+            field of view or camera is `settings.lens`, by default the accuracy of an uncalibrated camera.
 
     Raises:
         InputError: if a field of view is out of range or given with a camera, or for an unreadable index.

@@ -135,7 +135,7 @@ class SunMeasurement:
 
     @property
     def sigma(self) -> float:
-        """The standard deviation per axis, rad: the root of the mean variance over both axes."""
+        """The standard deviation per axis, rad, computed from the mean variance over both axes."""
         return float(np.sqrt(0.5 * np.trace(self.tangent_covariance)))
 
 
@@ -145,7 +145,7 @@ class SunSolution:
 
     Attributes:
         status: the outcome.
-        reason: short reason why no Sun was found. The reason is empty if the Sun was found.
+        reason: short reason why no Sun was found. If the Sun was found, `reason` is empty.
         sun: the measurement; The measurement is None unless the status is FOUND or PARTIAL.
         pixels_read: number of pixels that were read.
     """
@@ -213,7 +213,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if reasons:
             return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
         return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
-    # If several bright patches are round, the largest is the Sun.
+    # If several bright patches are round, the largest patch is taken as the Sun.
     sun = max(found, key=lambda one: one.radius)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
@@ -581,7 +581,7 @@ class SunOfCameras:
         covariance: covariance (3, 3) of the direction error, zero along the direction, rad^2.
         camera: index of the camera that found the Sun, or None if the solar strings gave the direction.
         each: result of the search in each image by camera index, in the order in which the cameras were read.
-        reason: reason why no camera found the Sun. The reason is empty if a camera found the Sun.
+        reason: reason why no camera found the Sun. If a camera found the Sun, `reason` is empty.
     """
 
     direction: FloatArray | None

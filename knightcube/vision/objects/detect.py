@@ -149,7 +149,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
-# Largest distance of the rotation centre from the boresight, in focal lengths, for which it is used.
+# Largest distance of a useful rotation centre from the boresight, in focal lengths.
 # The distance is computed from the rotation axis, because errors make a fitted centre appear too near.
 _FARTHEST_CENTRE = 3.0
 
@@ -241,8 +241,8 @@ def short_regions(
 class Verdict(Enum):
     """Classification of a streak or region.
 
-    STAR: the indicators agree with a star. STARS: stars explain the pixels. OBJECT: an object is present.
-        UNCLEAR: neither stars nor an object explains the pixels.
+    STAR: the indicators agree with the streak of a star. STARS: stars alone explain the pixels. OBJECT: the
+    streak or region contains an object. UNCLEAR: neither stars nor an object explains the pixels.
     """
 
     STAR = "star"
@@ -286,7 +286,7 @@ class SpaceObject:
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """The result of a search: the examined streaks of an image, and the objects found, the brightest first.
+    """Result of the search of an image: the examined streaks, and the objects found, the brightest first.
 
     The attributes `indicators` and `verdicts` contain first the streaks with two ends, then the short
     regions. The attribute `crowded` contains one verdict for each region with more than two corners.
@@ -637,8 +637,8 @@ class Judge:
         """Return whether a line between `ends` (2, 2), px, may be a segment of the streak of one star.
 
         A star is possible if its path begins or ends at one end of the line, and contains the other end. The
-        line has `flux` counts. The other segments of the star's streak may overlap other stars, so that the
-        whole path must be at least about as bright as the line.
+        line of light has a flux of `flux` counts. The other segments of the star's streak may overlap other
+        stars, so that the whole path must be at least about as bright as the line.
         """
         length = max(float(np.linalg.norm(ends[1] - ends[0])), 1.0)
         directions = self.pinhole.unit_vectors(ends[[0, 0, 1, 1]])
@@ -762,7 +762,7 @@ def detect_objects(
     Args:
         image: pixel values (rows, columns) of an unsigned integer type, with streaks of 20 px or more.
         camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`. The
-            search neglects the distortion of a lens.
+            search neglects lens distortion.
         rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
             from the streaks of the image. If the sign of the rate is unknown, the directions of motion of all
             objects may have the wrong sign.
@@ -772,8 +772,8 @@ def detect_objects(
     Raises:
         ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
 
-    Source: Sease 2013, chapter 4, as corrected in the errata. The test whether stars explain the pixels is
-    not from Sease.
+    Source: Sease 2013, chapter 4, as corrected in the errata. The test whether stars alone explain the pixels
+    is not part of Sease's method.
     """
     settings = ObjectSettings() if settings is None else settings
     check_image(image, camera)
@@ -783,7 +783,7 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # The angle that a pixel subtends is largest on the boresight, and is used for all directions.
+    # The angle of a pixel on the boresight, which is the largest, is used for all directions.
     sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

@@ -224,11 +224,11 @@ class FramePatches:
         return None if patch is None else _fit_object(patch, point, half, flux, self._near(point, patch))
 
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
-        """Return an object whose light is merged with that of known stars, or None if there is none.
+        """Return an object whose light is merged with the light of known stars, or None if there is none.
 
         The fit of the object starts at the brightest pixel after the stars are subtracted. The area of light
-        has its centre at `point` (2,), px, and the given `length`, px. The minimum flux of the object is
-        `significance` standard deviations.
+        has its centre at `point` (2,), px, and the given `length`, px. The flux of the object is at least
+        `significance` standard deviations of its error.
         """
         patch = self._patch(point, 0.5 * length + _patch_reach(np.zeros(2), self._psf))
         if patch is None:
@@ -346,7 +346,7 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of a star of one count is computed from the identified streaks, and is NaN without them.
+    # The magnitude of a star of one count is computed from identified streaks, or NaN if there are none.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
     if known is not None and np.any(known):
@@ -435,8 +435,8 @@ def measure_points(
 ) -> FieldPoints:
     """Return the points of light in a frame, with moving objects marked if the stars are streaks.
 
-    The motion of the camera over the `exposure`, s, is that from the streaks of the frame. The settings
-    `detection` are used to detect the bright areas in the frame (rows, columns).
+    The `motion` of the camera over the `exposure`, s, was estimated from the streaks of the frame. The
+    settings `detection` are used to detect the bright areas in the frame (rows, columns).
     """
     moves = motion.status is StreakStatus.RATE and motion.rate is not None and motion.length >= STREAK_PX
     if moves and isinstance(motion, MotionResult) and motion.rate is not None:

@@ -12,7 +12,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 class EndpointSettings:
     """Settings of the segmentation of streaks and of the location of their ends.
 
-    The defaults suit the camera of the demonstration.
+    The defaults are suitable for the camera of the demonstration.
 
     Attributes:
         threshold_sigmas: threshold for the sum of 3 x 3 pixels, in standard deviations of this sum; with 0

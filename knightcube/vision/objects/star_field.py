@@ -32,7 +32,7 @@ MOST_FAILURES = 3
 """Number of successive frames with too few assigned stars after which all stars are removed from the
 field."""
 KNOWN = 2
-"""Minimum number of frames in which a direction appears for the direction to be that of a star."""
+"""Minimum number of frames in which a direction appears before the direction is assumed to be a star."""
 FORGOTTEN = 20
 """Number of frames after which a direction that does not appear again is removed, unless it is a star."""
 MOST_STARS = 600

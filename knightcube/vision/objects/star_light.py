@@ -59,7 +59,7 @@ _SAME_PATH = 0.15
 _ROUNDS = 5
 # Minimum distance (px) to which light is followed beyond each end, in the first and in later iterations.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
-# Distance (px) between an assumed end and the end of the light above which the fit starts at the latter.
+# Difference (px) between assumed and measured end of the light above which the fit uses the measured end.
 _FOLLOWED = 1.5
 # Maximum number of Gauss-Newton steps of a fit of the ends, and step (px) below which it has converged.
 _END_FITS, _END_CONVERGED = 3, 0.05
@@ -128,8 +128,8 @@ class StarLight:
     Attributes:
         chi_square: chi-square of the best-fitting sum of star streaks.
         pixels: number of pixels used.
-        expected: expected chi-square of a correct model. In bright regions it is less than `pixels`, because
-            the weights of bright pixels also allow for model errors.
+        expected: expected chi-square of a correct model. In bright regions, `expected` is less than `pixels`,
+            because the weights of bright pixels also allow for model errors.
 
     Raises FlightError if the least-squares solution of the brightnesses does not converge.
     """
@@ -206,7 +206,8 @@ class StarLight:
         The light is followed along the path of the streak beyond both `ends` (2, 2), px, but not into other
         regions. The path is straight relative to the stars if `among_stars` is true, otherwise straight in
         the image. The initial ends are the ends of the most likely interval of uniform brightness without
-        light outside. Ends and brightness are then fitted to the pixels. Known stars are subtracted.
+        light outside. Ends and brightness are then fitted to the pixels, from which known stars are
+        subtracted.
         """
         beyond = max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         label = region_along(self._segmented, ends)
@@ -370,7 +371,7 @@ def region_along(segmented: Segmented, ends: FloatArray) -> int:
 def light_on_path(segmented: Segmented, path: FloatArray, psf_sigma: float) -> FloatArray:
     """Return the brightness (m,), counts/px, along a path (m, 2), px, whose points are 1 px apart.
 
-    Light of other sources on the path is included. Outside the frame, the brightness is zero.
+    The brightness includes light of other sources on the path, and is zero outside the frame.
     """
     rows, columns = segmented.signal.shape
     pixels = pixels_near(path, _REACH * psf_sigma, rows, columns)
@@ -503,7 +504,7 @@ def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole, per
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     extent = float(np.hypot(*(corners.max(axis=0) - corners.min(axis=0))))
     directions = pinhole.unit_vectors(np.concatenate([corners, middle[None]]))
-    # The points of a path are 1 px apart.
+    # The number of points of a path is its length in px, because the points are 1 px apart.
     length = star_paths(directions[-1:], rotation, np.array([0.5]), pinhole).shape[1]
     chain = min(max(extent / length, 1.0), _LONGEST_CHAIN)
     number = round(per_length * chain) + 1

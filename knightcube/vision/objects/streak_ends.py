@@ -4,8 +4,8 @@ A pixel is bright if the sum of the 3 x 3 pixels around it, without background, 
 standard deviations of the sum. The sum of 3 x 3 pixels is nearly the matched filter of a star image one pixel
 wide. The Harris response of the structure tensor (cornerness) is computed for each connected region of bright
 pixels. A streak has exactly two peaks of the Harris response, and each peak is located by its centre of
-intensity. The equations are those of Sease, where eq. (3.5), (3.15), (3.17) and (3.18) are corrected as in
-the errata. Images have the shape (rows, columns), and points are (x, y) in px.
+intensity. The equations are from Sease, with eq. (3.5), (3.15), (3.17) and (3.18) corrected as in the errata.
+Images have the shape (rows, columns), and points are (x, y) in px.
 
 The Gaussian kernels displace the peaks of the Harris response along the streak by a constant that depends on
 the point spread function. The function `extend` moves the measured streak ends outward to compensate the
@@ -278,7 +278,7 @@ def measure_streaks(
 def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Return image and mask of the region `label` with a margin, and the first pixel's position in the frame.
 
-    In the image, the pixels of other regions are zero.
+    Pixels of other regions are set to zero in the returned image.
     """
     rows, columns = signal.shape
     top, bottom, left, right = box
@@ -331,7 +331,7 @@ def _corners_of_regions(
     """Return the positions (m, 2), px, of all corners in n regions, and the number of corners in each, (n,).
 
     Corners are peaks of the Harris response, which is computed only near the pixels of the regions. The
-    argument `signal` is the counts above the background (rows, columns). The labels at each pixel, the
+    argument `signal` (rows, columns) contains the counts above the background. The labels at each pixel, the
     bounding boxes and the labels of the regions are those of `Regions`.
     """
     largest, most, (k, _, half_width) = 0, 0, limits
@@ -457,7 +457,7 @@ def _correlate(
 ) -> None:
     """Set `out` to the correlation of an image with an outer product, within spans of columns (rows, 2).
 
-    The image is extended by repeating its border pixels. The array `out` may be the image.
+    The image is extended by repeating its border pixels. The arrays `out` and `image` may be the same array.
     """
     rows, columns = image.shape
     high, wide = len(down) // 2, len(across) // 2
@@ -620,7 +620,7 @@ def _separable(image: Image, down: FloatArray, across: FloatArray) -> FloatArray
 
 
 def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntArray:
-    """Return the pixels (x, y) in `mask` whose response exceeds that of all eight neighbours, (n, 2).
+    """Return the pixels (x, y) in `mask` with a larger response than all eight neighbours, (n, 2).
 
     Pixels at the border of the image, and pixels below `relative` times the largest response in the mask, are
     excluded.
@@ -663,8 +663,8 @@ def find_corners(
 
     The position of a corner is the centre of intensity of the image `intensity` around the peak, where
     `intensity` is the cornerness or, as in Sease, the frame. If the centre of intensity is computed from the
-    frame, the corners lie up to 2 px inside the streak. A streak has two corners. A different number of
-    corners indicates noise, crossing streaks or another source.
+    frame, the corners lie up to 2 px inside the streak. A streak has two corners. A region with fewer or more
+    than two corners shows noise, crossing streaks or another source.
     """
     peaks = local_maxima(response, mask, relative)
     return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)

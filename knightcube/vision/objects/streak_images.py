@@ -129,9 +129,9 @@ def path_among_stars(
 ) -> FloatArray:
     """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
 
-    The motion may begin at either end. The slower of the two possible motions relative to the stars is
-    assumed. The array `parts` (m,) contains the position of each point as a fraction of the motion, counted
-    from the first of the `ends`. If `parts` is None, the points are evenly spaced.
+    The motion may begin at either of the two ends. The slower of the two possible motions relative to the
+    stars is assumed. The array `parts` (m,) contains the position of each point as a fraction of the motion,
+    counted from the first of the `ends`. If `parts` is None, the points are evenly spaced.
     """
     parts = _even_parts(ends) if parts is None else parts
     return _path_among_stars(ends, rotation, parts, (float(pinhole.focal_length), *pinhole.centre))
@@ -255,7 +255,7 @@ def _pixels_near_numpy(points: FloatArray, reach: float, rows: int, columns: int
 
 
 def _shifted(count: int, step: int) -> slice:
-    """Return the part of an axis of `count` pixels that a map shifted by `step` pixels covers."""
+    """Return the slice of an axis of `count` pixels that remains if an array is shifted by `step` pixels."""
     return slice(max(step, 0), count + min(step, 0))
 
 
@@ -305,7 +305,7 @@ def _mark_discs(
     rows, columns = marked.shape
     r, total = len(half) // 2, 0
     spans[:, 0], spans[:, 1] = columns, -1
-    # Neighbouring paths have many points on the same pixels.
+    # A disc is drawn only once at each pixel, because neighbouring paths have many points on the same pixels.
     drawn = np.zeros((rows + 2 * r, columns + 2 * r), dtype=np.bool_)
     for k in range(len(centres)):
         x, y = centres[k, 0] - low_x, centres[k, 1] - low_y
@@ -421,12 +421,12 @@ def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: boo
 
     The count is distributed evenly over the points of the path. The image is the product of the profiles
     across and along the path, which are blurred by a Gaussian with the standard deviation `sigma`, px, and by
-    the pixel. The error is at most 2 % of the largest value. The image of a strongly curved path is the sum
-    of the images of its points.
+    the pixel. The error of the image is at most 2 % of its largest value. The image of a strongly curved path
+    is the sum of the images of its points.
 
-    The `pixels` (p, 2) are sorted by row. The points of the `paths` (k, m, 2) are in px. If `slopes` is true,
-    the result has the shape (k, 3, p): the image of each streak is followed by its derivatives, 1/px, with
-    respect to displacements of the whole path along x and along y.
+    The `pixels` (p, 2) must be sorted by row. The points of the `paths` (k, m, 2) are in px. If `slopes` is
+    true, the result has the shape (k, 3, p): the image of each streak is followed by its derivatives, 1/px,
+    with respect to displacements of the whole path along x and along y.
     """
     images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
     for k in range(len(paths)):
@@ -665,7 +665,7 @@ def fitted_line(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: 
     """Return the ends (2, 2), px, of the line that Gauss-Newton fits to the counts `light` (rows, columns).
 
     The reciprocal standard deviations of the pixels are `weight` (rows, columns), 1/counts. The two `ends`
-    (2, 2), px, are an initial guess, and differ.
+    (2, 2), px, are an initial guess, and must differ.
     """
     ends = ends.copy()
     sums = np.empty((6, 5))

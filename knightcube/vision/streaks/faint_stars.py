@@ -106,7 +106,7 @@ def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarG
 def _direction_terms(grid: PolarGrid) -> tuple[Float32Array, Float32Array]:
     """Return terms (3, c) of azimuths and (3, r) of circles, whose sum is the direction of a sample.
 
-    The direction is not a unit vector, but is divided by the sine of its polar angle.
+    The direction is a unit vector divided by the sine of its angle from the rotation axis.
     """
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
@@ -114,7 +114,7 @@ def _direction_terms(grid: PolarGrid) -> tuple[Float32Array, Float32Array]:
 
 
 _Camera = tuple[tuple[float, float, float], tuple[int, int]]
-"""Focal length and image centre (x, y), px, and numbers of columns and rows."""
+"""Focal length and image centre (x, y) of a camera, px, and its numbers of columns and rows."""
 
 
 def _camera_of(pinhole: Pinhole) -> _Camera:
@@ -127,7 +127,7 @@ def _samples(
     """Return samples (r, c) of the 3 x 3 sums `flat`, and a mask (r, c) of the samples on the detector.
 
     The samples are rounded to integer multiples of 1/`per_count`, so that their sums are fast and exact. The
-    sums must be zero along the border of the frame. The other arguments are those of `_sum_along`.
+    3 x 3 sums must be zero along the border of the frame. The other arguments are described in `_sum_along`.
     """
     view, shape = camera
     last = np.int32(shape[0] - 1), np.int32(shape[1] - 1)
@@ -349,7 +349,7 @@ def _pixel_indices(
 ) -> None:
     """Compute the flat pixel index of each sample of a circle, which is negative outside the detector.
 
-    The first sample has the azimuth with the index `left`.
+    The argument `left` is the index of the azimuth of the first sample.
     """
     view, shape = camera
     columns, rows = np.int32(shape[0]), np.int32(shape[1])
@@ -443,7 +443,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference and its noise are scaled so that it equals an isolated star's response.
+    # The second difference is scaled so that it equals the response at an isolated star.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -459,7 +459,8 @@ def standing_peaks(
     """Return the peaks of stars, the strongest first, as fractional grid rows and columns.
 
     A peak is omitted if stronger peaks cause most of its response. Only the flat indices `place` (p,) of the
-    filter response are searched. The range `span` (r, 2) of columns on the detector is that of `RunningSums`.
+    filter response are searched. The argument `span` (r, 2) is the range of columns on the detector, as in
+    `RunningSums`.
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
@@ -666,8 +667,8 @@ def _less_boxes_numpy(sums: Image, shape: tuple[int, int], pixels: IntArray, tak
 def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
     """Return the flattened 3 x 3 `sums` of a frame of `shape` after counts are subtracted from some pixels.
 
-    The indices `pixels` (m,) are those of the changed pixels, each given once, and `taken` (m,) are the
-    counts to subtract. The sums of the border pixels are zero.
+    The argument `pixels` (m,) contains the flat indices of the changed pixels, each once, and `taken` (m,)
+    the counts to subtract. The returned sums are zero at the border of the frame.
     """
     out, (rows, columns) = sums.copy(), shape
     for p in range(len(pixels)):
@@ -682,7 +683,7 @@ def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Ima
 
 
 _Peaks = tuple[FloatArray, FloatArray, FloatArray]
-"""Fractional grid rows and columns, and heights, of the peaks of stars, each (k,)."""
+"""Fractional grid rows (k,), fractional grid columns (k,) and heights (k,) of the peaks of k stars."""
 
 
 def _found_stars(held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int) -> _Peaks:
@@ -735,7 +736,7 @@ def _add_responses_numpy(
 ) -> None:
     """Add the filter responses of `stars` at the ascending flat indices `place` (p,) to the array `out` (p,).
 
-    The range `span` (r, 2) is that of `RunningSums`, and the streak length is in samples.
+    The argument `span` (r, 2) is the range of columns on the detector, and `length` is in samples.
     """
     (rows, columns), (row, column, height) = shape, stars
     # On each neighbouring circle, the filter response of a star covers a contiguous range of columns.

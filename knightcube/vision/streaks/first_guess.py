@@ -65,8 +65,8 @@ class Circles:
     """Circles about the rotation axis, each through the centroid of one of the n brightest regions.
 
     The rows of the matrix `frame` (3, 3) are two unit vectors normal to the rotation axis, and the axis. The
-    `height` (n,) is the cosine of the angle between each circle and the axis, and the `azimuth` (n,), rad, is
-    that of the centroid of each region.
+    `height` (n,) is the cosine of the angle between each circle and the axis, and `azimuth` (n,), rad, is the
+    azimuth of the centroid of each region.
     """
 
     frame: FloatArray
@@ -269,7 +269,7 @@ class MotionGuess:
 def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, BoolArray] | None:
     """Return the rotation axis (3,) with which most bright regions agree, and a mask (n,) of these regions.
 
-    The sign of the axis is arbitrary. Returns None if fewer than two regions agree.
+    The sign of the returned axis is arbitrary. Returns None if fewer than two regions agree.
     """
     long = np.flatnonzero(regions.length >= _LEAST_LENGTH)
     if len(long) < 2:
@@ -426,7 +426,7 @@ def motions_by_scan(
 
 _Arcs = tuple[FloatArray, IntArray, FloatArray]
 _RegionPixels = tuple[IntArray, IntArray, FloatArray, IntArray]
-"""Column, row, light and owner of `BrightRegions`."""
+"""Attributes `column`, `row`, `light` and `owner` of `BrightRegions`."""
 
 
 def _arcs_numpy(
@@ -435,8 +435,8 @@ def _arcs_numpy(
     """Return moments (3, n), end pixels (2, n) and azimuths of the end pixels (2, n) of n regions.
 
     The moments are the mean and the variance of the azimuth about the axis, relative to the azimuths
-    `reference` (n,), and the mean cosine of the angle from the axis. The matrix `frame` (3, 3) is that of
-    `Circles`. The tuple `view` contains the focal length and the image centre (x, y) of the camera, px.
+    `reference` (n,), and the mean cosine of the angle from the axis. The matrix `frame` (3, 3) is described
+    in `Circles`. The tuple `view` contains the focal length and the image centre (x, y) of the camera, px.
     """
     n, (focal, centre_x, centre_y), (column, row, light, owner) = len(reference), view, pixels
     v = np.stack([(column - centre_x) / focal, (row - centre_y) / focal, np.ones(len(row))])

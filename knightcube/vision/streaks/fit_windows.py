@@ -359,7 +359,7 @@ class BlockPixels:
 
     Attributes:
         slot: index of each pixel in the list of all fitted pixels, which contains a pixel shared by several
-            stars only once. For a pixel outside the frame, `slot` is the number of fitted pixels.
+            stars only once. For a pixel outside the frame, `slot` is the total number of fitted pixels.
         inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
@@ -525,7 +525,7 @@ def _numbered(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, 
 
 
 _FrameArrays = tuple[Float32Array, Float32Array, Image, BoolArray]
-"""Signal, floor, counts and bad pixels of `ReducedFrame`."""
+"""Signal, noise variance (`floor`), raw counts and bad pixels of a `ReducedFrame`."""
 
 
 def _frame_values_numpy(

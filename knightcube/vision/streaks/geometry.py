@@ -430,15 +430,15 @@ def _ideal_paths(
 def _sensitivities_of(
     view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (m, 2, 8) and velocities (m, 2)."""
+    """Return the derivatives (m, 2, 8) and velocities (m, 2) of `sensitivities_and_velocity`."""
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(view, stars))
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
-    # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
+    # A change of the rate rotates the camera by a small vector psi, so that a direction v changes by v x psi.
     # The vector psi at the time t is the integral over t' of the rotation from t' to t.
     flow = _flow(view[0], there)
-    # In this integral, the mean rate since mid-exposure is used, which causes an error of higher order.
+    # The mean rate since mid-exposure is used in the integral, which causes an error of higher order.
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
     if motion.higher_terms.any() or motion.vibration.exists:
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)

@@ -1,8 +1,8 @@
 """Joint fit of the motion and the brightest stars, together with the fainter stars on the same pixels.
 
 The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
-the ends of the streaks. It can therefore converge to a wrong rotation angle. If the fitted rotation is too
-small, the model may match only one end of every streak. The function `true_ends` detects flux beyond the
+the ends of the streaks. The fit can therefore converge to a wrong rotation angle. If the fitted rotation is
+too small, the model may match only one end of every streak. The function `true_ends` detects flux beyond the
 modelled streak ends. If the fitted rotation is too large, the modelled streaks extend over dark pixels. The
 function `unbroken` detects gaps, which are dark segments within a streak. If a modelled streak end lies more
 than a few point-spread widths beyond the true end, the pixels around it contain no starlight, and the fit
@@ -56,7 +56,7 @@ from knightcube.vision.streaks.streak_result import LikelihoodSettings
 _MOST_WORK = 1_600_000
 # Fixed work of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
-# Ratio of the work per pixel of a pass over the frame to that of an evaluation of the model.
+# Ratio of the work per pixel in a pass over the frame to the work per pixel in a model evaluation.
 _PASS = 0.15
 
 
@@ -142,7 +142,7 @@ class FitProblem:
     The initial standard deviation of the point spread is `sigma`, px. If the fit is `growing`, the angular
     acceleration is fitted. The rotation vector must have a positive component along `sense` (3,), unless
     `sense` is None. The `course` is the motion from the navigation filter, or None if it is unknown or nearly
-    uniform. The `work` is the computing work spent on this frame so far.
+    uniform. The attribute `work` counts the computing work spent on this frame so far.
     """
 
     frame: ReducedFrame
@@ -459,8 +459,8 @@ def brightness(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean counts (n,) of pixels along path segments, and the standard errors (n,) of these means.
 
-    The argument `time` (n, s) contains s sampling times for each of the n path segments. The mean is NaN if a
-    segment has too few usable pixels.
+    The argument `time` (n, s) contains s sampling times for each of the n path segments. The mean of a
+    segment with too few usable pixels is NaN.
     """
     frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
@@ -470,7 +470,7 @@ def brightness(
 
 
 _FramePixels = tuple[Float32Array, Float32Array, BoolArray]
-"""Signal, floor and bad pixels of `ReducedFrame`, as flat arrays."""
+"""Signal, noise variance (`floor`) and bad pixels of a `ReducedFrame`, as flat arrays."""
 
 
 def _band_means_numpy(
@@ -478,7 +478,7 @@ def _band_means_numpy(
 ) -> tuple[FloatArray, FloatArray]:
     """Return means and standard errors (n,) of `brightness` for positions and velocities (2, n * samples).
 
-    The frame has the `shape` columns and rows.
+    The argument `shape` contains the numbers of columns and rows of the frame.
     """
     (columns, rows), (signal, floor, bad) = shape, frame
     way = velocity / np.maximum(np.hypot(velocity[0], velocity[1]), 1e-3)

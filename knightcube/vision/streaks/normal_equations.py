@@ -98,8 +98,8 @@ def evaluate(
 ) -> Evaluation:
     """Return the normal equations of `scene` on the pixels of its fit windows.
 
-    The residual limit `clip` for outlier pixels is that of `residuals`. The flag `growing` states whether the
-    angular acceleration is fitted.
+    The residual limit `clip` for outlier pixels is in standard deviations. The flag `growing` states whether
+    the angular acceleration is fitted.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows)
@@ -331,9 +331,9 @@ def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, 
 def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
     """Return the indices (e,) of the blocks that contain e pixels, and the values (i, e) of i images there.
 
-    The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last image
-    contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices of the given
-    pixels in an array (b, p).
+    The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
+    the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
+    of the given pixels in an array (b, p).
     """
     _, count, size = images.shape
     block, place = np.divmod(crowded, size)
@@ -411,9 +411,10 @@ class Solution:
 class EliminatedEquations(NamedTuple):
     """Normal equations for the shared parameters alone, in which coupling by shared pixels is neglected.
 
-    The indices `kept` (k,) are those of the fitted shared parameters, whose covariance (k, k) is `inner`. For
-    each star, `own` (n, ALONE, ALONE) is the inverse of its block of the information matrix, and `gain`, with
-    the shape (n, k, ALONE), the product of `own` and the block that couples shared and own parameters.
+    The attribute `kept` (k,) contains the indices of the fitted shared parameters, and `inner` (k, k) is
+    their covariance. For each star, `own` (n, ALONE, ALONE) is the inverse of its block of the information
+    matrix, and `gain`, with the shape (n, k, ALONE), the product of `own` and the block that couples shared
+    and own parameters.
     """
 
     kept: IntArray
@@ -671,7 +672,7 @@ def solution(
 
 @loop_helper
 def _solve_alone(eliminated: EliminatedEquations, right: FloatArray, shared: int, out: FloatArray) -> None:
-    """Set `out` to the result of `_without_coupling`."""
+    """Compiled form of `_without_coupling`, which writes the solution to `out`."""
     kept, own, gain, inner = eliminated
     alone, left = own.shape[1], np.empty(len(kept))
     for i in range(len(kept)):
@@ -701,7 +702,7 @@ def _multiply(
     scratch: tuple[FloatArray, Float32Array, FloatArray],
     product: FloatArray,
 ) -> None:
-    """Set `product` to the result of `_product`.
+    """Compiled form of `_product`, which writes the product to `product`.
 
     The scratch arrays (common,), (e,) for e shared pixels of all stars, and (2, n, s + a) are overwritten.
     """
@@ -777,8 +778,8 @@ _LEAST_EFFECTIVE = 2.0
 class StarEquations:
     """Normal equations of each star for k fitted shared parameters, after elimination of its own parameters.
 
-    The indices `kept` (k,) are those of the fitted parameters. The equations consist of the information
-    matrix (n, k, k) and the gradient (n, k) of the log-likelihood of each star (`score`).
+    The attribute `kept` (k,) contains the indices of the fitted parameters. The equations consist of the
+    information matrix (n, k, k) and the gradient (n, k) of the log-likelihood of each star (`score`).
     """
 
     kept: IntArray

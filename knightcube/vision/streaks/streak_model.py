@@ -199,7 +199,7 @@ def _draw_numpy(
 ) -> None:
     """Compute the basis images `out` (b, .., LINES, k) from the points at which paths cross lines of pixels.
 
-    The arrays `points` are those of `StarPaths.at_lines`. The argument `delay` contains two values: the
+    The argument `points` is the result of `StarPaths.at_lines`. The argument `delay` contains two values: the
     exposure delay from row to row, and the row without delay.
     """
     (corner, step, time), (position, velocity, acceleration) = lines, points
@@ -219,9 +219,9 @@ def _draw_numpy(
 class _Crossings(NamedTuple):
     """Points at which paths cross the lines of b blocks of pixels (b, LINES).
 
-    The first pixels and the steps are those of `Strips`. Position and unit tangent have the shape (b, LINES,
-    2), and the time at the centre of each block (b, 1). The acceleration along the path is `gained`, and the
-    curvature `bend`.
+    The first pixels (`corner`) and the steps (`step`) of the lines are described in `Strips`. Position and
+    unit tangent have the shape (b, LINES, 2), and the time at the centre of each block (b, 1). The
+    acceleration along the path is `gained`, and the curvature `bend`.
     """
 
     corner: IntArray
@@ -236,7 +236,7 @@ class _Crossings(NamedTuple):
 
 
 def _draw_part(out: Float32Array, lines: _Crossings, width: float, shutter: Shutter) -> None:
-    """Compute the basis images of some blocks of pixels."""
+    """Compute the basis images `out` of a group of blocks of pixels."""
     light, aside, s = _endless(lines, out.shape[3], width)
     s += ((lines.time - lines.centre) * lines.speed).astype(np.float32)
     out[:, 0] = light.transpose(1, 2, 0)
@@ -290,7 +290,7 @@ def _endless(lines: _Crossings, count: int, width: float) -> tuple[Float32Array,
 
 
 def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Shutter, width: float) -> None:
-    """Remove the counts before and after the exposure from those of an infinitely long streak, `out[:, 0]`.
+    """Remove the counts before and after the exposure from the image of an infinite streak, `out[:, 0]`.
 
     The images of the streak ends, `out[:, 3:5]`, and the effect of the ends on the derivative `out[:, 5]`
     with respect to the width are computed as well. The array `along` (b, LINES, k) is the distance (px) of
@@ -324,7 +324,7 @@ def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Sh
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
-        # If the speed changes, the intensity at a streak's end differs from that at the centre of the block.
+        # If the speed changes, the intensities at a streak's end and at the centre of the block differ.
         thinning = gained[near] / speed[near] ** 2
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
@@ -408,11 +408,12 @@ def _endless_line(
 ) -> None:
     """Compute four values for each of `count` pixels on a line across an infinite streak, from `begin`.
 
-    The values are the distances across the path and along it from the centre of the block, and exponent and
-    factor of the profile. The distances across and along the path from the crossing are `first` (px) for the
-    first pixel, and change by `each` from pixel to pixel. The values `path` are the curvature, the
-    acceleration along the path divided by the squared speed, and the distance of the line from the centre.
-    The `profile` is the inverse squared width, the maximum, and the correction for the fourth cumulant.
+    The four values are the distance across the path, the distance along the path from the centre of the
+    block, and the exponent and the factor of the profile. The distances across and along the path from the
+    crossing are `first` (px) for the first pixel, and change by `each` from pixel to pixel. The argument
+    `path` contains the curvature, the acceleration along the path divided by the squared speed, and the
+    distance of the line from the centre. The argument `profile` contains the inverse squared width, the
+    maximum, and the correction for the fourth cumulant.
     """
     across, ahead, by_across, by_ahead = first[0], first[1], each[0], each[1]
     bend, thinning, shift = path
@@ -431,7 +432,7 @@ def _endless_line(
 
 @loop_helper
 def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> None:
-    """Set the counts `out[0]` to those of an infinitely long streak, and initialise the images `out[3:7]`."""
+    """Set `out[0]` to the counts of an infinitely long streak, and initialise the images `out[3:7]`."""
     for k in range(len(exponential)):
         out[0, k] = exponential[k] * pixels[3, k]
         out[3, k], out[4, k], out[5, k], out[6, k] = 0.0, 0.0, 0.0, 1.0
@@ -441,9 +442,10 @@ def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> Non
 def _from_end(pixels: FloatArray, pace: FloatArray, width: float, sign: float, later: float) -> None:
     """Compute the distances `pixels[3]` (point-spread widths) of a line of pixels from one streak end.
 
-    The `sign` is 1 for the start and -1 for the stop of the exposure. The `pace` contains the speed of the
-    star, its acceleration along the path, the time at which it crosses the line, also relative to the centre
-    of the block, and the exposure delay of the first pixel, which increases by `later` from pixel to pixel.
+    The `sign` is 1 for the start and -1 for the stop of the exposure. The argument `pace` contains the speed
+    of the star, its acceleration along the path, the time at which it crosses the line, the difference of
+    this time from the time at the centre of the block, and the exposure delay of the first pixel. The delay
+    increases by `later` from pixel to pixel.
     """
     speed, gained, time, end = pace[0], pace[1], pace[2], -0.5 * sign
     shift = (time - pace[3] - end - pace[4]) * speed - 0.5 * gained * (time - end) ** 2
@@ -523,7 +525,8 @@ def _mixtures_numpy(change: FloatArray, velocity: FloatArray, spread: IntArray) 
 
     The derivatives `change` (m, 2, 8) and the velocities (m, 2) are given at four groups of instants: shortly
     before and shortly after the star crosses the centre of each block, and at the starts and the stops of
-    exposures. The array `spread` (b,) contains the index of each block among the starts and the stops.
+    exposures. The array `spread` (b,) contains, for each block, the index of its start and stop among all
+    starts and stops.
     """
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]

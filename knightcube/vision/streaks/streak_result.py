@@ -127,7 +127,7 @@ def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowle
 class StreakStatus(Enum):
     """Outcome of a frame: a rate, or the reason why no rate is reported.
 
-    The values are also used in the telemetry packet `streak`.
+    The telemetry packet `streak` uses the same values.
     """
 
     RATE = "rate"
@@ -227,7 +227,7 @@ class MotionResult(FrameMotion):
         misfit: median chi-square per degree of freedom of the bright stars.
         rate_model: fitted model of the rate, `constant` or `accelerating`.
         acceleration: fitted angular acceleration (3,), rad/s^2, or None if it was not fitted.
-        reason: one-line reason why no rate was found. The reason is empty if a rate was found.
+        reason: one-line reason why no rate was found. If a rate was found, `reason` is empty.
         course: rotation estimated by the navigation filter, from which the fit took the higher-order terms;
             None if it used none.
         line_time_sigma: standard deviation of the delay between the exposures of successive rows, s.

@@ -1,10 +1,10 @@
 """Covariance of the fitted rotation, including errors that the model does not describe.
 
-The covariance due to photon noise is a lower limit. The covariance is increased by the scatter of the stars
-beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
-all stars equally and therefore cause no scatter. These errors are a point spread function (PSF) with an
-unexpected width or profile, which moves the ends of all streaks, and vibration of the body. The residuals at
-the streak ends and along the streaks limit the errors from PSF and vibration.
+The covariance due to photon noise alone is a lower limit. The covariance is increased by the scatter of the
+stars beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors
+affect all stars equally and therefore cause no scatter. These errors are a point spread function (PSF) with
+an unexpected width or profile, which moves the ends of all streaks, and vibration of the body. The residuals
+at the streak ends and along the streaks limit the errors from PSF and vibration.
 """
 
 from __future__ import annotations
@@ -141,11 +141,11 @@ def correct(
 ) -> CalibrationCorrection | None:
     """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
 
-    The information (n, k, k) and the score (n, k) are those of `StarEquations`. The argument `spread` is the
-    ratio of the variance of the stars' scatter to the variance of their noise. Each of m calibration errors
-    of one standard deviation changes each star's estimate by `apparent` (n, k, m); the first `described`
-    errors have a specified standard deviation. The estimated errors are in addition to the errors `counted`
-    (m,), in standard deviations, which the fit has already corrected.
+    The information (n, k, k) and the score (n, k) are described in `StarEquations`. The argument `spread` is
+    the ratio of the variance of the stars' scatter to the variance of their noise. Each of m calibration
+    errors of one standard deviation changes each star's estimate by `apparent` (n, k, m); the first
+    `described` errors have a specified standard deviation. The estimated errors are in addition to the errors
+    `counted` (m,), in standard deviations, which the fit has already corrected.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -186,9 +186,9 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
     """Return the apparent rate changes (n, 3, m) of n stars due to m calibration errors.
 
     The apparent rate changes are in rad per exposure. Each calibration error has the size of its standard
-    deviation. Exactly known calibration parameters are omitted. The last of the m errors is that of the line
-    time. A streak determines the position of its path perpendicular to the path, and its ends determine the
-    length.
+    deviation. Exactly known calibration parameters are omitted. The last of the m errors is the error of the
+    line time. A streak determines the position of its path perpendicular to the path, and its ends determine
+    the length.
     """
     errors = _error_root(camera)
     n = len(scene.stars)
@@ -290,7 +290,8 @@ def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
     from the navigation filter. For a rate that changes linearly, the intensity along a path is proportional
     to 1/sqrt(s) at a distance of s px from the point of rest. A rotation that reverses covers the first part
     of the path twice, which doubles the intensity there. If the durations before and after the reversal are
-    equal, the intensity equals that of a motion from rest, and the pixels do not distinguish the two motions.
+    equal, the intensity equals the intensity of a motion from rest, and the pixels do not distinguish the two
+    motions.
     """
     motion, change = scene.motion, scene.motion.relative_acceleration
     if abs(change) < _NEAR_REST or motion.higher_terms.any():
@@ -451,9 +452,9 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
 class _LensEffect:
     """Effect of calibration errors on the rotation over the exposure, as in `CalibrationCorrection`.
 
-    The correction `step` (3,), rad, and the covariances (3, 3), rad^2, are those of the rotation vector. The
-    fit has corrected the calibration errors `counted` (m,), and the errors `error` (m,) remain, both in
-    standard deviations.
+    The correction `step` (3,), rad, and the covariances (3, 3), rad^2, apply to the rotation vector. The fit
+    has corrected the calibration errors `counted` (m,), and the errors `error` (m,) remain, both in standard
+    deviations.
 
     Attributes:
         spread: ratio of the variance of the stars' scatter to the variance of their noise.

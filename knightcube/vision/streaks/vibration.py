@@ -171,8 +171,8 @@ def fit_vibration(
     """Return `fit` with the vibration that its residuals show, or None if they show no vibration.
 
     The function `again` repeats the fit from a scene with a vibration, and returns None if it does not
-    succeed. If `fit` already includes a vibration, this vibration is improved. Returns None also for a
-    vibration that is too large.
+    succeed. If `fit` already includes a vibration, this vibration is improved. Returns None also if the
+    vibration is too large.
     """
     while True:
         vibration = fit.scene.motion.vibration
@@ -204,8 +204,8 @@ def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakRes
     """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
 
     The point spread function averages a vibration whose wavelength along the streaks is short. The model of
-    the streaks neglects this averaging, so that the fitted amplitudes are too small. The corresponding error
-    of the streak ends is included.
+    the streaks neglects this averaging, so that the fitted amplitudes are too small. The covariance includes
+    the corresponding error of the streak ends.
     """
     vibration = scene.motion.vibration
     if not vibration.exists or not len(left.star):
@@ -287,8 +287,8 @@ def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
 def _functions(values: FloatArray, slopes: FloatArray, at_ends: FloatArray) -> FloatArray:
     """Return n functions of time as an array (n, b, 4) of four values in each of b time bins.
 
-    The values are those of the function and its derivative in the bin, and of the function at the start and
-    at the end of the exposure.
+    The four values are the function and its derivative in the bin, and the function at the start and at the
+    end of the exposure.
     """
     ends = np.broadcast_to(at_ends[:, None], (*values.shape, 2))
     return np.concatenate([values[..., None], slopes[..., None], ends], axis=2)
@@ -351,8 +351,8 @@ def _strongest_frequency(sums: _RotationSums, known: Vibration, highest: float) 
 def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, FloatArray]:
     """Return the vibration after a Gauss-Newton step, and the covariance (3, 3), rad^2, that it adds.
 
-    The added covariance is that of the rotation over the exposure. Errors of position, rate and acceleration
-    common to all stars are estimated together with the vibration.
+    The vibration adds this covariance to the rotation over the exposure. Errors of position, rate and
+    acceleration common to all stars are estimated together with the vibration.
     """
     k, time = len(vibration.frequency), sums.time
     functions = [_powers(time), _waves(vibration.frequency, time), _detuned_waves(vibration.frequency, time)]
