@@ -390,8 +390,8 @@ def lens_accuracy(
 
     The standard deviations of focal length and centre are taken from the fit `found`, which does not include
     the omitted terms. The standard deviation of the focal length includes its difference from the fit
-    `whole`, which includes all terms. The distortion is expressed as the displacement of an image corner,
-    relative to the distance of the corner from the image centre. The standard deviation of the distortion
+    `whole`, which includes all terms. The distortion is expressed as the displacement of an image corner, as
+    a fraction of the distance of the corner from the image centre. The standard deviation of the distortion
     includes the uncertainty of the fit with all terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma

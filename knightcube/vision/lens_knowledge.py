@@ -46,7 +46,7 @@ _CAUCHY = 2.385
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
 """Median length of a residual of unit variance per axis (Rayleigh distribution)."""
 _MIN_SPREAD = 1e-12
-"""Minimum eigenvalue of the information matrix of a frame's attitude, relative to its trace."""
+"""Minimum eigenvalue of the information matrix of a frame's attitude, as a fraction of its trace."""
 _MIN_INDEPENDENCE = 1e-10
 """Minimum eigenvalue of the information matrix of the lens, normalised to a unit diagonal."""
 _MIN_COSINE = 0.05
@@ -310,7 +310,7 @@ _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
 _SECOND_TERM = 1.0 / 3.0
 """Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
 _FOURTH_LEFT = 0.058
-"""RMS error of the approximation of a fourth power by a constant and a quadratic term."""
+"""RMS error, over the image, of the approximation of a fourth power by a constant and a quadratic term."""
 _PSF_PRIOR, _PSF_NOISE = 0.3, 0.05
 """Relative standard deviations of the configured point-spread width, and of the width measured in a frame."""
 _DRIFT = 0.02

@@ -10,7 +10,7 @@ otherwise its mean over all nadir directions is used.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if one
 string fails in any way. The magnetic field does not determine the rotation about the field direction. The
-estimator therefore tries rotations by all angles about the field direction, and predicts for each the
+estimator therefore tests rotations by all angles about the field direction, and predicts for each the
 illumination of the strings by Sun and Earth. A trial rotation is possible if no string contradicts it, or if
 a single string contradicts it and this string is the same in all readings. Between readings, the possible
 rotations are propagated with the gyro. The covariance of the attitude includes all possible rotations
@@ -238,7 +238,7 @@ class StringFix:
 
 
 class FieldAndStrings:
-    """Attitude estimator that keeps track of the possible rotations about the magnetic field.
+    """Attitude estimator that stores which rotations about the magnetic field are possible.
 
     The text `wrong` describes a fault that the last reading shows, or is empty.
     """

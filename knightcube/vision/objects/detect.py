@@ -312,14 +312,14 @@ _FEW_PATHS = 2
 _GOOD_FIT = 1.4
 # Upper limit of chi-square per pixel along a uniform streak (three standard deviations for 1000 pixels).
 _UNIFORM = 1.15
-# Minimum brightness of a star's path, relative to a line on the path, if the line can be part of the star.
+# Minimum ratio of the brightness of a star's path to that of a line which may be a segment of the path.
 _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided; every part must be bright enough.
 _PARTS = 12
 # Largest ratio of the excess chi-square that remains with an object to the decrease by the object:
 # for every object, and for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
-# Fraction of the required decrease of chi-square above which the light may be a part of an object's streak.
+# Fraction of the required decrease of chi-square above which light may be a segment of an object's streak.
 _PART = 0.6
 # Largest ratio of remaining excess chi-square to its decrease by an object for which ends are located.
 _HOPELESS = 4.0
@@ -438,7 +438,7 @@ class Judge:
         return self._stars_or_unclear(light)
 
     def explained(self, judged: Judgement, label: int) -> bool:
-        """Return whether stars explain all light of a region, so that it cannot contain an object as well."""
+        """Return whether stars explain all light of a region, so that the region contains no object."""
         if judged.light is None:
             return False
         return judged.light.excess(self._pixels_of(label)) < self.objects.crossing_improvement
@@ -480,7 +480,7 @@ class Judge:
 
         If a few trial stars do not explain all light of a region, stars are fitted to the region. If the
         fitted stars do not explain all light either, they are subtracted, and the brightest remaining light
-        of the region is tested. Regions whose label is in `settled` are not examined. Regions whose label is
+        of the region is tested. Regions whose label is in `settled` are not examined; regions whose label is
         in `strange` are examined first. Regions whose label is in `explained` contain only stars, and count
         as examined.
         """

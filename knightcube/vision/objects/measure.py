@@ -8,8 +8,9 @@ does not explain. A tracker over several images determines which possible object
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration
 fits the position, extent and brightness of the object, the sky level and the brightness of each star,
-weighted by the noise of the modelled light. Saturated pixels are excluded, because they would displace a
-centroid by 0.03 px. The covariance of a fit is increased if the residuals exceed the noise.
+weighted by the noise of the modelled light. Saturated pixels are excluded, because they would displace the
+fitted centroid of an object by 0.03 px. The covariance of a fit is increased if the residuals exceed the
+noise.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def _fit_object(
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
 """Largest ratio of the fitted flux of a star to the flux predicted from the catalogue."""
 _LEAST_SHARE = 0.15
-"""Minimum flux of an object relative to adjacent stars, whose modelled images have errors of about 10 %."""
+"""Minimum ratio of an object's flux to adjacent stars, whose modelled images have errors of about 10 %."""
 _APART = 1.0
 """Minimum distance (px) of an object from the nearest star; closer light may be the second star of a pair."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)

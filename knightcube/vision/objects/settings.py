@@ -28,9 +28,9 @@ class EndpointSettings:
         derivative_sigma: standard deviation of the Gaussian derivative, px.
         window_sigma: standard deviation of the Gaussian window of the structure tensor, px.
         harris_k: constant k of the Harris response (Sease, eq. (3.8)).
-        peak_relative: minimum cornerness (Harris response) of an endpoint, relative to the largest cornerness
-            of the streak. The Harris response grows with the fourth power of the brightness, so that 0.005
-            allows a brightness ratio of 3.8 between the two ends.
+        peak_relative: minimum cornerness (Harris response) of an endpoint, as a fraction of the largest
+            cornerness of the streak. The Harris response grows with the fourth power of the brightness, so
+            that 0.005 allows a brightness ratio of 3.8 between the two ends.
         intensity_half_width: half-width of the window of the centre of intensity, px (N in Sease, eq.
             (3.15)).
         centre_of: image whose centre of intensity locates an endpoint: the Harris response ("response") or,

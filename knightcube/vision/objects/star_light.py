@@ -252,7 +252,7 @@ class StarLight:
     def _lit(
         self, curve: FloatArray, parts: FloatArray, ends: FloatArray, among_stars: bool, label: int
     ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, FloatArray] | None:
-        """Return the bright part of a curve and the pixels near the curve, or None if the curve is dark.
+        """Return the bright interval of a curve and the pixels near the curve, or None if the curve is dark.
 
         The results are the fractions of the path at which its light begins and ends (2,), their standard
         deviations (2,), px, the pixels (p, 2), their counts without known stars (p,), and their weights (p,).
@@ -484,7 +484,7 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
     """
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal / scale / scale[:, None]
-    # The ridge keeps the equations regular if images are equal or empty.
+    # The regularisation keeps the equations invertible if images are equal or empty.
     scaled.reshape(-1)[:: len(scale) + 1] += _RIDGE
     # LAPACK is called directly, because the argument checks of numpy take longer than the routines.
     factor, failed = lapack.dpotrf(scaled, lower=1)

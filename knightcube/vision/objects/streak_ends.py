@@ -306,7 +306,7 @@ def _harris_corners(segmented: Segmented, settings: EndpointSettings) -> list[Fl
 _Kernels = tuple[FloatArray, FloatArray, FloatArray]
 """Kernels: Gaussian normal to the gradient, Gaussian derivative, and Gaussian window of the tensor."""
 _Limits = tuple[float, float, int]
-"""Harris constant k, minimum relative response of a corner, and half-width of the centre of intensity, px."""
+"""Harris constant k, minimum response of a corner (fraction), half-width of the centre of intensity (px)."""
 
 
 def _corners_of_regions_numpy(

@@ -1,9 +1,9 @@
 """Paths of stars and objects in an image during an exposure, and the images of their streaks.
 
-A streak is the light of a point that moves along its path at a constant rate. The camera's point spread
-function (PSF) is a Gaussian. The image of a nearly straight streak is the product of its profiles across and
-along the path. The image of any other streak is the sum of the images of the points of its path. The
-functions that the search for objects calls most have a numpy form and a compiled form
+A streak is the image of a point source that moves along its path at a constant rate. The camera's point
+spread function (PSF) is a Gaussian. The image of a nearly straight streak is the product of its profiles
+across and along the path. The image of any other streak is the sum of the images of the points of its path.
+The functions that the search for objects calls most have a numpy form and a compiled form
 (`knightcube.compiled`).
 """
 
@@ -692,7 +692,7 @@ def fitted_line(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: 
 def _sum_line(
     light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float, sums: FloatArray
 ) -> None:
-    """Set `sums` (6, 5) to the products of the images of `line_image`, and in the last row with the light."""
+    """Set `sums` (6, 5) to the products of the images of `line_image`, in the last row with the pixels."""
     rows, columns = light.shape
     width = math.sqrt(sigma**2 + 1.0 / 12.0)
     reach = 4.0 * width
@@ -724,7 +724,7 @@ def _sum_line(
 
 @loop_helper
 def _set_pixel_of_line(s: float, n: float, width: float, length: float, image: FloatArray) -> None:
-    """Set `image` (5,) to the light of `line_image` at one pixel, s px along and n px across the line."""
+    """Set `image` (5,) to the values of `line_image` at one pixel, s px along and n px across the line."""
     profile = _bell(n / width) / (width * length)
     a, b = s / width, (s - length) / width
     covered, bell_a, bell_b = 1.0, 0.0, 0.0

@@ -119,7 +119,7 @@ _WORST_FIRST = 12.0
 _CROWDED = 0.05
 # Chi-square explained by the best fit below which a frame of blended stars is scanned completely.
 _BEYOND_CROWD = 100_000.0
-# Largest excess chi-square of a well-fitted star, relative to the star's squared significance.
+# Largest excess chi-square of a well-fitted star, as a fraction of the star's squared significance.
 _MOST_RESIDUAL = 0.01
 # Upper limit of a star's significance (standard deviations) in the chi-square that a fit explains.
 _ENOUGH = 200.0
@@ -787,7 +787,7 @@ def _has_angle(rotation: FloatArray, angles: list[float]) -> bool:
 def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candidate:
     """Return the motion of the joint fit that starts from the preliminary fit `first`.
 
-    If the joint fit does not succeed, the motion has the verdict REJECTED. A rejected motion is fitted again
+    If the joint fit does not succeed, the motion is marked as REJECTED. A rejected motion is fitted again
     with a vibration if its residuals show one.
     """
     last, found = _candidate(camera, seen, first)

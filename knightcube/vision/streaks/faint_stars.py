@@ -197,7 +197,8 @@ class RunningSums:
         count: number of samples on the detector in each running sum (r, c).
         span: first and last column of each circle on the detector (r, 2), or -inf and inf if the samples on
             the detector are not contiguous.
-        excess: noise of the running sums on each circle, relative to the noise for independent samples (r,).
+        excess: ratio (r,) of the noise of the running sums on each circle to the noise for independent
+            samples.
     """
 
     light: Float32Array
@@ -390,7 +391,7 @@ _SHARP_STEP = 3
 _SHARP_FROM = 40.0
 # Minimum second difference of a star's filter response, in standard deviations of its noise.
 _SHARP_SIGMAS = 6.0
-# Minimum second difference of a star's filter response, relative to the response.
+# Minimum second difference of a star's filter response, as a fraction of the response.
 _SHARP_SHARE = 0.3
 # Minimum fraction of the response at a star's peak that must remain after stronger peaks are subtracted.
 _OWN_SHARE = 0.45
@@ -404,7 +405,7 @@ _NEIGHBOURS = sorted(
 
 # Number of entries of the table `_PROFILE` per px of distance from the star.
 _PER_PX = 50.0
-# Filter response to a star, relative to its maximum, as a table by the distance of a circle from the star.
+# Table of the filter response to a star, as a fraction of its maximum, by distance of a circle from the star.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 

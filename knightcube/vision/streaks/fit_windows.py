@@ -45,7 +45,7 @@ _CROSSING_SAMPLES = 17
 # Ratio of a star's speeds along rows and columns at which its path is divided.
 # With a ratio of 1, all pixels on a diagonal border between two parts could be omitted.
 _DIAGONAL = 1.03
-# Number of instants at which the direction of part of a path is evaluated.
+# Number of instants at which the direction of a segment of a path is evaluated.
 _DIRECTION_INSTANTS = 7
 # Lower limit of the cosine between a path and the normal of a line of pixels beyond the end of the path.
 _MOST_BENT = 0.5
@@ -582,8 +582,8 @@ def _strips_and_patches(
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return start and end times of the fast part (n, 2) and of the slow part (n, 2) of each star's path.
 
-    The slow part of a path is at that end of the exposure at which the rate is smaller. If a path has no fast
-    part or no slow part, the start and end times of the missing part are equal.
+    The slow part of a path is at the end of the exposure with the smaller rate. If a path has no fast part or
+    no slow part, the start and end times of the missing part are equal.
     """
     motion = scene.motion.smooth
     if motion.constant or not motion.rotation.any():

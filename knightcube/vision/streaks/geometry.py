@@ -737,7 +737,7 @@ class Course:
     """Rotation over the exposure as a polynomial in time, predicted from gyro and commanded torque.
 
     The pixels of the frame determine the rate and the linear change of the rate. Higher-order terms, for
-    example of a step of the rate, are better known from the navigation filter and are held fixed in the fit.
+    example of a step of the rate, are better known from the navigation filter and are not fitted.
 
     The `terms` (k, 3), rad, are the coefficients of t, t^2, ... in the rotation vector since mid-exposure, in
     camera axes. The standard deviation `sigma`, rad, is that of the rate, multiplied by the exposure.
@@ -779,7 +779,7 @@ class StreakScene:
         width: standard deviation of the PSF convolved with a pixel, px.
         stars: positions of the n stars at mid-exposure (n, 2), px.
         light: flux of each star over the exposure (n,), counts.
-        sky: sky level around each star relative to the frame's background (n,), counts per pixel.
+        sky: sky level around each star minus the frame's background (n,), counts per pixel.
         trusted: mask (n,) of the stars that contribute to the fit of motion and PSF width.
     """
 

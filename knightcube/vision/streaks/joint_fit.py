@@ -608,7 +608,7 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     return replace(scene, motion=motion, stars=moved)
 
 
-# Largest change of the rate relative to the mid-exposure rate; it is 2 for a motion from or to rest.
+# Largest ratio of the rate's change to the mid-exposure rate; the ratio is 2 for a motion from or to rest.
 _MOST_CHANGE = 2.2
 # Deviation (standard deviations) from the majority above which a star is excluded from the motion fit.
 _TRUST_SIGMAS = 3.5

@@ -45,7 +45,7 @@ _UNRESOLVED = 0.1
 _AT_ONCE = 128
 # Prior standard deviation (px) of a star's position, for streaks with both ends outside the frame.
 _LOOSE = 30.0
-# Prior standard deviation (counts) of the sky level around a star, relative to the background.
+# Prior standard deviation (counts) of the difference between the sky level at a star and the background.
 _SKY = 3.0
 PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
 """Prior information, as inverse variances, on the parameters (ALONE,) of a star: x, y, flux and sky level."""
@@ -554,7 +554,7 @@ _CONVERGED = 1e-2
 _NONE = np.zeros(0, np.int64)
 _NO_LIGHT = np.zeros(0, np.float32), np.zeros((1, 0), np.float32)
 _NO_CROWD = SharedPixels(_NONE, np.zeros((0, 1, 1)), _NONE, _NONE, *_NO_LIGHT)
-"""The shared pixels, without elements, of stars that do not share pixels."""
+"""Empty `SharedPixels` for stars that do not share pixels."""
 _Crowds = tuple[SharedPixels, SharedPixels]
 
 
@@ -766,9 +766,9 @@ def _add_scaled(total: Any, factor: Any, values: Any) -> None:
         total[k] += factor * values[k]
 
 
-# Fisher information of a star, relative to the most informative star, below which the star is ignored.
+# Fisher information, as a fraction of that of the most informative star, below which a star is ignored.
 _NOTHING = 1e-9
-# Smallest used eigenvalue of a star's information matrix, relative to its largest eigenvalue.
+# Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.
 _KNOWN = 1e-4
 # Minimum effective number of stars (smaller for unequal weights) for an estimate of their scatter.
 _LEAST_EFFECTIVE = 2.0

@@ -127,7 +127,7 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # The part near the patch is extended by one sample; a path that is never near is divided completely.
+    # The path near the patch is extended by one sample; a path that is never near is divided completely.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -379,7 +379,7 @@ def _exponential(exponents: FloatArray, bits: IntArray, out: FloatArray) -> None
     """Compute the exponential `out` (k,) of non-positive exponents (k,), which are overwritten.
 
     The power of two is written as the exponent `bits` of `out`, which shares its memory with `bits`. The
-    relative error is below 1e-9. Exponents below -80 are replaced by -80.
+    relative error of the result is below 1e-9. Exponents below -80 are replaced by -80.
     """
     for k in range(len(bits)):
         exponent = max(exponents[k], -80.0)

@@ -61,7 +61,7 @@ class LikelihoodSettings:
         worst_displacement: largest rms displacement across the streaks, px, with which a motion is accepted
             in spite of a large misfit.
         worst_shaking: largest accepted vibration common to all streaks, as displacement across the streaks
-            (px) or as relative change of brightness along them.
+            (px) or as change of brightness along them (fraction).
         worst_uncertainty: largest accepted standard deviation of the rate from model errors, as a fraction of
             the rate.
         sign_sigmas: minimum significance (standard deviations) of the prior rate along the rotation axis, for

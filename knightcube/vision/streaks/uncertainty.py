@@ -397,7 +397,7 @@ class RotationUncertainty:
         rotation: rotation vector (3,), corrected for significant calibration errors, rad.
         covariance: covariance (3, 3) of `rotation`, rad^2.
         model_error: uncertainty from model errors, as a fraction of the rotation. If the type of shutter is
-            unspecified, its uncertainty is included only in the covariance.
+            unspecified, the uncertainty of the line time is included only in `covariance`.
         common_motion: deviation from the smooth motion that is common to all streaks, such as vibration.
         aside: displacement of streaks across their paths that would explain the residuals, px.
     """

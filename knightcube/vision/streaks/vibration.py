@@ -119,8 +119,8 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
 def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
     """Return the rms displacement common to all stars, or 0 if it is not significant.
 
-    The gradients `score` (m, 2) and `information` (m,) of m lines of pixels are summed over each star and
-    time bin, whose combined indices are `cell` (m,).
+    The gradients `score` (m, 2) and `information` (m,) of m lines of pixels are summed for each pair of a
+    star and a time bin; `cell` (m,) is the index of the pair.
     """
     size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
     if size < 2 * _BINS:
