@@ -82,7 +82,7 @@ class PidController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the current command for the given state. The estimated disturbance is checked but not used.
+        """Return the current command for the given state. The estimated disturbance is not used.
 
         Raises UsageError if an input is not finite.
         """
@@ -166,7 +166,7 @@ class AdaptiveController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the current command for the given state. The estimated disturbance is checked but not used.
+        """Return the current command for the given state. The estimated disturbance is not used.
 
         Raises UsageError if an input is not finite.
         """

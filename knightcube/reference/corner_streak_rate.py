@@ -267,7 +267,7 @@ def fit_rotation(
 def _consensus(
     endpoints: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Return flags (n,) of streaks with reversed ends, and flags (n,) of streaks that agree approximately."""
+    """Return flags (n,) of streaks with reversed ends, and of streaks that agree with a common rotation."""
     vectors = pinhole.unit_vectors(endpoints)
     length = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1)
     allowed = np.maximum(settings.axis_tolerance, settings.outlier_sigmas * sigma)
@@ -516,7 +516,7 @@ def solve_ends(
     If the streaks cannot be identified, the streak result is returned unchanged. The covariance of the rate
     is not changed, because it already describes the errors of the streak ends along and across the streaks.
     """
-    # The streaks are put in order of increasing error.
+    # The streaks are sorted by their expected error, the smallest first.
     used = np.flatnonzero(found.used)
     used = used[np.argsort(found.sigma[used], kind="stable")]
     sigma = found.sigma[used]

@@ -9,7 +9,7 @@ pseudo-inverse. The method assumes that the image has no distortion and that the
 flat detector, which is valid near the optical axis only. Meller et al. do not state from which side the image
 is scanned (here from the darkest border), nor how to compute nadir from the circle in the image of one
 camera. This implementation removes the lens distortion before the fit, and assumes that the point of the
-circle closest to the optical axis lies on the limb. Nadir lies on the line from this limb point to the
+circle closest to the optical axis lies on the limb. Nadir lies on the line from the assumed limb point to the
 circle's centre, at the Earth's angular radius from the limb point. The circle fit does not distinguish
 between limb and terminator.
 

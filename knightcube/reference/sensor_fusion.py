@@ -121,7 +121,7 @@ class GyroBiasFilter:
         return float(np.sqrt(np.trace(self._covariance[3:, 3:]) / 3.0))
 
     def propagate(self, turn: FloatArray, seconds: float) -> None:
-        """Rotate the attitude by the quaternion `turn` (4,), which the gyros measured within `seconds`."""
+        """Rotate the attitude by the quaternion `turn` (4,), measured by the gyros over `seconds`."""
         step = np.eye(6)
         step[:3, :3] = attitude_matrix(turn)
         step[:3, 3:] = -seconds * np.eye(3)
@@ -154,7 +154,7 @@ class GyroBiasFilter:
 
 
 class SeparateDetermination:
-    """Attitude determination by cameras and magnetometer, which passes the fused attitude to the filter."""
+    """Attitude determination by cameras and magnetometer; the fused attitude is the input of the filter."""
 
     def __init__(self, filter_: GyroBiasFilter) -> None:
         self._filter = filter_

@@ -1,11 +1,11 @@
 """Classical methods of star identification (Michalski, section 3.2), for comparison with the default method.
 
 Each method (`METHODS`) proposes candidates, which assign guide stars to some observed stars and thereby
-define an attitude. The number of bright observed stars that are close to guide stars is counted for the
-attitude of each candidate. The candidates with the most of these stars are verified with all observed stars
-by `knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is
-uncertain, the identification is tried at several scales (`ScaledField`). The function `match_images`
-determines the attitude of identified stars by image matching.
+define an attitude. For each candidate attitude, the bright observed stars that are close to guide stars are
+counted. The candidates with the highest counts are verified with all observed stars by
+`knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is uncertain,
+the identification is tried at several scales (`ScaledField`). The function `match_images` determines the
+attitude of identified stars by image matching.
 
 - Angle matching: The triangles of the brightest observed stars are processed in order of brightness
   (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars whose angles
@@ -240,7 +240,7 @@ def search(
 def _best(
     view: ScaledField, sky: KnownSky, candidates: Candidates, taken: int, settings: ClassicalSettings
 ) -> StarMatch | None:
-    """Return the first verified candidate among the `taken` candidates with the highest support."""
+    """Return the first of `taken` candidates, in order of matching stars, that passes the verification."""
     if not taken:
         return None
     observed, star = candidates.observed[:taken], candidates.star[:taken]
@@ -435,7 +435,7 @@ def _triangle_matches(
     """Return the guide star triangles in a table that match observed triangles (t, 3)."""
     # The area of a triangle is proportional to scale^2, and the polar moment to scale^4.
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
-    # The limits are widened by the rounding of the table's values to float32.
+    # The limits are widened by the rounding error of the float32 values in the table.
     reach = reach + 1e-7 * found.area
     # Flat triangles are excluded, because their areas are too uncertain.
     usable = np.flatnonzero(reach < 0.2 * found.area)
@@ -542,7 +542,7 @@ def propose_grids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings)
 class StarMotion:
     """Time derivatives (n, 3) of the directions of observed points in the camera frame, 1/s.
 
-    The standard deviations (n,) of these velocities are per axis.
+    The standard deviations `sigma` (n,) of the velocities are per axis, 1/s.
     """
 
     velocity: FloatArray
@@ -671,8 +671,8 @@ DEFAULT_METHOD = "default"
 class Method:
     """Method of star identification, with its publication.
 
-    The function identifies the stars of a field by comparison with the guide star tables of the sky. The
-    methods other than the default method raise FieldUnknown if the image scale is too uncertain.
+    The function `identify` compares the stars of a field with the guide star tables of the sky. The methods
+    other than the default method raise FieldUnknown if the image scale is too uncertain.
     """
 
     identify: Callable[[StarField, KnownSky], StarMatch]
@@ -682,7 +682,7 @@ class Method:
 def method_of(name: str) -> Callable[[StarField, SkyIndex], StarMatch]:
     """Return an identification function of the method `name` for use in `SolveSettings`.
 
-    The function builds new tables of the sky for each field.
+    The returned function builds new tables of the sky for each field.
     """
     method = METHODS[name]
 
@@ -729,8 +729,8 @@ def match_images(
 
     A tilt of the camera moves stars far from the boresight by more than stars at the boresight. The error of
     the closed form is therefore proportional to the error of the prior attitude and to the squared field
-    angle. Each further step projects the stars with the newest attitude and removes most of the remaining
-    error: four steps reduce a prior error of 1 deg in a 20 deg field to less than 0.01".
+    angle. Each further step projects the stars with the newest attitude, which removes most of the remaining
+    error. Four steps reduce a prior error of 1 deg in a 20 deg field to less than 0.01".
 
     Raises AttitudeError if the attitude is undetermined, or if a star is behind the camera according to the
     prior attitude.

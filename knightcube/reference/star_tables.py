@@ -5,11 +5,11 @@ between the stars, stored as float32 with a rounding error of at most 0.003" for
 are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary search
 (Mortari & Neta, K-vector range searching techniques, 2000). A k-vector approximates the sorted keys by a
 straight line, and contains, for evenly spaced values on the line, the number of keys below each value. Two
-look-ups then give the beginning and end of a range of keys, which is half-open (low <= key < high). Equation
-61 of Michalski also returns some keys just outside the range; this implementation compares the keys in the
-two boundary cells with the limits. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in the
-original paper, so that the straight line ends above the largest key. The margin 2.22e-16 in equation 56 of
-Michalski is replaced by a margin proportional to the magnitude of the keys.
+look-ups in the k-vector give the beginning and end of a range of keys, which is half-open (low <= key <
+high). Equation 61 of Michalski also returns some keys just outside the range; this implementation compares
+the keys in the two boundary cells with the limits. Equation 54 of Michalski is corrected to 2 delta-epsilon,
+as in the original paper, so that the straight line ends above the largest key. The margin 2.22e-16 in
+equation 56 of Michalski is replaced by a margin proportional to the magnitude of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -451,7 +451,7 @@ class GridTable:
 
 
 def build_grid(direction: FloatArray, tree: cKDTree, radius: float) -> GridTable:
-    """Return the table of the grid patterns, with a radius in rad, of all guide stars (n, 3)."""
+    """Return the table of the grid patterns of all guide stars (n, 3); the pattern radius is in rad."""
     pairs = tree.query_pairs(2.0 * np.sin(0.5 * radius), output_type="ndarray").astype(np.int64)
     centre = np.concatenate([pairs[:, 0], pairs[:, 1]])
     other = np.concatenate([pairs[:, 1], pairs[:, 0]])

@@ -59,7 +59,7 @@ def fits_image(content: bytes, name: str) -> Image:
     The image is the primary image or, if the primary image is empty, the first image extension. Integer
     pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned integers
     become unsigned. Pixels with any other BZERO or BSCALE value become float64. Three planes of colour are
-    converted to luminance. Raises UsageError for an unsupported image, with the file's `name`.
+    converted to luminance. Raises UsageError, which contains the file's `name`, for an unsupported image.
     """
     header, axes, start = _first_image(content, name)
     bits = _whole(header, "BITPIX", name)
@@ -434,8 +434,8 @@ class KeptFrames:
 def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
     """Write a frame (rows, columns) with its metadata (`facts`) to disk.
 
-    If the number of kept frames then exceeds the maximum, the oldest frames are deleted. If the frame cannot
-    be written, it is lost and no exception is raised.
+    If there are more kept frames than the maximum, the oldest frames are deleted. If the frame cannot be
+    written, it is lost and no exception is raised.
     """
     with suppress(OSError):
         kept.folder.mkdir(exist_ok=True)

@@ -304,14 +304,14 @@ class Lens:
         """Return the undistorted tangents of distorted tangents (...), or NaN beyond the fold.
 
         Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
-        that is nearer to the axis. From these initial values, Newton's method overshoots the root at most
-        once and then converges from one side.
+        that is nearer to the axis. From both initial values, Newton's method overshoots the root at most once
+        and then converges from one side.
         """
         k1, k2 = self.k1, self.k2
         if k1 == k2 == 0.0:
             return stretched
         seen = stretched < self._limit()
-        # A NaN is replaced by 0, because it would keep the iteration from converging.
+        # NaN is replaced by 0, because NaN would keep the iteration from converging.
         target = np.where(seen, stretched, 0.0)
         inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
         radius = np.minimum(target, inflection)

@@ -105,8 +105,8 @@ class ScanLines:
 class ImagePart:
     """A rectangle of an image in which a second search finds edges on more scan lines.
 
-    The lowest and highest (x, y) are the `box` (2, 2), px. The brightness levels are those of the whole
-    image.
+    The rows of `box` (2, 2) are the lowest and the highest (x, y), px. The brightness levels are those of the
+    whole image.
     """
 
     box: FloatArray
@@ -374,7 +374,7 @@ class Samples:
         mottle: texture of the image at each sampled pixel (m,), measured by the second difference of `level`
             along the scan line. The second difference is divided by 6^0.5, so that white noise has the same
             standard deviation in `mottle` and in `level`.
-        noise: standard deviation of `level` from the noise of the dark pixels.
+        noise: standard deviation of `level` due to the noise of dark pixels.
         floor: dark level of the image divided by the bright level.
     """
 

@@ -1,11 +1,11 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
 The significance of a horizon is an upper bound on the expected number of equally good horizons that other
-edges, such as coasts and the borders of clouds, form by chance. The density of these chance edges is
-estimated from the number of edges beside the limb. A coast or the border of a cloud with the radius of
-curvature R, tangent to the limb, stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan
-lines that cross the same segment of a coast or cloud are not independent. The test therefore counts limb
-segments of the length 2 sqrt(2 g R) instead of scan lines.
+edges, such as coasts and the borders of clouds, form by chance. The density of chance edges is estimated from
+the number of edges beside the limb. A coast or the border of a cloud with the radius of curvature R, tangent
+to the limb, stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the
+same segment of a coast or cloud are not independent. The test therefore counts limb segments of the length 2
+sqrt(2 g R) instead of scan lines.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
-"""Minimum cosine of the angle between scan line and limb normal. Oblique scan lines are inaccurate."""
+"""Minimum cosine of the angle between scan line and limb normal. Edges at smaller cosines are inaccurate."""
 _LOWEST_SUN = np.radians(1.0)
 """Minimum elevation of the Sun (rad) at a limb point; with a lower Sun the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
@@ -144,7 +144,7 @@ _ROUND = 0.1
 _BESIDE = 0.05
 """Distance from the limb within which other edges are counted, as a fraction of the image size.
 
-The number of edges gives the density of chance edges.
+The number of other edges determines the density of chance edges.
 """
 
 
@@ -152,7 +152,8 @@ The number of edges gives the density of chance edges.
 class LimbInView:
     """Length of the part of a limb in an image that should show edges, px, and crossings with scan lines.
 
-    The number of crossings is `crossings` for this part, and `all_crossings` for the whole limb in the image.
+    The number of crossings is `crossings` for the part that should show edges, and `all_crossings` for the
+    whole limb in the image.
     """
 
     length: float
@@ -166,7 +167,8 @@ def limb_in_view(
     """Return the length of a limb in the image and the number of its crossings with scan lines.
 
     The points (n, 2), px, follow the closed limb. The masks (n,) mark the points inside the image, and the
-    points at which the limb should show an edge. Scanned columns and rows are `space` px apart.
+    points at which the limb should show an edge. The distances between scanned columns and between scanned
+    rows are `space` (2,), px.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)

@@ -6,16 +6,16 @@ limb does not agree with the image. Meller et al., section 3.3, do not state how
 terminator.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
-al., section 4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere, and predicts for
-each direction that the samples on the sunlit part of the Earth's disc are bright. The coarse nadir is the
+al., section 4.1). Without a limb, `coarse_nadir` tries nadir directions that cover the sphere, and predicts
+for each direction that the samples on the sunlit part of the Earth's disc are bright. The coarse nadir is the
 mean of the trial directions, weighted by their likelihood, and the covariance is their spread. If the
 direction of the Sun is unknown, any sample on the Earth's disc may be dark, because it may be on the night
 side.
 
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
 attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night side can
-be. Possible causes are a camera that has failed, is blinded, is mounted upside down or sends random data. The
-comparison excludes samples near the limb, in the twilight zone and near the Sun.
+be. Possible causes of a contradiction are a camera that has failed, is blinded, is mounted upside down or
+sends random data. The comparison excludes samples near the limb, in the twilight zone and near the Sun.
 """
 
 from __future__ import annotations
@@ -223,8 +223,8 @@ class ImageBrightness:
 class CoarseNadir:
     """An estimated nadir (3,) in body axes, with an uncertainty of several degrees.
 
-    The covariance (3, 3), rad^2, is zero along the direction. The mean probability of the samples' brightness
-    for the most likely nadir is `explained`.
+    The covariance (3, 3), rad^2, is zero along the nadir direction. The mean probability of the samples'
+    brightness for the most likely nadir is `explained`.
     """
 
     direction: FloatArray

@@ -3,11 +3,11 @@
 All rays u to the limb of a sphere make the same angle rho with the nadir n. The limb therefore satisfies the
 equation u.g = 1, which is linear in g = n / cos rho (Christian & Robinson 2016). Two rays to the limb
 determine the nadir up to two solutions if rho is known, and three rays determine rho and the nadir. Trial
-cones are computed from all pairs of edges, or from all triples if the altitude is unknown. Of too many pairs
-or triples, an evenly spaced selection is used. An edge agrees with a cone if it lies near the cone and its
-bright side is towards nadir. The edges of the best cone are removed and the search is repeated, so that the
-terminator, a coast or a band of clouds gives a separate cone. The search is a sample consensus (Fischler &
-Bolles 1981) without random selection.
+cones are computed from all pairs of edges, or from all triples if the altitude is unknown. If there are too
+many pairs or triples, an evenly spaced selection is used. An edge agrees with a cone if it lies near the cone
+and its bright side is towards nadir. The edges of the best cone are removed and the search is repeated, so
+that the terminator, a coast or a band of clouds gives a separate cone. The search is a sample consensus
+(Fischler & Bolles 1981) without random selection.
 
 A horizon does not determine the rotation about nadir, which is needed because the Earth's flattening depends
 on the direction of the pole, and the illumination on the direction of the Sun. The rotation is derived from a
@@ -94,7 +94,8 @@ def best_cone(
     """Return the cone with which most edges in the mask `free` (n,) agree, or None if no cone can be formed.
 
     The limits `cosines` of the cosine of the cone's half-angle are equal if the angle is known. An edge
-    agrees within `tolerance` px. At most `tries` pairs or triples of edges are tried.
+    agrees with a cone if it lies within `tolerance` px of the cone. At most `tries` pairs or triples of edges
+    are tried.
     """
     chosen = np.flatnonzero(free)
     if cosines[0] == cosines[1]:

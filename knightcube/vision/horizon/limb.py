@@ -1,12 +1,12 @@
 """The Earth's limb: its direction from a camera, its brightness profile, and robust fits of both.
 
-A scaling along the axes of the Earth's ellipsoid transforms the ellipsoid into the unit sphere. The limb of
-the sphere is a circular cone about the direction of its centre. A scaled ray is a ray as well, so that a ray
-lies on the ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016,
-"Noniterative Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance, Control, and
-Dynamics 39, 2757). The residual of a ray is the angle between the scaled ray and the scaled direction of the
-centre, minus the half-angle of the limb cone. The residual of a ray is 0 on the limb and positive outside of
-the Earth. The gradient of the residuals is analytic.
+A scaling along the axes of the Earth's ellipsoid transforms the ellipsoid into the unit sphere. The rays to
+the limb of a sphere form a circular cone about the direction of the sphere's centre. A scaled ray is a ray as
+well, so that a ray lies on the ellipsoid's limb if and only if the scaled ray lies on the cone (Christian &
+Robinson 2016, "Noniterative Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance,
+Control, and Dynamics 39, 2757). The residual of a ray is the angle between the scaled ray and the scaled
+direction of the centre, minus the half-angle of the limb cone. The residual of a ray is 0 on the limb and
+positive outside of the Earth. The gradient of the residuals is analytic.
 
 The limb cone is fitted by a Gauss-Newton iteration. Huber's weights, with zero weight beyond five standard
 deviations, exclude clouds, glare and the ends of the terminator. The standard deviation of the residuals is
@@ -293,8 +293,8 @@ def shared_error(
     """Return the covariance (5, 5) of a fit's parameters due to errors common to the rays of a group.
 
     The covariance of the fit assumes independent errors of the rays (n, 3) with the standard deviations
-    `sigma` (n,), rad. Each ray belongs to one of the `groups` (n,), whose common errors have the standard
-    deviations `error` (groups,), rad.
+    `sigma` (n,), rad. The array `groups` (n,) contains the index of each ray's group. The common errors of
+    the groups have the standard deviations `error` (groups,), rad.
     """
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]

@@ -304,7 +304,7 @@ def _by_field(
     settings: HorizonSettings,
     hidden: BoolArray | None,
 ) -> tuple[list[_FieldTrial], FloatArray]:
-    """Return the best horizons at trial focal lengths, unless prior knowledge excludes them, and weights."""
+    """Return the best horizon at each trial focal length, if prior knowledge permits it, and the weights."""
     centre, width = 0.0, 1.0
     trials: list[_FieldTrial] = []
     weights = np.zeros(0)
@@ -716,7 +716,7 @@ def _joint_fit(
     """Return the nadir of one limb fitted to the limb points of all agreeing cameras."""
     most = max(numbers, key=lambda number: len(each[number].limb))
     view, camera = each[most].view, cameras[most]
-    assert view is not None  # each of these cameras has found a horizon
+    assert view is not None  # each camera in `numbers` has found a horizon
     place = place_of(knowledge, settings)
     located = place is not None and place.located
     body = replace(view, rotation=camera.to_camera.T @ view.rotation, limb_height=UNIT_DEPTH_HEIGHT)

@@ -146,7 +146,7 @@ class HorizonSettings:
         edges: settings of the search for edges.
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
             of the limb height is valid for an atmosphere of unknown scale height (6.5 to 9.5 km) and unknown
-            haze. If scale height and haze are known, 1,000 m is sufficient.
+            haze. If scale height and haze are known, a standard deviation of 1,000 m is sufficient.
         altitude_sigma: standard deviation of the altitude of a known position, m.
         altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
             would accept any bright disc as the Earth, for instance a lens ghost.

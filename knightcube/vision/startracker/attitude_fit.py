@@ -154,7 +154,7 @@ class StarMatch:
 _SETTLED = 1e-4
 _MOST_STEPS = 6
 # Minimum reciprocal condition number of the normal equations.
-# It is reached if all stars lie within 1e-6 rad of one direction.
+# Stars that all lie within 1e-6 rad of one direction reach the minimum condition number.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -181,7 +181,7 @@ class Refinement:
         return math.sqrt(self.covariance[3, 3]) if len(self.covariance) == 4 else 0.0
 
     def fix(self) -> AttitudeFix:
-        """Return the attitude and its covariance as the result type of the solvers of Wahba's problem."""
+        """Return the attitude and its covariance as an `AttitudeFix`, as solvers of Wahba's problem do."""
         turn = np.ascontiguousarray(self.covariance[:3, :3])
         return AttitudeFix(from_matrix(self.matrix), turn, 0.5 * float(self.squares.sum()))
 
@@ -459,7 +459,7 @@ def _turn(matrix: FloatArray, turn: FloatArray) -> None:
 
 
 def _summed_cross(gram: list[list[float]], at: int) -> list[float]:
-    """Return the sum over all stars of p x q; p begins at column 0 of the Gram matrix's rows, q at `at`."""
+    """Return the sum of p x q over the stars; p is columns 0 to 2 of their rows, and q begins at `at`."""
     return [gram[1][at + 2] - gram[2][at + 1], gram[2][at] - gram[0][at + 2], gram[0][at + 1] - gram[1][at]]
 
 

@@ -44,7 +44,7 @@ from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
 from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 
-# Ratio of the distance below which streaks overlap to the half-width of the strip of a bright streak.
+# Distance below which streaks overlap, in half-widths of the pixel strip around a bright streak.
 _NEAR = 1.4
 # Distance (px) below which two stars are too close to be fitted separately.
 _TWIN = 2.0
@@ -56,7 +56,7 @@ _BESIDE = 2.5
 _LIGHT_ERROR = 0.15
 # Number of stars that are subtracted from the frame in one batch.
 _AT_ONCE = 25
-# Number of instants of the exposure at which the position of a star is tested to be in the frame.
+# Number of instants of the exposure at which it is tested whether a star is in the frame.
 _INSTANTS = 9
 # Factor by which the maximum number of pixels is larger in the second fit, which includes more stars.
 _ROOM = 1.7

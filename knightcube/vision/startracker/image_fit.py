@@ -496,7 +496,7 @@ def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Se
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
     Bright points that disagree with the fit for their measured variances may agree for the larger variances.
-    The common variance is estimated again with these points. Excluded streaks remain excluded.
+    The common variance is estimated again with all points that agree. Excluded streaks remain excluded.
     """
     own = seen
     for _ in range(_AGREEMENT_ROUNDS):

@@ -104,7 +104,7 @@ def middle_sized(field: StarField, most: int) -> IntArray:
     """Return up to `most` medium-sized triangles (t, 3) of the brightest stars, in a random order."""
     triangles = triples(min(len(field), _MOST_STARS), shuffled=True)
     direction = field.direction[:_MOST_STARS]
-    # The longest side of a triangle is the pair of stars whose directions have the smallest cosine.
+    # The longest side of a triangle connects the two stars with the smallest cosine of their angle.
     cosine = (direction @ direction.T).ravel()
     shortest, longest = (2.0 * max(field.half_width) * size for size in _MIDDLE_SIZES)
     found = [triangles[:0]]
@@ -780,7 +780,7 @@ def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint16], star: npt.N
 
 @loop_helper
 def _counted_votes(code: npt.NDArray[np.uint32]) -> IntArray:
-    """Return the votes (k,) that `_votes` returns."""
+    """Return the votes (k,) of k matches, with the same result as `_votes`."""
     bits, size = 0, 3 * len(code)
     while size:
         size >>= 1

@@ -225,7 +225,7 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # The variable `gain` is minus the derivative of the weighted moment by the weight's position.
+        # The variable `gain` is minus the derivative of the moment with respect to the weight's position.
         # For a star with the same width as the weight, it is half of the weighted sum of counts.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
@@ -301,7 +301,7 @@ class WindowCentroids:
 def centre_of_mass(
     windows: StarWindows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
 ) -> WindowCentroids:
-    """Return the centroids in windows by one of `METHODS`, or the centres of mass.
+    """Return the centroids in windows, computed by one of `METHODS` or as centres of mass.
 
     The centre of mass follows Michalski, eq. (12) to (20). Pixels outside the frame count as zero.
     """

@@ -125,7 +125,7 @@ class StarTargets:
         return len(self.middle)
 
 
-# Length (px) of a star's path below which it is treated as a point. It widens a PSF of 1 px by 0.2 %.
+# Length (px) of a star's path below which the path is neglected. It widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
 # Number of quadrature nodes, for an error of 0.1 % of the flux on paths of four PSF widths.
 _NODES = 4
@@ -422,7 +422,7 @@ def _solve_numpy(
     """Fit the parameters `values` (n, 5) in place, the first `count` of which are free, and return the fits.
 
     The quadrature has m nodes with the displacements `shift` (m, n, 2), px, and the weights `share` (m,). The
-    argument `model` is the noise model.
+    argument `model` contains the photon noise and the mismatch of the noise model.
     """
     size = light.shape[1]
     # All steps share two arrays, because allocating large arrays takes more time than the arithmetic.
@@ -486,7 +486,7 @@ def _solve(
             for pixel in range(area):
                 counts[pixel] = value[FLUX] * jacobian[FLUX, pixel]
                 off[pixel] = light[star, pixel // size, pixel % size] - counts[pixel] - value[SKY]
-            # In the last steps, pixels above a limit are excluded; see `_solve_numpy`.
+            # In the last steps, pixels with residuals above a limit are excluded (see `_solve_numpy`).
             limit = _CLIP**2 if step >= steps - _CLIP_FROM_END else np.inf
             _weights(counts, off, usable, noise[star], model, limit, expected, weight)
             for i in range(count):
@@ -603,7 +603,7 @@ def _invert(normal: FloatArray, out: FloatArray) -> None:
     scale = np.empty(count)
     for i in range(count):
         scale[i] = math.sqrt(max(normal[i, i], 1e-30))
-    # Cholesky factor of the scaled matrix, then its inverse.
+    # The Cholesky factor of the scaled matrix is computed first, and is then inverted.
     factor = np.zeros((count, count))
     for i in range(count):
         for j in range(i + 1):
@@ -718,7 +718,8 @@ def neighbour_light(
 ) -> FloatArray:
     """Return the counts of all neighbours in the window of each star (n, k, k).
 
-    Each star has a middle pixel (n, 2), offset from it (n, 2), px, flux (n,), counts, and width (n,), px.
+    The stars have middle pixels (n, 2), offsets from the middle (n, 2), px, fluxes (n,), counts, and widths
+    (n,), px.
     """
     size = 2 * windows.half + 1
     out = np.zeros((len(middle), size, size))

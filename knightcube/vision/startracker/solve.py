@@ -2,7 +2,7 @@
 
 If the stars are points, the module `detect` measures their positions. If the stars are streaks, their fitted
 positions at mid-exposure are used instead. Identification first searches near a prior attitude, if there is
-one, and then in the whole sky. The resulting attitude is that at mid-exposure.
+one, and then in the whole sky. The resulting attitude refers to mid-exposure.
 
 During an exposure at a constant rate, the middle of a streak is the position of the star at mid-exposure.
 During an exposure of length T, an angular acceleration a displaces the centroid of a point by a T^2 / 24, and
@@ -210,8 +210,9 @@ _PLACELESS_PX = 5.0
 # Distance (px) below which a point may be a part of the same star as a matched point.
 _SPLIT_PX = 10.0
 # Stars are assumed to be imaged as several points each if too many points are near matched points.
-# The first limit is in standard deviations of the number of points expected by chance.
-# The second limit is a fraction of the matched points; the sum of both limits must be exceeded.
+# The limit is the number of nearby points expected by chance, plus the sum of two terms.
+# The first term is `_SPLIT_SIGMAS` standard deviations of the number of nearby points.
+# The second term is the fraction `_SPLIT_SHARE` of the matched points.
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference from the prior attitude (1 false rejection in 100,000 frames).
 _NEAR = 25.9

@@ -46,7 +46,7 @@ TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
 # Noise of a sum of pixels, relative to its value without correlation, below which correlation is neglected.
 _CORRELATED = 1.05
-# Ratio of the lower noise tail to two standard deviations below which noise is clipped at zero counts.
+# Length of the lower noise tail, divided by 2 sigma, below which noise counts as clipped at zero counts.
 _CUT_OFF = 0.8
 # Noise (counts) below which quantisation prevents a measurement of the noise.
 _HIDDEN = 0.5
@@ -474,7 +474,8 @@ class Areas:
         pixels: number of pixels of each area (n,).
         flux: sum of the counts above the background of each area (n,).
         centre: centroid of each area (n, 2), px.
-        length: length of the uniform line with the same second moments as each area, without PSF (n,), px.
+        length: length of a uniform line that, blurred by the PSF, has the same second moments as each area
+            (n,), px.
         thickness: rms width of each area across its long axis (n,), px.
         direction: angle between the long axis of each area and the rows (n,), rad.
         shape: rows and columns of the frame.

@@ -173,7 +173,7 @@ _FEW_MISSED = 0.8
 # The second value is the radius of the search for nearby stars, relative to the image corner's tangent.
 # A larger fraction indicates a wrong fit of the lens: a foreground hides stars but does not displace them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Factor (log10) between the chance matches of a candidate that is rejected without refinement and the limit.
+# Excess of log10 chance matches over the limit above which a candidate is rejected without refinement.
 _HOPELESS = 7.0
 
 

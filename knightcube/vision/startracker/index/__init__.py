@@ -190,7 +190,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the lowest star index in each star's group (count,); `pairs` (p, 2) of stars form groups."""
+    """Return the lowest star index in each star's group (count,); stars of `pairs` (p, 2) form groups."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -218,14 +218,14 @@ _BOXES = 20
 TIE = 1e-9
 """Relative tolerance for rounding errors in comparisons of a triangle's side with a limit."""
 LEAST_RATIO = 0.1
-"""Minimum ratio of the shortest to the longest side of a triangle. Flatter triangles are not distinctive."""
+"""Minimum ratio of the shortest to the longest side of a triangle. Flat triangles are not distinctive."""
 
 
 # Distance between the centres of neighbouring circles that together cover the sky, relative to their radius.
 _CIRCLES_APART = 0.7
 # Mean number of stars per circle in the first search, relative to the number of stars needed.
 _ENOUGH = 4.0
-# Mean number of stars within `least` of a star in the first comparison of `reach`, as a multiple of `rank`.
+# Mean number of compared stars within the distance `least` of a star, as a multiple of `rank`.
 _BRIGHTER = 2.0
 
 
