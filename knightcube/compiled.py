@@ -93,9 +93,9 @@ def compiled_form_of(
 ) -> Callable[[Callable[Parameters, Result]], HotFunction[Parameters, Result]]:
     """Return the decorator that combines a loop form with its numpy form.
 
-    The loop form has only positional arguments, which are arrays and numbers. It may call only numpy
-    functions that numba supports, and functions of the same module that `loop_helper` decorates. The loop
-    form must not use constants of other modules: numba compiles a cached function again only if the
+    The loop form has only positional arguments, which are arrays and numbers. The loop form may call only
+    numpy functions that numba supports, and functions of the same module that `loop_helper` decorates. The
+    loop form must not use constants of other modules: numba compiles a cached function again only if the
     function's own module changes, so the cached function would keep an outdated constant.
     """
     return lambda loop_form: HotFunction(numpy_form, loop_form)

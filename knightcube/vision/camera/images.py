@@ -59,7 +59,8 @@ def fits_image(content: bytes, name: str) -> Image:
     The image is the primary image or, if the primary image is empty, the first image extension. Integer
     pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned integers
     become unsigned. Pixels with any other BZERO or BSCALE value become float64. Three planes of colour are
-    converted to luminance. Raises UsageError, which contains the file's `name`, for an unsupported image.
+    converted to luminance. Raises UsageError, with the file's `name` in its message, for an unsupported
+    image.
     """
     header, axes, start = _first_image(content, name)
     bits = _whole(header, "BITPIX", name)

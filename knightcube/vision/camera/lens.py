@@ -399,8 +399,8 @@ class CameraKnowledge:
         line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
             of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
         covariance: covariance (5, 5) of relative focal length, optical axis along x and y, distortion and
-            line time, in the units above, if the lens parameters were estimated from frames. If the
-            covariance is None, the errors are independent.
+            line time, in the units of the other attributes, if the lens parameters were estimated from
+            frames. If the covariance is None, the errors are independent.
     """
 
     focal_length: float = 0.0

@@ -299,7 +299,7 @@ def shared_error(
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
     inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
-    assert inverse is not None  # the fit has already solved these equations, so that they are not singular
+    assert inverse is not None  # the fit has solved the same equations, so they are not singular
     moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
     return np.asarray((moved * (error**2)[:, None]).T @ moved)
 

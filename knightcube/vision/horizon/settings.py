@@ -148,8 +148,8 @@ class HorizonSettings:
             of the limb height is valid for an atmosphere of unknown scale height (6.5 to 9.5 km) and unknown
             haze. If scale height and haze are known, a standard deviation of 1,000 m is sufficient.
         altitude_sigma: standard deviation of the altitude of a known position, m.
-        altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
-            would accept any bright disc as the Earth, for instance a lens ghost.
+        altitudes: range of an unknown altitude, m. The default range of altitudes covers low orbits. An
+            unlimited range would accept any bright disc as the Earth, for instance a lens ghost.
         tolerance: largest distance of an edge from a horizon's circular cone, px; it includes the Earth's
             flattening.
         least_edges: minimum number of edges on a horizon.

@@ -602,7 +602,7 @@ def _distorted_fit(
 ) -> tuple[_DistortedPose, FloatArray, FloatArray] | None:
     """Return a fit of attitude, scale and distortion, its normal matrix (5, 5) and chi-squares (k,).
 
-    The normal matrix includes the prior of the distortion. Each chi-square is that of one matched star.
+    The normal matrix includes the prior of the distortion. There is one chi-square for each matched star.
     """
     direction, reference = field.direction[observed], sky.stars.direction[star]
     weight = 1.0 / (field.sigma[observed] * pose.scale)

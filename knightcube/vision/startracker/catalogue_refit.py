@@ -75,8 +75,8 @@ def refit_with_catalogue(
 ) -> FrameSolution:
     """Return a solution with motion and attitude fitted again, or the same solution if the new fit fails.
 
-    The arguments are those of the first solution. A solution with a fitted focal length is returned
-    unchanged.
+    The other arguments must be those with which `solution` was computed. A solution with a fitted focal
+    length is returned unchanged.
     """
     motion, fix = solution.motion, solution.fix
     if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:

@@ -417,7 +417,7 @@ def _write_slopes(
     if scale:
         slope[0, 3], slope[1, 3], slope[2, 3] = x * z * z, y * z * z, z * z * z - z
         last = 4
-    for k in range(bends):  # in the order of `bend_slope`
+    for k in range(bends):  # the lens errors are in the order of `bend_slope`
         if k in (0, 1, 4, 5):
             along = (tx, ty, 0.0, 0.0, square, square * square)[k]
             slope[0, last] = along * x * z * z

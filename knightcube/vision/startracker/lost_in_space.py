@@ -780,7 +780,7 @@ def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint16], star: npt.N
 
 @loop_helper
 def _counted_votes(code: npt.NDArray[np.uint32]) -> IntArray:
-    """Return the votes (k,) of k matches, with the same result as `_votes`."""
+    """Return the votes (k,) of k matches, as `_votes` does."""
     bits, size = 0, 3 * len(code)
     while size:
         size >>= 1

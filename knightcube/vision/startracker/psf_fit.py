@@ -154,7 +154,7 @@ def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
     """Return the nodes of a quadrature along the paths of n stars, with their weights.
 
     Each quadrature node is a displacement of the stars from the midpoints of their paths (n, 2), px. The
-    lengths and directions of the paths are those of `trail` (n, 2), px.
+    vectors `trail` (n, 2), px, lead from the start to the end of each path.
     """
     if not len(trail) or float(np.abs(trail).max()) < _SHORTEST:
         return [(np.zeros_like(trail), 1.0)]

@@ -201,7 +201,7 @@ class SkyMap:
         """Return the ICRS directions of pixels (n, 2), as unit vectors (n, 3)."""
         rays = self.camera.unit_vectors(self._exchanged(points))
         seen = bent(rays, self.bend) @ attitude_matrix(self.quaternion)
-        # Aberration is inverted by the opposite velocity, accurate to (v/c)^2 or 0.002".
+        # The aberration for the opposite velocity inverts the aberration to within (v/c)^2 or 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:
