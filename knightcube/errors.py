@@ -32,7 +32,7 @@ class InputError(UsageError):
 class PlanningError(FlightError):
     """Error raised if a planner finds no path from start to goal within its limits.
 
-    The message states the reason.
+    The message states why the planner finds no path.
     """
 
 

@@ -11,27 +11,32 @@ attitude of identified stars by image matching.
   (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars whose angles
   match two sides of a triangle are joined if the pairs share a star. Two joined pairs are a candidate if the
   angle of the third side matches as well.
+
 - Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
   define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
   & Crassidis 2004 and 2006). Triangles in this range are candidates if their polar moments and side lengths
   also match. If several triangles match, the published methods pivot to a neighbouring triangle, while this
   implementation tests all matching triangles.
+
 - Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
   limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
   Navigation 51, 2004). Only triangles that a fourth observed star confirms are candidates, because a matching
   fourth star makes chance matches rare.
+
 - Rate matching: Two frames, or the ends of streaks, give the velocity of each observed point (Michalski,
   section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification algorithms, IEEE TAES 41,
   2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars, unlike satellites,
   aircraft and hot pixels. The position of each star is predicted from a previous attitude, which is
   propagated by the body rate. Without a previous attitude, the pyramid method identifies the remaining
   points.
+
 - Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
   one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
   Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because otherwise guide stars
   in dense regions of the sky would get the most votes if the noise exceeds 0.3 px. In a second vote, two
   assignments with many votes vote for each other if the angle between their guide stars agrees with the angle
   between their observed stars. The largest group of consistent assignments is the candidate.
+
 - Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting
   the cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33,
   1997). Several neighbouring stars are tried as the star that defines the orientation, because a neighbouring

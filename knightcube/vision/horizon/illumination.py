@@ -131,7 +131,7 @@ _LEAST_SKY = 8
 _DIM_AIR = 30e3
 """Height (m) above the limb at which the atmosphere has 3 % of its maximum brightness.
 
-The height is used for images that do not show enough sky above `_ATMOSPHERE`.
+The height of 30 km is used for images that do not show enough sky above `_ATMOSPHERE`.
 """
 _CLEAR = 24.0
 """Distance from the limb (px) beyond which the pixels averaged in a sample do not image the Earth."""

@@ -378,10 +378,10 @@ def measure_near(
     """Return the stars near predicted positions, the brightest first.
 
     Only windows around the predictions (m, 2), px, are read; predictions outside the frame are ignored. A
-    prediction gives a star only if a peak within the search radius exceeds the threshold. A peak near several
-    predictions is assigned to the nearest prediction. During the exposure, each star moves by `trail` (m, 2),
-    px, at most a few pixels. Raises ValueError unless pixels and predictions are finite real numbers and the
-    frame has at least 16 x 16 pixels.
+    star is detected at a prediction only if a peak within the search radius exceeds the threshold. A peak
+    near several predictions is assigned to the nearest prediction. During the exposure, each star moves by
+    `trail` (m, 2), px, at most a few pixels. Raises ValueError unless pixels and predictions are finite real
+    numbers and the frame has at least 16 x 16 pixels.
     """
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)

@@ -478,7 +478,7 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
         squares = seen.squares(pose)
-    # A star agrees if its residual is within the scatter of the majority.
+    # A star agrees with the fit if its residual is within the scatter of the majority of stars.
     # All stars are used if too few stars agree.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
