@@ -2,8 +2,8 @@
 
 The emulated buses and lines implement the same Protocols as those on Linux, so simulated flights exercise the
 flight drivers. The body is held still at its initial attitude until its release. The modules of cameras and
-orbit devices are imported only where they are used, because their import takes half a second and a testbed
-flight does not need these modules.
+orbit devices are imported only in the functions that use them, because the import takes half a second and a
+testbed flight needs neither cameras nor orbit devices.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     scene = EarthScene(position, attitude, sun_position(julian_date))
     frame = render(model, scene, generator)
 
-Radiance is stated relative to that of a white Lambertian surface with the Sun at the zenith, so the radiance
+The unit of radiance is the radiance of a white Lambertian surface with the Sun at the zenith, so the radiance
 of the Sun's disc is 46,000.
 
 The air density decreases exponentially with height. Single scattering of sunlight in the air produces the
@@ -110,10 +110,10 @@ class Atmosphere:
         """Return the fraction of sunlight scattered along lines of sight, without the phase function.
 
         `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
-        line's lowest point, relative to the ground. `sunward` (...) is the optical depth towards the Sun,
-        from the ground below the line of sight. The scattered light comes from the air above the point where
-        the optical depth along the line reaches one. The transmission of sunlight is averaged over the
-        scattering air.
+        line's lowest point, divided by the density at the ground. `sunward` (...) is the optical depth
+        towards the Sun, from the ground below the line of sight. The scattered light comes from the air above
+        the point where the optical depth along the line reaches one. The transmission of sunlight is averaged
+        over the scattering air.
         """
         x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)
         return np.asarray(np.expm1(-depth) * np.expm1(-x) / x)
@@ -290,7 +290,7 @@ _DARKEST = -0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarthIntersection:
-    """First intersections of n lines of sight with the Earth's ellipsoid, or the points nearest to it.
+    """First intersections of n lines of sight with the Earth's ellipsoid, or their nearest points to it.
 
     The heights (n,), m, are 0 for lines that meet the ground and infinite for lines that point away from the
     Earth. The points `places` (n, 3) are in Earth-fixed axes that are scaled so that the ellipsoid is the
@@ -342,7 +342,7 @@ def near_earth(scene: EarthScene, rays: Float32Array) -> IntArray:
 def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> Float32Array:
     """Return the radiance (n,) along unit `rays` (n, 3) in camera axes, without the Sun's disc.
 
-    `sight` holds the intersections of the rays with the Earth.
+    The argument `sight` contains the intersections of the rays with the Earth.
     """
     result = np.zeros(len(rays), dtype=np.float32)
     axes = semi_axes().astype(np.float32)[:, None]
@@ -415,7 +415,7 @@ def visible_share(scene: EarthScene) -> float:
 
 
 def darkening(share: FloatArray) -> FloatArray:
-    """Return the brightness of the Sun's disc (mean 1) at squared relative radii (...) from 0 to 1."""
+    """Return the brightness (mean 1) of the Sun at squared radii (...), 0 at the centre, 1 at the limb."""
     rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
     return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
 
@@ -458,8 +458,8 @@ class EarthCameraModel:
 
     Attributes:
         lens: camera geometry, a `Pinhole` or a `Lens` with distortion.
-        rows: number of pixel rows, equal to that of the lens.
-        columns: number of pixel columns, equal to that of the lens.
+        rows: number of pixel rows, equal to the rows of `lens`.
+        columns: number of pixel columns, equal to the columns of `lens`.
         bits: resolution of the analogue-to-digital converter, bits.
         response: "logarithmic" (counts follow the logarithm of radiance plus `darkest`) or "linear".
         decades: decades of radiance from `darkest` to the highest count, for the logarithmic response.
@@ -607,9 +607,9 @@ def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -
     """Add the sunlight that the optics scatter to `image` (rows, columns).
 
     The scattered radiance decreases from its centre as 1/(1 + (s/s0)^2), where s is the chord between unit
-    vectors. This is the Harvey-Shack model for polished optics with a slope of two. The fraction `scatter` of
-    the light is scattered over the hemisphere. The lens has no hood, so sunlight reaches it from the entire
-    hemisphere in front of the camera.
+    vectors. This function of s is the Harvey-Shack model for polished optics with a slope of two. The
+    fraction `scatter` of the light is scattered over the hemisphere. The lens has no hood, so sunlight
+    reaches it from the entire hemisphere in front of the camera.
     """
     axis, _ = towards_sun(scene)
     if axis[2] <= 0.0 or model.scatter == 0.0:

@@ -46,8 +46,8 @@ class CraftSection(Section, frozen=True, kw_only=True):
     The craft is a box of `size` (3,), m. The vector `centre_of_mass` (3,), m, leads from the centre of the
     box to the centre of mass, in body axes. `inertia`, kg m^2, contains the moments of inertia (3,) about the
     body axes, or the inertia tensor (3, 3). The residual dipole in shadow is `residual_dipole` (3,), A m^2,
-    plus that of the section `disturbances`. The list `windings` describes the coils. An omitted value equals
-    that of the flight configuration.
+    plus the residual dipole of the section `disturbances`. The list `windings` describes the coils. An
+    omitted value equals the value of the flight configuration.
     """
 
     inertia: Inertia | None = None
@@ -80,8 +80,9 @@ class Disturbances(Section, frozen=True, kw_only=True):
     `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
     of air density and residual dipole. The angle between body axes and principal axes is at least a third of
     `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
-    deviations of the coils' scale errors and axis tilts. `coil_variation` is the relative standard deviation
-    of the dipole of each coil, which changes every 20 s, for example with the supply voltage.
+    deviations of the coils' scale errors and axis tilts. `coil_variation` is the standard deviation of the
+    dipole of each coil, as a fraction of the dipole, which changes every 20 s, for example with the supply
+    voltage.
     """
 
     gravity_gradient: NotNegative = 1.0
@@ -101,7 +102,8 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
     """The section `free_body`.
 
     If `craft` is a name, the body is one of the two satellites in `sim_hal.worlds.free_body.CRAFTS`.
-    Otherwise the body is the satellite of the flight configuration, with the differences in `craft`.
+    If `craft` is not a name, the body is the satellite of the flight configuration, with the differences in
+    `craft`.
 
     `errors` is the largest error of the configured description of body, coils and sensors, as a multiple of
     the configured accuracies (`sim_hal.description_errors`).
@@ -133,8 +135,8 @@ class ImuNoise(Section, frozen=True, kw_only=True):
 
     `quaternion_noise` and `rate_noise` (rad/s) bound the uniform noise of quaternion and rate. `profile:
     datasheet` adds the white noise of the unit's data sheet and a random bias at each start. `gyro_bias`
-    (3,), rad/s, is the constant bias of the gyro, and `field_bias` (3,), T, body axes, is that of the
-    magnetometer.
+    (3,), rad/s, is the constant bias of the gyro, and `field_bias` (3,), T, body axes, is the constant bias
+    of the magnetometer.
     """
 
     profile: Literal["bounds", "datasheet"] = "bounds"
@@ -181,8 +183,8 @@ class SkySection(Section, frozen=True, kw_only=True):
 
     The thesis (Sease, chapter 2) uses `psf: bilinear` and `noise: uniform`. In orbit, stray light saturates a
     frame if the boresight is within `sun_exclusion_deg` of the Sun or within `earth_exclusion_deg` of sunlit
-    ground, and whenever one of them is in the field of view. The default angles are those of a star tracker
-    with a baffle that fits into a CubeSat.
+    ground, and whenever one of them is in the field of view. The default exclusion angles are typical of a
+    star tracker with a baffle that fits into a CubeSat.
     """
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5

@@ -148,7 +148,8 @@ class FirstOrbit:
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
         lasts: whether the orbit `state`, the most likely one, is bound to the Earth and does not hit the
-            Earth. Otherwise, another orbit with a distance in `interval` satisfies both conditions.
+            Earth. If not, another orbit with a distance in `interval` is bound to the Earth and does not hit
+            the Earth.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """
@@ -214,9 +215,9 @@ def _within(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the interval of distances in which chi-square is less than `_DEGREES_95` above its minimum.
 
-    The arguments are the `logarithms` of the tried distances and the chi-square at each of them. The first
-    result contains the smallest and the largest tried logarithm inside the interval. The second result
-    contains the two ends of the interval, interpolated between tried logarithms.
+    The arguments are the `logarithms` of the tried distances and the chi-square at each distance. The first
+    result contains the smallest and the largest tried logarithm of the distance inside the interval. The
+    second result contains the two ends of the interval, interpolated between tried logarithms.
     """
     excess = chi_square - chi_square.min() - _DEGREES_95
     first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])

@@ -1,14 +1,15 @@
 """Tracks of several objects over camera frames, and a filter of the line of sight to each object.
 
 The line-of-sight filter uses measured directions only, without ranges. The filter state consists of the
-relative position y (a unit vector) and the relative velocity z, both divided by the present range. Without
-forces the velocity z is constant and the position y moves on a straight line. The motion model of the
-line-of-sight filter is therefore linear at any angular rate, and only the measurement model is nonlinear.
-After each step the filter state is divided by the length of the position y, so that y is a unit vector again.
-The filter state is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE
-Transactions on Automatic Control 28). The component of the velocity z across the line of sight is the angular
-rate v. The component of the velocity z along the line of sight is s = (range rate) / range. Without forces,
-the angular acceleration of the line of sight is -2 (range rate) / range times the angular rate.
+position y (a unit vector) and the velocity z of the object relative to the observer, both divided by the
+present range. Without forces the velocity z is constant and the position y moves on a straight line. The
+motion model of the line-of-sight filter is therefore linear at any angular rate, and only the measurement
+model is nonlinear. After each step the filter state is divided by the length of the position y, so that y is
+a unit vector again. The filter state is the vector form of the modified polar coordinates of Aidala and
+Hammel (1983, IEEE Transactions on Automatic Control 28). The component of the velocity z across the line of
+sight is the angular rate v. The component of the velocity z along the line of sight is s = (range rate) /
+range. Without forces, the angular acceleration of the line of sight is -2 (range rate) / range times the
+angular rate.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the
@@ -89,12 +90,13 @@ class MotionModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSightState:
-    """Direction and relative velocity of an object at one time.
+    """Direction of an object, and velocity of the object relative to the observer, at one time.
 
     Attributes:
         time_ns: time of the state.
         direction: unit vector (3,) to the object, ICRS.
-        velocity: relative velocity (3,) divided by the range (z of the module's docstring), ICRS, 1/s.
+        velocity: velocity (3,) relative to the observer, divided by the range (z of the module's docstring),
+            ICRS, 1/s.
         covariance: covariance (6, 6) of direction and velocity, with zero variance along the direction.
     """
 

@@ -147,7 +147,8 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
     CoilCondition.B_HIGH: (None, _HIGH),
     CoilCondition.B_LOW: (None, _LOW),
 }
-"""Constant output of the bridge legs A and B for each fault; None stands for a leg that follows its input."""
+"""Constant output of the bridge legs A and B for each fault; None is for a bridge leg that follows its
+input."""
 
 
 class CoilCircuit:

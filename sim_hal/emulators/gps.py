@@ -3,7 +3,7 @@
 The u-blox receiver starts without a configuration and sends NMEA sentences until a message enables NAV-PVT.
 Fixes are computed at UTC times that are multiples of the period, and their frames are sent `latency` s later.
 The position error is a random walk (ionosphere, ephemerides) plus white noise, and the velocity error is
-white noise. The NMEA receiver sends its sentences by itself and ignores commands.
+white noise. The NMEA receiver sends its sentences without being configured and ignores commands.
 """
 
 from __future__ import annotations

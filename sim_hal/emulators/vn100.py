@@ -8,11 +8,11 @@ In register 85, only the filter windows of magnetometer, accelerometer and gyro 
 the second serial port are not emulated. VectorNav specifies 500 ms for a flash write, and a start-up time of
 1 s is assumed.
 
-The commands of the attitude filter are those of VectorNav UM001, chapter 8. The commands "set initial
-heading" and "set filter bias" follow VectorNav's SDK 0.99 and the answers of VectorNav units with satellite
-navigation. In the absolute heading mode the magnetometer is assumed to set the heading, so that the commands
-"tare" and "set initial heading" have no effect. Gravity is assumed to set pitch and roll in every mode, so
-only the yaw of a given attitude has an effect. The filter's estimate of the gyro bias has no error.
+The commands of the attitude filter follow VectorNav UM001, chapter 8. The commands "set initial heading" and
+"set filter bias" follow VectorNav's SDK 0.99 and the answers of VectorNav units with satellite navigation. In
+the absolute heading mode the magnetometer is assumed to set the heading, so that the commands "tare" and "set
+initial heading" have no effect. Gravity is assumed to set pitch and roll in every mode, so only the yaw of a
+given attitude has an effect. The filter's estimate of the gyro bias has no error.
 """
 
 from __future__ import annotations

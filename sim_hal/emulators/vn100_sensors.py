@@ -4,7 +4,7 @@ The main noise profiles are "thesis" and "datasheet". The profile "thesis" has u
 rate with the bounds of Sease 2013, chapter 5. The profile "datasheet" has white noise with the densities of
 the data sheet and the filter windows of register 85, a static attitude error, and a gyro bias that is drawn
 at each start. The group delay of the filters (half a window, 12.5 ms for 20 samples) is not modelled. The
-layouts and number formats are those of VectorNav UM001 v2.43, chapters 4 and 5.
+layouts and number formats follow VectorNav UM001 v2.43, chapters 4 and 5.
 """
 
 from __future__ import annotations

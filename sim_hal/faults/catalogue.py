@@ -561,7 +561,7 @@ def _given_or_drawn(bench: Bench, given: Parameters, name: str, values: Sequence
 
 
 def _upset_pwm(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # Configuration registers are drawn with probability 1/2; a uniform draw would rarely select one of them.
+    # Half of the draws select a configuration register, which a uniform draw would rarely select.
     among = _SET_UP if bench.generator.random() < 0.5 else _OUTPUTS
     register = _given_or_drawn(bench, given, "register", among)
     bench.hardware.pwm.flip(register, _given_or_drawn(bench, given, "bit", range(8)))

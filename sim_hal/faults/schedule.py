@@ -107,7 +107,10 @@ def _number(word: str, what: str, text: str) -> float:
 
 
 def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
-    """Parse the faults of a `simulation` section. Raises UsageError that names the entry."""
+    """Parse the faults of a `simulation` section.
+
+    Raises UsageError, with the entry in the message, for an invalid entry.
+    """
     read = []
     for number, entry in enumerate(entries):
         key = f"simulation.faults[{number}]"

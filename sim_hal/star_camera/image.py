@@ -257,7 +257,7 @@ OwnTimes = Callable[[FloatArray, IntArray], FloatArray]
 """Function from times (m, k) or (m, 1) and source indices (k,) to camera-frame directions (m, k, 3)."""
 
 FASTEST = 0.25
-"""Largest speed (px per line time) of a source; a speed of 1 is that of the rolling shutter."""
+"""Largest speed (px per line time) of a source; the rolling shutter moves at a speed of 1."""
 SETTLED = 1e-4
 """Tolerance (line times) of the iterated time at which the row of a source is exposed."""
 

@@ -100,10 +100,10 @@ def source_tracks(
     """Return the tracks of the visible objects from `start` to `end` s.
 
     `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks count from
-    `zero` s, as in an attitude history. An object that is in the umbra or behind the Earth the whole time is
-    omitted. An object that is partly sunlit, or sunlit for part of the time, has its mean brightness over the
-    track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
-    outside the orbits, and for an object within 1 m of the camera.
+    `zero` s, as in an attitude history. An object that is in the umbra or behind the Earth during the entire
+    exposure is omitted. An object that is partly sunlit, or sunlit for part of the time, has its mean
+    brightness over the track. For a rolling shutter, `end` is the end of the last row's exposure. Raises
+    OutOfRange for times outside the orbits, and for an object within 1 m of the camera.
     """
     if not start < end:
         raise OutOfRange(DEVICE, "end of the exposure", end, start, math.inf, "s")
@@ -317,7 +317,7 @@ def view(
 ) -> tuple[bool, BoolArray | None]:
     """Return whether stray light blinds the camera, and a mask (rows, columns) of the dark Earth, or None.
 
-    `sky` holds the exclusion angles of the baffle. Sun or sunlit ground in the field of view always blinds
+    `sky` contains the exclusion angles of the baffle. Sun or sunlit ground in the field of view always blinds
     the camera.
     """
     corner = float(np.arccos(pinhole.unit_vectors(np.zeros((1, 2)))[0, 2]))

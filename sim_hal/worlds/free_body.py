@@ -8,9 +8,9 @@ solar radiation force on a sunlit face is given by Montenbruck & Gill 2000, eq. 
 not shade each other.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
-the torques that depend on the attitude, namely those of the dipole in the field and of the gravity gradient
-(Wertz 1978, eq. 17.28). The error of a step in which the body rotates by 0.01 rad is 1e-13 rad. The code uses
-Python floats, because numpy takes ten times as long for three components.
+the torques that depend on the attitude, namely the torques of the dipole in the field and of the gravity
+gradient (Wertz 1978, eq. 17.28). The error of a step in which the body rotates by 0.01 rad is 1e-13 rad. The
+code uses Python floats, because numpy takes ten times as long for three components.
 
 The rotation is integrated when the state is read and when the currents change. Reading the state at other
 times changes the attitude by less than a microradian. Drag torque, solar radiation torque and residual dipole
@@ -224,7 +224,7 @@ class TrueCraft:
         faces: faces of the craft's box.
         coil_dipole: matrix (3, n), m^2, that maps coil currents to the dipole in body axes.
         coil_frames: rotation matrices (n, 3, 3) from the function `coil_frames`; the errors of the coils are
-            drawn in these axes.
+            drawn in the rotated axes.
         constant_dipole: constant part (3,) of the residual dipole, A m^2, body axes.
         sunlit_dipole: part (3,) of the residual dipole that sunlight at one astronomical unit causes, A m^2,
             body axes.
@@ -343,7 +343,8 @@ def air_torque(faces: Sequence[Face], flow: Floats, density: float) -> Floats:
 def sunlight_torque(faces: Sequence[Face], sun: Floats, light: float) -> Floats:
     """Return the solar radiation torque (3,), N m, body axes.
 
-    `sun` (3,) is the direction to the Sun in body axes. `light` is the irradiance relative to that at 1 au.
+    `sun` (3,) is the direction to the Sun in body axes. `light` is the solar irradiance as a fraction of the
+    irradiance at 1 au.
     """
     if light <= 0.0:
         return ZERO

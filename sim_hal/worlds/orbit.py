@@ -66,7 +66,7 @@ from sim_hal.worlds.world import Floats, OrbitEnvironment
 
 DEVICE = "orbit"
 _TOLERANCE = 1e-12
-"""Relative tolerance of the orbit integration, which gives errors of centimetres after ten low orbits."""
+"""Relative tolerance of the orbit integration, with errors of centimetres after ten low orbits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,7 +37,7 @@ from sim_hal.worlds.world import (
 )
 
 VACUUM_PERMEABILITY = 4e-7 * math.pi
-"""Vacuum permeability (T m/A); the value is that of the thesis."""
+"""Vacuum permeability (T m/A), with the value of the thesis."""
 
 
 def helmholtz_field(turns: float, current: float, radius: float) -> float:
@@ -166,7 +166,7 @@ def make(inputs: WorldInputs) -> Testbed:
 def model_of(config: TestbedConfig, section: Simulation) -> tuple[TestbedModel, float, float]:
     """Return the true constants of the testbed, and the angle (rad) and rate (rad/s) at release.
 
-    Values of the simulation section `section` override those of `config`. Raises ConfigError if
+    Values of the simulation section `section` override the values of `config`. Raises ConfigError if
     `simulation.release` is missing.
     """
     release = section.release

@@ -127,7 +127,10 @@ class WorldInputs:
 
 
 def make_world(inputs: WorldInputs) -> World:
-    """Return the world that a configuration names. Raises ConfigError if the name is not that of a world."""
+    """Return the world that a configuration names.
+
+    Raises ConfigError if the name does not belong to a world.
+    """
     named = inputs.section.world
     factory = imported("simulation.world", named, WORLDS, os.environ)
     try:

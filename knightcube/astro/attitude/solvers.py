@@ -428,8 +428,8 @@ class VectorObservation:
 def field_observation(field: FloatArray, reference: FloatArray, covariance: FloatArray) -> VectorObservation:
     """Return the direction observation of a measured magnetic field (3,), body axes, T.
 
-    The covariance (3, 3), T^2, includes the magnetometer bias. The field `reference` (3,), T, is that of the
-    model in inertial axes. Raises AttitudeError if the error of the field's direction exceeds one radian.
+    The covariance (3, 3), T^2, includes the magnetometer bias. The field `reference` (3,), T, is the field of
+    the model in inertial axes. Raises AttitudeError if the error of the field's direction exceeds one radian.
     """
     strength = float(np.linalg.norm(reference))
     if not float(np.sqrt(np.trace(covariance))) < strength:

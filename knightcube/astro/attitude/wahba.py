@@ -92,7 +92,7 @@ class Sightings:
 
 
 def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Sightings:
-    """Check directions and return them with the quantities that all solvers need.
+    """Check directions, and return the directions with the quantities that all solvers need.
 
     The arguments are those of `Solver`. Raises AttitudeError if the directions do not determine an attitude.
     """

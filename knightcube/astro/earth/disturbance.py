@@ -6,8 +6,9 @@ the density at night (Montenbruck & Gill 2000, section 3.5.2: cos^4 of half the 
 behind the Sun). The aerodynamic torque and the solar radiation torque are each the cross product c x d of a
 body vector c and a pressure vector d. The body vector c (N m) is constant: the force multiplied by the lever
 arm of the centre of pressure. The pressure vector d is the direction of the pressure in body axes, multiplied
-by relative strength and exposed area. The exposed areas are those of a homogeneous box with the moments of
-inertia of the body. All other disturbance torques are represented by a constant torque in body axes.
+by the strength relative to a reference pressure and by the exposed area. The exposed areas are those of a
+homogeneous box with the moments of inertia of the body. All other disturbance torques are represented by a
+constant torque in body axes.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ _LAG = math.radians(30.0)
 _THINNEST = 0.02
 """Minimum squared side length of the box, divided by 12 times the largest moment of inertia per mass."""
 _HEIGHT, _SCALE_HEIGHT = EARTH_RADIUS + 500e3, 65e3
-"""Geocentric distance (m) at which the relative air density is one, and scale height (m) of the air."""
+"""Geocentric distance (m) of the reference air density (relative density 1), and scale height (m)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pressures:
-    """Pressure vectors: directions multiplied by relative strengths.
+    """Pressure vectors: directions multiplied by strengths relative to the reference pressures.
 
     Attributes:
-        air: (n, 3) direction of the motion through the air times relative air density, ICRS axes.
+        air: (n, 3) direction of the motion through the air times air density (1 at about 500 km), ICRS axes.
         light: (n, 3) direction to the Sun times visible fraction of the Sun's disc, ICRS axes.
     """
 
@@ -87,7 +88,7 @@ def mean_density(distance: float) -> float:
 
 
 def box_areas(inertia: FloatArray) -> FloatArray:
-    """Return the relative areas (3,) of the faces of a homogeneous box with an inertia tensor (3, 3), kg m^2.
+    """Return the scaled face areas (3,) of a homogeneous box with an inertia tensor (3, 3), kg m^2.
 
     The principal axes must be close to the body axes. The areas are scaled to a mean projected area of one.
     If no homogeneous box has the given moments of inertia, a flat box is used.

@@ -33,7 +33,7 @@ _FAR, _NEAREST, _ROUNDS = 6.0, 300.0, 4
 """Rejection limits of a residual, as a multiple of the median and in m (the larger applies), and maximum
 number of fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
-"""Eccentricity of the initial guess, and relative step of the numerical derivatives.
+"""Eccentricity of the initial guess, and step of the numerical derivatives as a fraction of the parameter.
 
 SGP4 replaces eccentricities below 1e-6. Steps below 1e-6 would therefore give wrong derivatives for a
 circular orbit. The fit adds 1 to each component of the eccentricity vector, so that a relative step of 1e-6
@@ -161,7 +161,7 @@ class _Fit:
 def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the distances (n,), m, between positions (n, 3), ICRS, and elements at Julian dates (n,).
 
-    Raises UsageError for elements that SGP4 cannot propagate to these dates.
+    Raises UsageError for elements that SGP4 cannot propagate to the given dates.
     """
     known = TwoLineElements(*lines)
     try:

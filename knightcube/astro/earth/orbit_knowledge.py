@@ -29,9 +29,10 @@ _LONGEST_STEP = 30.0
 _SGP4_EPOCH, _MINUTES_PER_DAY = 2_433_281.5, 1440.0
 """Julian date from which SGP4 counts days, and number of minutes in a day."""
 _DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
-"""Relative standard deviation of B* for small satellites, and minimum standard deviation (1/Earth radius)."""
+"""Standard deviation of B* for small satellites as a fraction of B*, and its minimum (1/Earth radius)."""
 _DRAG_TIME, _DECAYING = 0.25, 1e7
-"""Time (days) over which the effect of B* is computed, and effect (m/day^2) assumed for a decaying orbit."""
+"""Time (days) over which the along-track shift by B* is computed, and shift (m/day^2) for a decaying
+orbit."""
 
 
 class OrbitError(FlightError):

@@ -33,20 +33,20 @@ _PERMEABILITY = 1e-7
 _SEGMENTS = 128
 """Number of straight segments that approximate a circular coil."""
 LEAST_SPREAD = 0.05
-"""Smallest singular value of the unit vectors along the coil axes; below it, the axes are nearly coplanar."""
+"""Singular value of the unit vectors along the coil axes below which the axes count as coplanar."""
 _STEPS = 200
 """Number of iterations that compute the largest box of dipole moments."""
 _PARALLEL = 1e-6
 """Sine of the angle between two coil axes below which the coils count as parallel."""
 _NEWTON_STEPS, _EXACT = 60, 1e-9
-"""Largest number of Newton steps for limited currents, and relative accuracy of the resulting dipole
-moment."""
+"""Largest number of Newton steps for limited currents, and accuracy of the resulting dipole moment as a
+fraction of the moment."""
 _SATURATED = 1e-4
-"""Weight, in the Newton matrix, of a coil whose current is at the limit, relative to a coil below its
+"""Ratio of the Newton matrix weight of a coil at its current limit to the weight of a coil below its
 limit."""
 _WEAKEST = 0.15
-"""Torque per unit current below which a torque direction is discarded, relative to the direction with the
-largest torque per unit current. A torque in a discarded direction would need the full current, and scaling
+"""Torque per unit current below which a torque direction is discarded, as a fraction of the largest torque
+per unit current of any direction. A torque in a discarded direction would need the full current, and scaling
 all currents to the limit would then reduce the torque in the other directions."""
 
 
@@ -100,7 +100,7 @@ class CoilMap:
         current_limits: largest current of each coil (n,), A.
         resistance: resistance of each coil (n,), ohm.
         limits: largest dipole moment along each body axis (3,), A m^2. The coils can produce all dipole
-            moments within these three limits.
+            moments within the three limits `limits`.
         heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, without saturation.
     """
 
@@ -282,7 +282,8 @@ class Allocation:
     Attributes:
         currents: coil currents (n,), zero for coils that are not available, A.
         torque: torque (3,) of the allocated currents, N m.
-        share: component of the torque along the requested torque, as a fraction of the latter, 0 to 1.
+        share: component of the torque along the requested torque, as a fraction (0 to 1) of the requested
+            torque.
     """
 
     currents: FloatArray

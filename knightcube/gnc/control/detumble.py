@@ -73,7 +73,7 @@ class DetumblerSettings:
         inertia: smallest principal moment of inertia, kg m^2.
         dipole_per_ampere: dipole moment per current of each coil (turns times area), m^2.
         current_limit: current limit of each coil, A.
-        share: fraction of the rate across the field to remove in one window, below 1.
+        share: fraction (below 1) of the rate across the field that is removed in one window.
     """
 
     inertia: float
@@ -95,7 +95,7 @@ class DetumblerSettings:
 
 
 def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> float:
-    """Return the best `share` for a free body in a field that rotates at `field_rate` rad/s.
+    """Return the best setting `share` for a free body in a field that rotates at `field_rate` rad/s.
 
     The rate along the field can be removed only while the field rotates. With a gain above k = 2 Omega J,
     where Omega is the rotation rate of the field, the spin aligns with the field and remains (Avanzini and

@@ -2,8 +2,8 @@
 
 The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, until
 their field has decayed and the field is measured. The driven phase between two pauses is short while the
-estimated rate is uncertain. The filter `knightcube.gnc.estimation.field_rate` uses the samples in these
-pauses to estimate all components of the body rate and the rotation of the field in inertial axes. A gyro
+estimated rate is uncertain. The filter `knightcube.gnc.estimation.field_rate` uses the field samples in the
+coil pauses to estimate all components of the body rate and the rotation of the field in inertial axes. A gyro
 sample shows the rate along the field immediately.
 
 The momentum plan uses the field predicted along the orbit, if the orbit is known. If the attitude is unknown,
@@ -60,15 +60,15 @@ from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSetti
 
 ITERATIONS = 12
 LIMIT_GAIN = 1.5
-"""Mean dipole moment of three saturated coils along a direction, averaged over all directions and relative to
-the mean limit of the body axes."""
+"""Dipole moment of three saturated coils along a direction, averaged over all directions and divided by the
+mean limit of the body axes."""
 STEEP = 12.0
 """Gain of the dipole moment: a coil reaches the dipole limit if |B x y| (field B, costate y) exceeds the mean
 of |B x y| divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would
 then reverse the coil currents wherever B x y is small."""
 FLAT = 0.02
-"""Lower bound of |B x y| (field B, costate y), relative to its largest value, which keeps the weights of the
-iteration finite."""
+"""Lower bound of |B x y| (field B, costate y), as a fraction of the largest |B x y|, which keeps the weights
+of the iteration finite."""
 FINENESS = 60
 """Number of steps into which the search for the minimum time divides the minimum time."""
 
@@ -290,7 +290,7 @@ KNOWN, KNOWN_SHARE = 2e-3, 0.1
 set: in rad/s (first value) or as a fraction of the rate (second value)."""
 _SECOND = 1e-9
 _ROUNDING = 1e-9
-"""Relative rounding error of a scalar product that should be zero."""
+"""Rounding error of a scalar product that should be zero, divided by the lengths of both vectors."""
 _NO_DIPOLE: FloatArray = np.zeros(3)
 _IDENTITY: FloatArray = np.eye(3)
 

@@ -17,7 +17,7 @@ offset. The estimator integrates the difference between actual and modelled acce
 limited current, so the integral does not wind up. The second feature limits the rate at which an angle error
 is reduced, so that the coil can decelerate the body in time and the angle does not overshoot. Small errors e
 are reduced at the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate sqrt(2 A |e| - (A /
-s)^2), where A is the available deceleration. The rate limit is that of the proximate time-optimal
+s)^2), where A is the available deceleration. The limit is the rate limit of the proximate time-optimal
 servomechanism (Workman 1987), but with a continuous slope.
 
 The error e = sin(d) is monotonic in d only up to 90 degrees. The angle error d is therefore clamped to
@@ -193,7 +193,7 @@ def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
 
     The plant e'' = v, with the error e and the control v, is a double integrator. The Riccati equation of
     this plant (Sease, eqs. (5.28) to (5.32)) has the solution K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e) with w
-    = Q / R. A general solver would take 0.2 s at the start.
+    = Q / R. A general Riccati solver would take 0.2 s at the start.
     """
     weight = state_weight / input_weight
     error_gain = math.sqrt(weight)

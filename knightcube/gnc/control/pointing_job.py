@@ -85,9 +85,9 @@ END = 2_000.0
 lasts for this time. The weight is high because disturbance torques are poorly known before the slew, and the
 errors that they cause should be corrected by the end of the slew."""
 HOTTER = 1.1
-"""Largest ratio of the coil heat of a new plan to that of the present plan, for the remaining slew. A new
-plan with more heat is rejected, because it would correct a deviation for which the remaining time is too
-short."""
+"""Largest accepted ratio of the coil heat of a new plan to the coil heat of the present plan, for the
+remaining slew. A new plan with more heat is rejected, because it would correct a deviation for which the
+remaining time is too short."""
 _INSIDE = 1e-6
 """Additional reduction (rad) of the half angle of a violated exclusion cone, so that the path is outside the
 cone."""
@@ -138,7 +138,7 @@ class SlewStart:
         inertia: (3, 3) kg m^2.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
-        areas: relative areas (3,) of the faces on which air and sunlight act.
+        areas: scaled areas (3,) of the body's faces, on which air and sunlight act.
     """
 
     quaternion: FloatArray
@@ -296,7 +296,7 @@ def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeR
 
 
 def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeReferences:
-    """Return the motion `then`, with its first instants replaced by those of the motion `first`."""
+    """Return the motion `then`, with its first instants replaced by the motion `first`."""
     count = len(first.times)
     return AttitudeReferences(
         then.times,
@@ -387,7 +387,7 @@ def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, Flo
 
 
 def _narrowed(cone: Cone, path: SlewPath, start: FloatArray) -> Cone:
-    """Return an exclusion cone, narrowed if a path or its initial attitude `start` (4,) violates it."""
+    """Return an exclusion cone, narrowed if a path or an initial attitude `start` (4,) is inside it."""
     room = min(
         float(cone.clearance(path.quaternion, path.times).min()),
         float(cone.clearance(start[None], np.zeros(1))[0]),
@@ -425,7 +425,8 @@ does not depend on the duration of the initial guess."""
 class ObjectDirection:
     """The direction (3,) of an object, ICRS, `since` s after the time `origin_ns` of the planning job.
 
-    The vector `velocity` (3,), 1/s, is the object's relative velocity divided by its distance, or zero.
+    The vector `velocity` (3,), 1/s, is the object's velocity relative to the satellite, divided by the
+    distance, or zero.
     """
 
     direction: FloatArray
@@ -447,7 +448,7 @@ class PointingJob:
         inertia: (3, 3) kg m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
-        areas: relative areas (3,) of the faces on which air and sunlight act.
+        areas: scaled areas (3,) of the body's faces, on which air and sunlight act.
         slew: parameters of slews, or None if the body approaches every attitude law without a slew.
         running: the slew in progress whose remaining part is replanned, or None if a new path is planned.
         sight: the sighted object at which the body points instead of `target`, or None.
@@ -483,8 +484,8 @@ def prepare() -> None:
 def run(job: PointingJob) -> PointingTable | None:
     """Return the pointing table, whose times are in s after the job's time `origin_ns`.
 
-    The result is None if the remaining part of a slew was to be replanned and the present plan should be
-    kept. The computation takes about one second, two seconds with a slew, and a tenth of a second for the
+    The result is None if the remaining part of a slew was replanned without a better plan than the present
+    plan. The computation takes about one second, two seconds with a slew, and a tenth of a second for the
     remaining part of a slew. Raises FlightError if the magnetic field is unknown, and UsageError if the
     target does not define an attitude.
     """

@@ -35,7 +35,7 @@ LARGEST_RATE = math.radians(1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingCommand:
-    """Dipole moment (3,), A m^2, within the coils' limit, and the errors relative to the reference.
+    """Dipole moment (3,), A m^2, within the coils' limit, and the errors relative to the reference motion.
 
     The errors are a rotation vector (3,), rad, from the reference to the body, and a rate (3,), rad/s.
     """
@@ -82,13 +82,13 @@ class PointingLaw:
         """Return the command at a time (s) for an estimated attitude (4,) and rate (3,) rad/s.
 
         The magnetic field `field` (3,), T, is in body axes. The estimated residual dipole moment
-        `residual_dipole` (3,) A m^2 is cancelled directly, as far as it is normal to the field. The effects
-        of the disturbance torques with the estimated components `sizes` (n,), N m, are reduced as far as the
-        field allows.
+        `residual_dipole` (3,) A m^2 is cancelled directly, except for the component along the field. The
+        effects of the disturbance torques with the estimated components `sizes` (n,), N m, are reduced as far
+        as the field allows.
         """
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
-        # Both rates are expressed in body axes, which differ from the reference axes by the rotation error.
+        # The rotation error rotates the reference rate into body axes, in which the rates are compared.
         missed = rate - attitude_matrix(from_rotation_vector(rotation)) @ wanted.rate
         cut_rotation, cut_rate = _cut(rotation, LARGEST_ROTATION), _cut(missed, LARGEST_RATE)
         # The gains apply to the body rate in body axes minus the reference rate in reference axes.

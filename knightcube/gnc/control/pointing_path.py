@@ -204,17 +204,18 @@ RISES = (4.0, 2.0, 10.0)
 """Factors by which the cost of a torque along the field is increased from stage to stage. Each factor is
 tried until a path settles on the attitude law, because different factors lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
-"""Costs of a torque along the field, relative to the cost of the same torque across the field. The cost of a
-torque along the field is increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
+"""Ratios of the cost of a torque along the field to the cost of the same torque across the field. The cost of
+a torque along the field is increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
 """Largest rotation error (rad), in the second half of a path, of a path that counts as settled."""
 SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even if the sweeps have not converged."""
 SAVED = (0.05, 2e-3)
-"""Relative improvements of the total cost by a sweep, below which a stage ends. If a sweep improves the total
-cost by less than the first value, the next stage begins, with an increased cost of a torque along the field.
-In the last stage, which has the cost `PROHIBITIVE`, the second value replaces the first value."""
+"""Reductions of the total cost by a sweep, as fractions of the cost, below which a stage ends. If a sweep
+improves the total cost by less than the first value, the next stage begins, with an increased cost of a
+torque along the field. In the last stage, which has the cost `PROHIBITIVE`, the second value replaces the
+first value."""
 NEAR = math.radians(10.0)
 """Angle (rad) between the first motion and the attitude law, up to which the linear-quadratic sweeps converge
 without an auxiliary torque along the field."""

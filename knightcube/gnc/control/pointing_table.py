@@ -9,8 +9,8 @@ during the iterations (Bock & Plitt 1984, IFAC 9th World Congress). Multiple sho
 grow along a revolution of the orbit. Propagating one motion over a revolution could let errors grow, because
 coils cause no torque about the field and the body may rotate by a large angle about the pointing axis. An
 iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and
-the derivatives are those of this discrete rule. With derivatives of the continuous motion, the iteration
-would stall for bodies that rotate by degrees per time step.
+the derivatives are the exact derivatives of the midpoint rule. With derivatives of the continuous motion, the
+iteration would stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of the path is computed by a backward
@@ -130,7 +130,7 @@ FARTHEST = math.radians(30.0)
 HALVES = 6
 """Largest number of times that a step is halved in the line search."""
 DEARER = 1.2
-"""Weight of the defects in the merit function, relative to the largest derivative of the cost with respect to
+"""Weight of the defects in the merit function, divided by the largest derivative of the cost with respect to
 a defect."""
 DONE = math.radians(0.05)
 """Multiple shooting ends if an iteration rotates all attitudes by less than this angle (rad). Multiple

@@ -138,16 +138,16 @@ class ResidualDipole:
 
 
 AGREES = 0.2
-"""Largest relative difference between the magnetic fields measured in two successive coil pauses, after
-correction for the body's rotation."""
+"""Largest difference between the magnetic fields measured in two successive coil pauses, corrected for the
+body's rotation, as a fraction of the field strength."""
 ROLL = 150.0
-"""Cost of a torque normal to the Sun direction, relative to the cost of a torque about the Sun direction."""
+"""Ratio of the cost of a torque normal to the Sun direction to the cost of a torque about that direction."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
 """Total rate (rad/s, first value) and rate (rad/s) across the Sun direction (second value) above which the
 body is only damped. The two rate limits are below the rates at which the flight software starts
 detumbling."""
 FASTEST_ROLL = 0.0105
-"""Roll rate (rad/s) about the Sun direction at which the lower cost of torques about it is reduced to 1/e."""
+"""Roll rate (rad/s) about the Sun direction at which the extra cost of torques normal to it falls to 1/e."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
 """Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the pointing
 law demands at most the fraction `SHARE` of the torque that the coils can produce."""

@@ -1,7 +1,7 @@
 """A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
-The filter applies each measurement at the time for which the measurement is valid. If a measurement arrives
-late, it is inserted at its time, and all later measurements are applied again, either in a single call, or a
+The filter applies each measurement at the time for which the measurement is valid. A late measurement is
+inserted at its measurement time, and all later measurements are applied again, either in a single call, or a
 few in each call while the filter continues without the late measurement (module `replay`). The rate from a
 streaked image is the mean rate during the exposure, so the filter stores the attitude at the start of an
 exposure until the exposure ends. The filter can also estimate the age of the inertial unit's samples (module
@@ -65,8 +65,8 @@ strong coil fault is detected in one gyro sample, a weak coil fault only in the 
 flights without a fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
 _BEFORE_NS = 500_000_000
 """Time (ns), before the first contradictory sample, during which the currents are also treated as unknown. A
-weak fault affects the other states of the filter before it is detected. These effects are corrected by
-treating the currents before the sample as unknown, too."""
+weak fault affects the other states of the filter before it is detected. Treating the currents before the
+contradictory sample as unknown corrects the other states."""
 _MAXIMUM_CHANGE = 3.0
 """Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
 coils. A reversed coil causes an innovation of twice the commanded change, and the uncertain age of a sample
@@ -301,7 +301,7 @@ def first_checkpoint(
     attitude: AttitudeMeasurement,
     rate: RateMeasurement,
 ) -> Checkpoint:
-    """Return the filter's first checkpoint, whose time is that of the later of the two measurements.
+    """Return the filter's first checkpoint, at the time of the later of the two measurements.
 
     For a suspended body, the measured attitude is reduced to the angle about the thread.
     """
@@ -393,8 +393,9 @@ class AttitudeFilter:
     def mark_unknown(self, since_ns: int) -> None:
         """Treat the coil currents recorded since `since_ns` as unknown.
 
-        Wrong currents may have been mistaken for a disturbance or a change of parameters. The measurements
-        since that time are therefore applied again, some of them at each call of `catch_up`.
+        The filter may have attributed the effect of wrong currents to a disturbance or a change of
+        parameters. The measurements since `since_ns` are therefore applied again, some of them at each call
+        of `catch_up`.
         """
         self.catch_up()
         self._commands.mark_unknown(since_ns)

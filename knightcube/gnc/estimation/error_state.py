@@ -173,10 +173,10 @@ def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: Fl
     """Preserve, in place, the uncertainty of the common scale of some states after their correction.
 
     If no measurement depends on the common scale, the vector of the scaled states is itself the unobservable
-    direction in state space. The correction `change` (n,) of the error state changes this direction, so the
-    covariance is adjusted to the new direction. Without this adjustment, each correction would reduce the
-    uncertainty of the scale. The states with the common scale are the slice `at` of the error state, and had
-    the `values` (m,) before the correction.
+    direction in state space. The correction `change` (n,) of the error state changes the unobservable
+    direction, so the covariance is adjusted to the new direction. Without the adjustment of the covariance,
+    each correction would reduce the uncertainty of the scale. The states with the common scale are the slice
+    `at` of the error state, and had the `values` (m,) before the correction.
     """
     along = values / (values @ values)
     covariance += np.outer(change, along @ covariance[at])
@@ -214,8 +214,8 @@ CONTRADICTED, PAUSE = 60.0, 600.0
 """Time (s) over which innovations are evaluated, and time (s) after a contradiction during which innovations
 are ignored."""
 _LARGEST, _MEAN, _LEAST = chi_square.bound(0.001, 3), 5.0, 40
-"""Value at which normalised squared innovations are clipped, largest mean of consistent innovations, and
-minimum number of innovations for a decision."""
+"""Value at which normalised squared innovations are clipped, largest mean of consistent squared innovations,
+and minimum number of innovations for a decision."""
 
 
 class PriorCheck:

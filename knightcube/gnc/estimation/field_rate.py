@@ -275,11 +275,11 @@ class FieldRate:
         self._update_unexplained()
 
     def _update_unexplained(self) -> None:
-        """Set the relative standard deviation of the gyroscopic torque from the uncertainty of the inertia.
+        """Set the fractional uncertainty of the gyroscopic torque from the uncertainty of the inertia.
 
-        Without this noise, the covariance of the linearised filter would become too small while the inertia
-        is poorly known. The least certain combination of the tensor's elements is omitted, because it is the
-        common scale of the elements, which does not affect the gyroscopic acceleration.
+        Without noise for this torque, the covariance of the linearised filter would become too small while
+        the inertia is poorly known. The least certain combination of the tensor's elements is omitted,
+        because it is the common scale of the elements, which does not affect the gyroscopic acceleration.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[INERTIA, INERTIA])[-2])
         self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)

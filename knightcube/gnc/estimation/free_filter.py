@@ -13,7 +13,8 @@ error state (see `error_state`) contains these blocks:
 - `coils`: matrix of gain errors and misalignments of the coils. The estimated dipole is the commanded dipole
   plus this matrix times the commanded dipole.
 - `gyro_matrix`, `field_matrix`: scale errors and misalignments of both sensors (Pittelkau 2001, JGCD 24(6)).
-- `camera`: misalignment of the star camera, whose attitude is known more accurately than that of the body.
+- `camera`: misalignment of the star camera, whose attitude is known more accurately than the attitude of the
+  body.
 - `horizon`: misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
   cameras are used, so this block is a Gauss-Markov process with a long correlation time.
 - `coil_variation`: relative variation of the dipole along each body axis, for example because the supply
@@ -217,9 +218,9 @@ body at rest."""
 CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected magnitudes of the constant, aerodynamic and solar radiation torques, relative to the aerodynamic
-torque. The constant torque is small, because the error of the inertia has its own states, and because an
-aerodynamic torque that is attributed to the constant torque is wrong at every other attitude."""
+"""Expected magnitudes of the constant, aerodynamic and solar radiation torques, as multiples of the
+aerodynamic torque. The constant torque is small, because the error of the inertia has its own states, and
+because an aerodynamic torque that is attributed to the constant torque is wrong at every other attitude."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,8 +247,8 @@ class FreeFilterSettings:
             rate in rad/s. The random walk represents flexible parts, which are loaded only while the body
             rotates, and prevents the uncertainty of the inertia from becoming too small.
         errors: largest errors of the description of body and sensors.
-        coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; None for
-            coils along the body axes, because their covariance follows from `errors`.
+        coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; for coils
+            along the body axes None, because their covariance follows from `errors`.
         roles: roles of the blocks whose role differs from the default, by name of the block.
         rate_start: initial standard deviation of the rate, rad/s.
         fine, coarse: largest standard deviation, rad, of an attitude of the accuracy class FINE and COARSE,
@@ -325,8 +326,9 @@ MINIMUM_FIELD_ERROR = 1e-8
 """Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
 of the magnetometer's errors."""
 CURRENTS = 1e-7
-"""Standard deviation (T per axis) of the magnetic field of auroral currents. This deviation is added to the
-measurement noise, so that field measurements in auroral zones pass the gate."""
+"""Standard deviation (T per axis) of the magnetic field of auroral currents. The standard deviation of
+auroral fields is added to the measurement noise, so that field measurements in auroral zones pass the
+gate."""
 AIR_WALK = 6e-3
 """Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
@@ -488,11 +490,11 @@ class FreeFilter:
         """Reset the estimated matrix of the coils for one coil.
 
         The coil has the unit vector `direction` (3,) in body axes; the vector `dual` (3,) is normal to the
-        other coils and has the scalar product 1 with it. The estimate and its copies `memories` are changed.
-        The reset is necessary after the sign or the gain of the coil was corrected, because the estimated
-        matrix refers to the dipole before the correction. The error of the corrected dipole becomes zero, and
-        its correlations with other states are deleted. The settings give the new relative standard deviation
-        of the corrected dipole, which along the coil is at least `deviation`.
+        other coils and has the scalar product 1 with `direction`. The estimate and its copies `memories` are
+        changed. The reset is necessary after the sign or the gain of the coil was corrected, because the
+        estimated matrix refers to the dipole before the correction. The error of the corrected dipole becomes
+        zero, and its correlations with other states are deleted. The settings give the new relative standard
+        deviation of the corrected dipole, which along the coil is at least `deviation`.
         """
         self.changes += 1
         kept = np.eye(STATES)
@@ -573,8 +575,8 @@ class FreeFilter:
         The entries `dipole` and `sunlit_dipole` (3,), A m^2, are the residual dipole in shadow and its
         increase in sunlight. The name of each standard deviation ends with `_sigma`. The entry
         `camera_attitude_sigma` (3,), rad, is the standard deviation of the attitude of the star camera, which
-        is smaller than that of the attitude of the body. The standard deviations of inertia and coils
-        relative to the trace (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
+        is smaller than the standard deviation of the attitude of the body. The standard deviations of inertia
+        and coils relative to the trace (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
         """
         self.motion.correct(self._constants[INERTIA])
         sigma = np.sqrt(self.covariance.diagonal())
@@ -798,8 +800,8 @@ class FreeFilter:
     def _curvature(self, by_inertia: FloatArray) -> FloatArray:
         """Return the noise density (3, 3), rad^2/s^3, of second order in the error of the inertia.
 
-        The derivative of the acceleration with respect to the error is `by_inertia` (3, 6). Without this
-        noise, the first seconds of a fast tumble make the uncertainty of an unknown inertia too small.
+        The derivative of the acceleration with respect to the error is `by_inertia` (3, 6). Without noise of
+        second order, the first seconds of a fast tumble make the uncertainty of an unknown inertia too small.
         """
         spread = self.covariance[INERTIA, INERTIA]
         relative = spread.diagonal()[:3] * (self.motion.trace / self.motion.inertia.diagonal()) ** 2
@@ -873,7 +875,7 @@ _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
 def density_walk(sizes: FloatArray) -> FloatArray:
     """Return the increase (9, 9) per second of the covariance of the disturbance components `sizes` (9,).
 
-    The random walk of the air density is relative, so its effect is proportional to the aerodynamic torque.
+    The random walk is a fraction of the air density, so its effect is proportional to the aerodynamic torque.
     """
     walk = np.zeros((SIZES, SIZES))
     walk[AIR, AIR] = AIR_WALK**2 * np.outer(sizes[AIR], sizes[AIR])

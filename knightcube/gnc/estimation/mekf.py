@@ -77,7 +77,7 @@ class RateChange(NamedTuple):
 def rate_change(
     before: Accelerated, after: Accelerated, disturbance: Vector, covariance: FloatArray
 ) -> RateChange:
-    """Return the angular acceleration at a sample from the modelled accelerations before and after it.
+    """Return the angular acceleration at a sample from modelled accelerations before and after the sample.
 
     The arguments `before` and `after` are the accelerations at two times, which precede and follow the sample
     by the standard deviation of its age. The two accelerations differ if a coil command begins or ends
@@ -207,7 +207,7 @@ def _field(state: FilterState, measurement: FieldMeasurement, size: int) -> Inno
 
 @functools.cache
 def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
-    """Return the Jacobian (3, size) of a sum of states, which begin at the indices `firsts`."""
+    """Return the Jacobian (3, size) of a sum of three-element states with the first indices `firsts`."""
     rows = np.zeros((3, size))
     for first in firsts:
         rows[:, first : first + 3] += _EYE

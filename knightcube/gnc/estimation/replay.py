@@ -101,7 +101,7 @@ _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
 """Normalised squared innovation, by number of axes, above which a gyro sample corrects only the rate.
 Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with the rate.
 Before a broken coil is detected, the correlations with the rate cause wrong corrections of angle, disturbance
-and coil gain. Without this limit, the angle error reached 40 standard deviations although the rate was
+and coil gain. Without the limit, the angle error reached 40 standard deviations although the rate was
 correct. In a consistent filter, one gyro sample in forty exceeds the limit."""
 
 

@@ -160,8 +160,8 @@ class RigidBody:
     ) -> Linearised:
         """Return the angular acceleration at attitude `q` for the coil state `torquing`, with derivatives.
 
-        The gyroscopic torque is computed for the predicted rate `ahead` seconds later. With this prediction,
-        the error of the midpoint rule for a tumbling body is of third order per step.
+        The gyroscopic torque is computed for the predicted rate `ahead` seconds later. With the predicted
+        rate, the error of the midpoint rule for a tumbling body is of third order per step.
         """
         x, y, z = times(self._response, self._gyroscopic(rate))
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
@@ -288,7 +288,7 @@ _DRAWS = 2000
 """Number of random inertia tensors from which the covariance of the coefficients Q is computed. The six
 largest principal components of Q for 1000 and for 4000 random tensors agree within 5 %."""
 _NEGLIGIBLE = 1e-6
-"""Variance of a principal component of Q, relative to the largest variance, below which it is omitted."""
+"""Variance of a principal component of Q, as a fraction of the largest, below which it is omitted."""
 
 
 @dataclass(frozen=True, slots=True)

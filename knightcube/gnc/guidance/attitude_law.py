@@ -10,7 +10,7 @@ about the first direction.
 The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
 `across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
 the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
-If the roll is free, the body keeps the roll that it has when the attitude law begins.
+If the roll is free, the body keeps the roll angle of the time at which the attitude law begins.
 """
 
 from __future__ import annotations
@@ -222,8 +222,9 @@ def free_roll(
 def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
     """Return the function for the direction to an object that moves on a straight line relative to the body.
 
-    At the time `since`, s, the unit vector `direction` (3,) points to the object. The relative velocity of
-    the object divided by the distance is `velocity` (3,), 1/s, which is zero for a fixed direction.
+    At the time `since`, s, the unit vector `direction` (3,) points to the object. The argument `velocity`
+    (3,), 1/s, is the object's velocity relative to the satellite, divided by the distance, and zero for a
+    fixed direction.
     """
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:

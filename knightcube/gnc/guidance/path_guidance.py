@@ -39,8 +39,8 @@ class AcceptanceRules:
         late_after: longest accepted delay of a plan, from the start time of its path to its arrival, s.
         angle_tolerance: largest difference between the start angle of a plan and the estimated angle, rad.
         rate_tolerance: largest difference between the start rate of a plan and the estimated rate, rad/s.
-        q2_limit: upper bound of |q2|, which a path may exceed by a relative amount of 1e-3.
-        current_excess: largest relative amount by which a path may exceed the plant's current limit.
+        q2_limit: upper bound of |q2|, which a path may exceed by 0.1 %.
+        current_excess: largest excess of a path over the plant's current limit, as a fraction of the limit.
     """
 
     late_after: float

@@ -187,7 +187,7 @@ def current_and_slopes(
 
 
 _ROUNDED = 0.1
-"""Parameter e of the smooth approximation of |I| in the cost, relative to Imax. The cost uses sqrt(I^2 + e^2)
+"""Parameter e of the smooth approximation of |I| in the cost, divided by Imax. The cost uses sqrt(I^2 + e^2)
 - e instead of |I|, because the slope of |I| is discontinuous."""
 
 

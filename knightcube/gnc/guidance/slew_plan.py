@@ -4,7 +4,7 @@ Coils cause only torques normal to the magnetic field, so a path is planned toge
 The whole motion is discretised by collocation and solved by an interior point method (`slew_program`), from
 several initial guesses (`slew_search`). The path is then corrected until a Runge-Kutta integration of the
 motion reaches the end of the path. The collocation error on 24 intervals is a few thousandths of a degree.
-For this correction, the motion is integrated in small steps from the first node of each interval. The
+To correct a path, the motion is integrated in small steps from the first node of each interval. The
 differences between the integrated states and the states at the next nodes are removed with one factored
 Newton matrix (multiple shooting with the chord method). The energy of a slew is the heat produced in the
 coils, J. The planner is deterministic and has no side effects.

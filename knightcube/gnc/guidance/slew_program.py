@@ -152,7 +152,7 @@ _AXIS = np.arange(3)
 class Trajectory:
     """States (2 k + 1, 7) at nodes and midpoints, and dipoles (k + 1, 3) at nodes.
 
-    The unit of time is the slew's duration, and the unit of dipoles is that of `SlewDynamics`.
+    The unit of time is the slew's duration, and dipoles have the unit of `SlewDynamics`.
     """
 
     states: FloatArray
@@ -396,7 +396,7 @@ _HEAVIER = 1.2
 _FAR = 0.03
 """Sum of the constraint violations above which the second derivatives of the equations are omitted."""
 _DAMPED = 3e-3
-"""Minimum convexification far from a feasible point, which prevents excessive steps. This value applies to a
+"""Minimum convexification far from a feasible point, which prevents excessive steps. The value applies to a
 constraint violation of one and above; for smaller violations, the minimum is proportional to the
 violation."""
 _CONVEX = 1e-3, 1e4

@@ -302,8 +302,8 @@ class VmcProgram:
     def __init__(self, task: SlewTask, scale: float, prey: FloatArray, count: int = NODES) -> None:
         """Set up a family of paths on `count` nodes about the initial guess `prey`, given as states (n, 7).
 
-        The attitudes and rates at both ends are those of the task. The parameters are whitened: at the
-        initial guess, the Hessian of the heat is close to the unit matrix.
+        The task defines the attitudes and rates at both ends of the paths. The parameters are whitened: at
+        the initial guess, the Hessian of the heat is close to the unit matrix.
         """
         end = task.end(scale)
         q = prey[:, :4] * np.sign(prey[0, :4] @ task.quaternion)

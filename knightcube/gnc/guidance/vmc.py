@@ -8,8 +8,8 @@ well. Energy is the integral of R I^2 in J, without the factor 1/2 of Sease, eq.
 
 Every search for a duration (`horizon`) minimises energy plus time cost times duration, between a shortest and
 a longest duration. With a time cost far above the power of the coil, and the requested duration as lower
-bound, the result is the requested duration if it is feasible, and otherwise the shortest feasible duration.
-The planner therefore never has to solve an infeasible nonlinear program.
+bound, the search returns the requested duration if this duration is feasible, and otherwise the shortest
+feasible duration. The planner therefore never has to solve an infeasible nonlinear program.
 
 The planner is deterministic, so that the same arguments give the same plan in any process.
 """
@@ -243,8 +243,8 @@ NODES = 24
 1.1 times the shortest duration, and an extended duration is at most 1.5 % too long. With 16 nodes, planning
 takes half the time and an extended duration is at most 2.5 % too long."""
 FINE_NODES = 40
-"""Number of nodes for paths that reach the current limit near the requested duration. The cost of these paths
-is up to 0.3 % above the optimum with 24 nodes, and up to 0.07 % with 40 nodes."""
+"""Number of nodes for paths that reach the current limit near the requested duration. The cost of a path
+along the current limit is up to 0.3 % above the optimum with 24 nodes, and up to 0.07 % with 40 nodes."""
 _NEARLY = 1.03
 """Largest extension factor of a duration after which a path of the requested duration is searched with more
 nodes."""

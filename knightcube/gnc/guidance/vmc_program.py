@@ -187,12 +187,12 @@ def time_scale(horizon: float) -> FloatArray:
 
 
 LIMIT_TOLERANCE = 3e-4
-"""Largest relative amount by which a path may exceed a limit on the dense grid. Between the points of the
-dense grid, the path then exceeds a limit by less than the fraction 1e-3."""
+"""Largest excess of a path over a limit on the dense grid, as a fraction of the limit. Between the points of
+the dense grid, the path then exceeds a limit by less than the fraction 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
-"""Relative margin by which an imposed limit is tightened, so that peaks between the imposed points do not
-exceed the limit. Without this margin of the imposed limits, the exchange method converges slowly."""
+"""Fraction by which an imposed limit is tightened, so that peaks between the imposed points do not exceed the
+limit. Without a margin of the imposed limits, the exchange method converges slowly."""
 
 SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
 """Exceptions that a run of NLopt without a result raises. NLopt 2.11 raises `nlopt.runtime_error`, and older
@@ -290,7 +290,7 @@ class PathProgram:
     def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
         """Return the energy (J), its gradient (N - 4,), and its derivative with respect to the duration.
 
-        For heat, the integral is that of Sease, eq. (5.8), without the factor 1/2 of eq. (5.1).
+        For heat, the energy is the integral of Sease, eq. (5.8), without the factor 1/2 of eq. (5.1).
         """
         points, horizon = self._cost_points, trial.horizon
         trajectory = points.trajectory(trial.parameters, horizon)
@@ -348,8 +348,8 @@ class PathProgram:
         if converged:
             return trial
         # If the start is already the optimum, NLopt reports limited progress due to rounding errors.
-        # This report is not a failure if a further step could save little energy.
-        # That energy is estimated by half the squared gradient with respect to the whitened parameters.
+        # The report is not a failure if a further Newton step would reduce the energy only a little.
+        # The reduction is estimated as half the squared gradient with respect to the whitened parameters.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
@@ -412,7 +412,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except SOLVER_STOPS:
-            # NLopt raises these after a negligible line search, for trivial and infeasible problems.
+            # NLopt raises an exception after a negligible line search, for trivial and infeasible problems.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in CONVERGED
 

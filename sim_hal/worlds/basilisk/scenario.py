@@ -1,9 +1,9 @@
 """The Basilisk simulation of one spacecraft: modules, messages and their connections.
 
 Basilisk's own modules compute the dynamics, the gravity with J2, the gravity gradient, the magnetic field
-(WMM), drag, solar pressure and eclipses. This simulator provides the properties of the craft, the orbital
-elements, the Earth's orientation and the Sun's position. The simulation uses no data that Basilisk downloads
-from the network.
+(WMM), drag, solar pressure and eclipses. The package `sim_hal` provides the properties of the craft, the
+orbital elements, the Earth's orientation and the Sun's position. The simulation uses no data that Basilisk
+downloads from the network.
 """
 
 from __future__ import annotations
@@ -198,6 +198,6 @@ def _column(vector: FloatArray) -> list[list[float]]:
 
 
 def rodrigues(attitude: FloatArray) -> FloatArray:
-    """Return the modified Rodrigues parameters (3,) of a quaternion (4,), those of the shorter rotation."""
+    """Return the modified Rodrigues parameters (3,) of a quaternion (4,), for the shorter rotation."""
     q = attitude if attitude[3] >= 0.0 else -attitude
     return np.asarray(q[:3] / (1.0 + q[3]))
