@@ -73,9 +73,10 @@ class MotionModel:
         rate: initial standard deviation of each component of the angular rate, rad/s.
         closing: initial standard deviation of the ratio (range rate) / range, 1/s.
         wander: noise density of the tidal acceleration divided by the range, 1/s^3. Between two low orbits
-            with the orbital rate n, the component of this acceleration across the line of sight is at most
-            1.5 n^2 = 1.8e-6 1/s^2. With the default density, the errors of direction and rate agree with the
-            covariance in passes with angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
+            with the orbital rate n, the component of the tidal acceleration across the line of sight, divided
+            by the range, is at most 1.5 n^2 = 1.8e-6 1/s^2. With the default density, the errors of direction
+            and rate agree with the covariance in passes with angular rates of 0.05 to 0.6 deg/s and ranges of
+            up to 5,000 km.
         residual_wander: noise density that replaces `wander` if the gravity gradient is known, 1/s^3.
         bend: standard deviation of the unmodelled rate of change of the ratio (range rate) / range on curved
             paths, as a multiple of the squared angular rate of the object.

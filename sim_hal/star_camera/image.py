@@ -317,7 +317,7 @@ def _passes(
     """Return the times (n,), s, at which the row of each source has been exposed for `phase` s."""
     outside = reach + 1.0
     times = np.full(len(sources), shutter.start + phase + 0.5 * camera.rows * shutter.line_time)
-    # For sources on the detector, each iteration reduces the error to a quarter or less.
+    # For sources on the detector, each iteration reduces the time error to a quarter or less.
     for _ in range(math.ceil(math.log(SETTLED / camera.rows) / math.log(FASTEST)) + 1):
         row = camera.project(vectors(times[None], sources))[0, :, 1]
         row = np.clip(np.nan_to_num(row, nan=-outside), -outside, camera.rows + outside)

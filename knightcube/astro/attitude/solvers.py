@@ -1,32 +1,39 @@
 """Solvers of Wahba's problem with a common signature (Michalski, section 3.4).
 
 Most solvers (`PROFILE_METHODS`) compute the optimal quaternion from the attitude profile matrix B (3, 3),
-with weights that sum to one. The function `refine` of the module `wahba` then corrects the rounding errors of
-B. The default solver is Davenport's q-method, because it has no singularity and no iteration that can fail,
-and because LAPACK decomposes a 4 x 4 matrix faster than Python evaluates the closed-form solutions. If the
-formula of a solver is singular, the reference frame is first rotated by 180 deg about one of its axes
-(sequential rotation). The function `weighted_fit` solves the least-squares problem with a full covariance
-matrix per direction.
+with weights that sum to one. The function `refine` of the module `wahba` corrects the effect of the rounding
+errors of B on the quaternion. The default solver is Davenport's q-method, because it has no singularity and
+no iteration that can fail, and because LAPACK decomposes a 4 x 4 matrix faster than Python evaluates the
+closed-form solutions. If the formula of a solver is singular, the reference frame is first rotated by 180 deg
+about one of its axes (sequential rotation). The function `weighted_fit` solves the least-squares problem with
+a full covariance matrix per direction.
 
 - Davenport's q-method: Michalski, section 3.4.2, eq. 69-75.
+
 - SVD: Michalski, eq. 80-84, corrected (the determinants occur only once, in the middle), and Markley,
   Attitude determination using vector observations and the singular value decomposition, Journal of the
   Astronautical Sciences 36 (1988).
+
 - QUEST: Michalski, section 3.4.4, eq. 78 and 79, and Shuster and Oh, Three-axis attitude determination from
   vector observations, Journal of Guidance and Control 4 (1981). The Rayleigh quotient avoids the loss of
   accuracy of Newton's method (Cheng and Shuster, Journal of Guidance, Control, and Dynamics 37, 2014).
+
 - ESOQ2: Sease, chapter 3, text at eq. 3.23; Mortari, ESOQ-2 single-point algorithm, Advances in the
   Astronautical Sciences 95 (1997), and Markley and Mortari, Quaternion attitude estimation using vector
   observations, Journal of the Astronautical Sciences 48 (2000).
+
 - FOAM: Michalski, section 3.4.6, and Markley, Attitude determination using vector observations: a fast
   optimal matrix algorithm, Journal of the Astronautical Sciences 41 (1993).
+
 - Predictive filter: In each step the filter chooses the body rate that minimises the weighted residuals of
   the directions predicted to first order (Michalski, section 3.4.1, without a formula; Crassidis and Markley,
   Journal of Guidance, Control, and Dynamics 20, 1997; Park and Crassidis, Navigation 53, 2006). For
   measurements at one time, the steps converge to the solution of Wahba's problem without rounding errors of
   B.
+
 - TRIAD: The attitude follows from the pair of directions whose covariance has the smallest trace, and the
   first direction of the pair is assumed to be exact (Michalski, section 3.4.5; covariance of Shuster and Oh).
+
 - OLAE (optimal linear attitude estimator): The Gibbs vector follows from linear least squares (Sease, eq.
   4.1-4.7). For an observed direction b = A r and the Gibbs (Rodrigues) vector g of A, the equation [s x] g =
   d is exact, where s = b + r and d = b - r. If r are the starts and b the ends of star streaks, A is the

@@ -45,8 +45,8 @@ LARGEST_ROTATION = 0.15
 COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
 """Longest time (s) and largest rotation (rad) of the body in one propagation step of the covariance."""
 _LINEARISED = 0.2
-"""Fraction of the standard deviation of the inertia that is added as noise while the rate is known. The noise
-represents products of errors, which the linearised filter neglects."""
+"""Noise of the gyroscopic torque as a fraction of its uncertainty due to the inertia, while the rate is
+known. The noise represents products of errors, which the linearised filter neglects."""
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)

@@ -10,18 +10,25 @@ error state (see `error_state`) contains these blocks:
 - `inertia`: errors of the inertia tensor, relative to the trace, in which Euler's equation is linear. In a
   tumble about more than one axis, the ratios of the moments of inertia and the principal axes are observable
   (Psiaki 2005, JGCD 28(4)). The common scale is observable only relative to the dipole moment of the coils.
+
 - `coils`: matrix of gain errors and misalignments of the coils. The estimated dipole is the commanded dipole
   plus this matrix times the commanded dipole.
+
 - `gyro_matrix`, `field_matrix`: scale errors and misalignments of both sensors (Pittelkau 2001, JGCD 24(6)).
+
 - `camera`: misalignment of the star camera, whose attitude is known more accurately than the attitude of the
   body.
+
 - `horizon`: misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
   cameras are used, so this block is a Gauss-Markov process with a long correlation time.
+
 - `coil_variation`: relative variation of the dipole along each body axis, for example because the supply
   voltage varies, as a Gauss-Markov process with a correlation time of tens of seconds.
+
 - `field_error`: error of the field model, correlated over minutes, as a Gauss-Markov process of first order
   in body axes. While the attitude is known accurately, its standard deviation is estimated by expectation
   maximisation (Dempster, Laird & Rubin 1977), from the square and the variance of the estimated error.
+
 - Biases of gyro and magnetometer, the residual dipole in shadow, its increase in sunlight, and the components
   of the disturbance torques of `knightcube.astro.earth.disturbance`.
 """

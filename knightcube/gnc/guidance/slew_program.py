@@ -380,7 +380,7 @@ class SlewLimits:
         return states, heavy
 
     def _parts(self, values: FloatArray, at: Trajectory) -> tuple[FloatArray, FloatArray]:
-        """Return the elements of `values` for the dipole limits and those for the exclusion cones."""
+        """Return the elements of `values` for the dipole limits, and the elements for the exclusion cones."""
         nodes = 0 if self.dipole is None else 2 * at.dipoles.size
         dipoles = values[:nodes].reshape(2, -1, 3) if nodes else values[:0]
         return dipoles, values[nodes:].reshape(self.cones.count, len(at.states) - 1)

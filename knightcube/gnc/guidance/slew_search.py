@@ -385,8 +385,8 @@ ENOUGH = 3
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors by which the requested duration is multiplied, one after the other, until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Ratio by which the first step shortens a slew (first value), and ratio between the shortest duration with a
-path and the longest duration without a path below which the shortening ends (second value). The three pairs
+"""Factor by which the first step shortens a slew (first value). The shortening ends when the shortest
+duration with a path divided by the longest duration without a path is below the second value. The three pairs
 are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
 _CROSSED = 1.3
 """Angle by which a cone that a path crosses between two points is widened, divided by the depth of the path
