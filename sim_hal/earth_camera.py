@@ -454,7 +454,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EarthCameraModel:
-    """A wide-angle CMOS camera; radiance 1 is that of a white Lambertian surface with the Sun at the zenith.
+    """A wide-angle CMOS camera; a white Lambertian surface with the Sun at the zenith has radiance 1.
 
     Attributes:
         lens: camera geometry, a `Pinhole` or a `Lens` with distortion.

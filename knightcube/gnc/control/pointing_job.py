@@ -248,7 +248,7 @@ def slew_table(
 ) -> PointingTable:
     """Return the pointing table for a slew and the following attitude law.
 
-    The time step of this table is a fifth of the time step of `begin.times`.
+    The time step of the returned table is a fifth of the time step of `begin.times`.
 
     The path was planned with the residual dipole moment `residual` (3,), A m^2. Only the environment in
     `expected` is used, which is given at the times of `begin`.

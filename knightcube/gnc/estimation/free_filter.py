@@ -226,8 +226,9 @@ CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
 """Expected magnitudes of the constant, aerodynamic and solar radiation torques, as multiples of the
-aerodynamic torque. The constant torque is small, because the error of the inertia has its own states, and
-because an aerodynamic torque that is attributed to the constant torque is wrong at every other attitude."""
+aerodynamic torque. The constant torque is assumed to be small, because the error of the inertia has its own
+states, and because an aerodynamic torque attributed to the constant torque would be wrong at every other
+attitude."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

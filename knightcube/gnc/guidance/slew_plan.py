@@ -165,7 +165,7 @@ class SlewPlan:
     steps: int
 
     def __repr__(self) -> str:
-        """Return status, duration, heat and largest dipole moment, in one line."""
+        """Return status, duration, heat and largest dipole moment as one line of text."""
         return (
             f"<SlewPlan {self.status}: {self.horizon:g} s, heat {1e3 * self.energy:.4g} mJ, "
             f"peak dipole {100.0 * self.peak:.3g} % of the limit>"
@@ -359,7 +359,7 @@ class OrderedSlew:
     compared: int
 
     def __repr__(self) -> str:
-        """Return the start and the plan, in one line."""
+        """Return the start time and the plan as one line of text."""
         return f"<OrderedSlew: begins at {self.begin:g} s, {self.plan!r}>"
 
 

@@ -216,7 +216,7 @@ class HorizonSearch:
     def _resumed(self, program: PathProgram, warm: FloatArray, asked: float, longest: float) -> Trial | None:
         """Return the path found by a warm start, or None.
 
-        The limits are imposed at once if the start reaches a limit.
+        If the warm start itself reaches a limit, no solution without limits is computed.
         """
         start = program.beside_prey(warm, asked)
         worst = float(np.abs(program.ratios(start)).max())
@@ -300,7 +300,7 @@ class StepPlan:
     node_q2: FloatArray
 
     def __repr__(self) -> str:
-        """Return status, duration, energy and peak current, in one line."""
+        """Return status, duration, energy and peak current as one line of text."""
         return (
             f"<StepPlan {self.status}: {self.horizon:g} s, heat {1e3 * self.energy:.4g} mJ, "
             f"peak current {1e3 * self.peak_current:.4g} mA>"
