@@ -181,10 +181,10 @@ class CageTruth(Section, frozen=True, kw_only=True):
 class SkySection(Section, frozen=True, kw_only=True):
     """Sky and optics of the emulated star camera.
 
-    The thesis (Sease, chapter 2) uses `psf: bilinear` and `noise: uniform`. In orbit, stray light saturates a
-    frame if the boresight is within `sun_exclusion_deg` of the Sun or within `earth_exclusion_deg` of sunlit
-    ground, and whenever one of them is in the field of view. The default exclusion angles are typical of a
-    star tracker with a baffle that fits into a CubeSat.
+    The model of Sease 2013, chapter 2, corresponds to `psf: bilinear` and `noise: uniform`. In orbit, stray
+    light saturates a frame if the boresight is within `sun_exclusion_deg` of the Sun or within
+    `earth_exclusion_deg` of sunlit ground, and whenever one of them is in the field of view. The default
+    exclusion angles are typical of a star tracker with a baffle that fits into a CubeSat.
     """
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5

@@ -104,7 +104,7 @@ def from_rotation_vector(vector: FloatArray) -> FloatArray:
     if v.ndim == 1:
         x, y, z = v.tolist()
         half_angle = 0.5 * math.sqrt(x * x + y * y + z * z)
-        phase = np.pi * (half_angle / np.pi)  # this product rounds in the same way as numpy.sinc
+        phase = np.pi * (half_angle / np.pi)  # numpy.sinc rounds in the same way
         scale = 0.5 * (np.sin(phase) / phase) if phase else 0.5
         return np.array([scale * x, scale * y, scale * z, np.cos(half_angle)])
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)

@@ -140,7 +140,7 @@ class EmulatedIcm20948(Registers):
         self._held[self._bank, register] = value
         if (self._bank, register) == (0, 0x06) and value & 0x80:
             self.reset()
-        if (self._bank, register) == (3, 0x15) and value & 0x80:  # start of a transfer on the internal bus
+        if (self._bank, register) == (3, 0x15) and value & 0x80:  # start a transfer on the internal bus
             self._transfer()
 
     def load(self, register: int) -> int:

@@ -181,7 +181,7 @@ class MessageData:
     Attributes:
         device_ns: time of the unit's clock since the unit's start, ns.
         sample: measured sample.
-        status: VPE status word.
+        status: status word of the attitude filter (VPE).
         interval: time since the previous output of the same kind, s, over which changes are integrated.
         temperature: reported temperature, degrees C.
         pressure: reported pressure, kPa.

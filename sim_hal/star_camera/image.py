@@ -88,7 +88,7 @@ def integrated_gaussian(sigma: float) -> PointSpread:
 
 @lru_cache(maxsize=8)
 def bilinear_gaussian(sigma: float) -> PointSpread:
-    """Return the point spread function of the thesis.
+    """Return the point spread function of Sease 2013.
 
     The point spread function places the charge on the four nearest pixels (Sease, eqs. 2.5 and 2.6) and blurs
     it by a 3 x 3 kernel (Sease, eq. 2.9).
@@ -394,7 +394,7 @@ class StarCameraModel:
             where 19,000 is per mm^2).
         read_noise: standard deviation of the read noise, e-.
         dark_current: dark current of each pixel, e-/s.
-        gain: charge per count, e-, which the thesis calls quantum efficiency.
+        gain: charge per count, e-, which Sease 2013 calls quantum efficiency.
         pedestal: counts added before the analogue-to-digital conversion, so that negative noise is not
             clipped.
         bits: resolution of the analogue-to-digital converter, bits.
@@ -665,9 +665,10 @@ def _exact(
 def _uniform(
     model: StarCameraModel, light: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Float32Array:
-    """Return the charge (e-) with added uniform noise as in the thesis.
+    """Return the charge (e-) with added uniform noise as in Sease 2013.
 
-    The noise is the sum of sqrt(signal) and sqrt(RN^2 + DC T), each multiplied by a uniform draw from 0 to 1.
+    The noise is the sum of sqrt(signal) and sqrt(read noise^2 + dark charge), each multiplied by a uniform
+    draw from 0 to 1.
     """
     rest = np.sqrt(model.read_noise**2 + model.dark_current * exposure)
     signal = light + np.sqrt(light) * rng.random(light.shape, dtype=np.float32)

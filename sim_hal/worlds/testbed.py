@@ -37,7 +37,7 @@ from sim_hal.worlds.world import (
 )
 
 VACUUM_PERMEABILITY = 4e-7 * math.pi
-"""Vacuum permeability (T m/A), with the value of the thesis."""
+"""Vacuum permeability (T m/A), with the value of Sease 2013."""
 
 
 def helmholtz_field(turns: float, current: float, radius: float) -> float:

@@ -113,7 +113,7 @@ def _expansion(
 ) -> list[tuple[float, float, float]]:
     """Return the north, east and down components, nT, with the same operations as `GeoMag.calculate`."""
     model = _model()
-    assert model.model  # not empty, because the coefficients have been read
+    assert model.model  # The model is not empty, because its coefficients have been read.
     lowest, highest = FIRST_YEAR - LONGEST_EXTRAPOLATION, LAST_YEAR + LONGEST_EXTRAPOLATION
     since = np.minimum(np.maximum(years, lowest), highest) - model._epoch
     at = [math.radians(math.degrees(angle)) for angle in latitude.tolist()]

@@ -8,7 +8,7 @@ that the tracker can follow the planned path. Functions with singular names (`cu
 `math`, because they run in the 40 Hz control loop. Functions with plural names (`currents`) accept arrays of
 equal shape.
 
-The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
+The coils are driven by pulse-width modulation with a period of 20 ms (Sease 2013, chapter 5). The time
 constant L/R of a coil, 0.1 ms, is short compared with the period, so the coil current is V/R while the
 H-bridge drives the coil, and otherwise zero. At a mean coil current I the supply delivers the power V |I|
 with V = R Imax, which is dissipated in the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady
