@@ -302,7 +302,8 @@ def _rms(frames: Sequence[MatchedFrame], lens: Lens, used: Sequence[BoolArray]) 
 class OmittedTerm:
     """A lens term that the stars do not determine: last fitted values and their standard deviations.
 
-    The calibrated lens has the values `assumed` instead: one for k1 and k2, and x and y for the centre.
+    The calibrated lens has the values `assumed` instead: one value for k1 or k2, and two values (x and y) for
+    the centre.
     """
 
     values: tuple[float, ...]
@@ -548,7 +549,7 @@ def calibrate_lens(
 
 
 def _mirrored_back(found: LensCalibration) -> LensCalibration:
-    """Return the calibration of mirrored images from the one `found` after each row was reversed."""
+    """Return the calibration of mirrored images from the calibration `found` of images with reversed rows."""
     if found.determined is None:
         return replace(found, mirrored=True)
     determined = found.determined

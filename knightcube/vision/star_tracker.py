@@ -380,7 +380,7 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
 def _solution(
     frame: FrameSolution, sky: SkyIndex, velocity: FloatArray | None, exposure_known: bool
 ) -> StarSolution:
-    """Return the solution for the user from the results of a frame."""
+    """Return the public solution (`StarSolution`) from the results of a frame."""
     fix, matched, motion = frame.fix, frame.matched, frame.motion
     pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
     if fix is None:

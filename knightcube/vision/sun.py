@@ -326,7 +326,7 @@ def _disc(
 def _trace(
     strip: Image, first_row: int, camera: CameraModel, axis: FloatArray, level: float, reach: float
 ) -> _Rim:
-    """Return the rim within `reach` rad around `axis` (3,) in `strip`, the rows from `first_row`."""
+    """Return the rim within `reach` rad around `axis` (3,), from image rows `strip` from `first_row` on."""
     basis = tangent_basis(axis)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
     ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)

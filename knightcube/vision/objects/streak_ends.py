@@ -67,7 +67,7 @@ class Regions:
         return select(self, chosen, "labels")
 
     def is_significant(self, sigmas: float, background: Background) -> BoolArray:
-        """Return the mask (n,) of the regions whose flux is at least `sigmas` times its noise."""
+        """Return the mask (n,) of the regions whose flux is at least `sigmas` standard deviations."""
         return np.asarray(self.flux >= sigmas * background.typical_noise * np.sqrt(self.area))
 
     def __len__(self) -> int:

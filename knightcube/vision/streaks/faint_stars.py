@@ -422,7 +422,7 @@ def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: flo
 
 
 def profile(distance: FloatArray) -> FloatArray:
-    """Return the filter response to a star at a `distance` (px) across its circle, relative to the peak."""
+    """Return the filter response to a star at a `distance` (px) across its circle, divided by the peak."""
     index = np.minimum(np.abs(distance) * _PER_PX + 0.5, len(_PROFILE) - 1.0).astype(np.int64)
     return np.asarray(_PROFILE[index])
 
@@ -805,7 +805,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     common = np.stack([first, last], axis=-1)
     overlap = overlap_of(column[one], column[other], common, grid.length)
     overlap = overlap * profile((row[one] - row[other]) * ACROSS)
-    # The right-hand side has the diagonal's factor, so that regularisation does not bias isolated stars.
+    # Diagonal and right-hand side get the same factor, so that heights of isolated stars are unbiased.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(np.float64)

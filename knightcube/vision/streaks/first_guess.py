@@ -496,7 +496,7 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
 
 
 def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
-    """Return likely rotation angles (rad), each with the fraction of flux in regions that exceed it."""
+    """Return likely rotation angles (rad), and the fractions of flux in regions longer than each angle."""
     whole = guess.agree & ~regions.cut & (guess.width > 0.0)
     candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
     spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates

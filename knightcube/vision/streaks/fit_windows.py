@@ -420,7 +420,7 @@ class FitWindows:
 
 
 def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
-    """Return the sum (count,), over the values of `first` and `second`, of all counts on each fitted pixel.
+    """Return the sums (count,) of the counts in `first` and `second` that belong to each fitted pixel.
 
     The array `slot` contains the index of the pixel for each value of `first`, and then of `second`.
     """
@@ -485,7 +485,7 @@ def cut_windows(
 
 
 def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the list of m distinct fitted pixels, the index of each pixel in the list, and frequencies (m,).
+    """Return the m distinct fitted pixels, the index of each pixel in this list, and occurrences (m,).
 
     The pixels are given as flat indices `index` (p,) in a frame of `size` pixels, which contain repeated
     values if windows overlap. The returned index is m for a pixel that is not `inside`.

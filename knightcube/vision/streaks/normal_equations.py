@@ -11,8 +11,8 @@ Each star also provides its own estimate of the shared parameters. A blend of tw
 than the image of a single star, and the flux of a neighbouring star shifts the ends of a streak. Blended
 stars are excluded from the fit of the motion, because their estimates disagree with the majority.
 
-A vector of all parameters consists of the s parameters common to all stars, followed by a further parameters
-for each of the n stars.
+The vector of all parameters has the length s + n a: s parameters are common to all stars, and `a` parameters
+belong to each of the n stars.
 """
 
 from __future__ import annotations
@@ -329,7 +329,7 @@ def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, 
 
 
 def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
-    """Return the indices (e,) of the blocks that contain e pixels, and the values (i, e) of i images there.
+    """Return the blocks (e,) that contain e pixels, and the values (i, e) of i images on these pixels.
 
     The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
     the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
@@ -766,7 +766,7 @@ def _add_scaled(total: Any, factor: Any, values: Any) -> None:
         total[k] += factor * values[k]
 
 
-# Fisher information, as a fraction of that of the most informative star, below which a star is ignored.
+# Ratio of a star's Fisher information to the largest of all stars below which the star is ignored.
 _NOTHING = 1e-9
 # Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.
 _KNOWN = 1e-4

@@ -166,7 +166,7 @@ IMAGES = 7
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths) along a path between a pixel and the crossing of its line.
+# Largest distance (point-spread widths) along a path from a pixel to where the path crosses its line.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in units of the exposure time.
 _STEP = 1e-4

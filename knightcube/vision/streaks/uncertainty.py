@@ -81,7 +81,7 @@ def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement
 
 
 def _sensitive(left: StreakResiduals, change: Float32Array) -> BoolArray:
-    """Return which fitted pixels are sensitive to a displacement, given the `change` of their counts."""
+    """Return the mask of fitted pixels sensitive to a displacement, given the `change` of their counts."""
     most = change.max(axis=(1, 2), keepdims=True, initial=0.0)
     return np.asarray((left.weight > 0.0) & (change > _LEAST_SENSITIVITY * most))
 
@@ -219,7 +219,7 @@ def _error_root(camera: FitProblem) -> FloatArray:
     """Return a root (5, m) of the covariance of the calibration errors, one column per independent error.
 
     The rows are relative focal length, centre x and y (px), distortion at the corner, and line time (s). If
-    the errors are independent, the line time is the last column.
+    the errors are independent, the last column is the error of the line time.
     """
     known = camera.settings.knowledge
     if known.covariance is not None:
