@@ -66,7 +66,7 @@ class Rail:
         self._shown = (0.0, 0.0)
 
     def measure(self, *_: int) -> tuple[float, float]:
-        """Return the measured voltage (V) and current (A), whatever the time window."""
+        """Return the measured voltage (V) and current (A), which do not depend on the time window."""
         if not self.stuck:
             self._shown = (self.gain * self.values[0], self.gain * self.values[1])
         return self._shown

@@ -18,8 +18,8 @@ requested times.
 The air density is an exponential profile (Vallado, Fundamentals of Astrodynamics, 4th ed. 2013, Table 8-4)
 with a diurnal bulge. The apex of the diurnal bulge is 30 deg east of the Sun in right ascension, and the
 density falls off as cos^4 of half the angle from the apex (Montenbruck & Gill 2000, section 3.5.2,
-Harris-Priester). The density at the apex is four times that on the opposite side, as near 500 km at mean
-solar activity.
+Harris-Priester). The density at the apex is four times the density on the opposite side, a typical ratio near
+500 km altitude at mean solar activity.
 
 The Earth's true magnetic field is the International Geomagnetic Reference Field, 14th generation (IGRF-14).
 The field is an expansion in spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49,

@@ -224,8 +224,8 @@ class FilterSettings:
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
         rate_walk: random walk of the rate due to torque noise, without the coils, rad/s per sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
-        gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
-            component by this many standard deviations.
+        gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
+            probable than a one-dimensional deviation of this size.
         history_ns: largest delay of a measurement that is still used, ns.
         longest_step: longest propagation step, s; longer steps are suitable for a slowly rotating body.
     """

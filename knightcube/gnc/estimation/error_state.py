@@ -252,7 +252,7 @@ class PriorCheck:
 def gate_bounds(sigma: float) -> dict[int, float]:
     """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 
-    A larger square is less likely than a deviation of one component by `sigma` standard deviations.
+    A larger square is less probable than a one-dimensional deviation by `sigma` standard deviations.
     """
     chance = math.erfc(sigma / math.sqrt(2.0))
     return {components: chi_square.bound(chance, components) for components in (1, 2, 3)}

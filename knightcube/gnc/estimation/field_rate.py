@@ -66,8 +66,8 @@ class FieldRateSettings:
         torque_walk: random walk of the rate per axis due to unmodelled torques, rad/s per sqrt(s).
         errors: largest errors of the body's description; only the errors of the inertia are used.
         inertia_walk: random walk of the inertia, relative to its trace, per sqrt(s).
-        gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
-            component by this many standard deviations.
+        gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
+            probable than a one-dimensional deviation of this size.
         refusals: number of consecutively rejected measurements after which the filter restarts (field
             measurements) or the gyro is excluded (gyro measurements).
         gyro_sigma: assumed bound of the gyro bias per axis, rad/s.

@@ -261,8 +261,8 @@ class FreeFilterSettings:
         rate_start: initial standard deviation of the rate, rad/s.
         fine, coarse: largest standard deviation, rad, of an attitude of the accuracy class FINE and COARSE,
             about the least certain axis.
-        gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
-            component by this many standard deviations.
+        gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
+            probable than a one-dimensional deviation of this size.
     """
 
     gyro: tuple[float, float] = (1e-3, 2e-6)

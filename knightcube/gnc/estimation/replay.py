@@ -306,7 +306,7 @@ class CheckpointHistory:
 
     @property
     def newest_used(self) -> Checkpoint:
-        """The newest checkpoint whose measurement passed the gate, or the newest one if none passed."""
+        """The newest checkpoint whose measurement passed the gate; if none passed, the newest checkpoint."""
         return next((c for c in reversed(self._checkpoints) if c.used), self._checkpoints[-1])
 
     def at(self, time_ns: int) -> Checkpoint | None:

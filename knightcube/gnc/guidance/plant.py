@@ -361,7 +361,7 @@ class PolynomialPath:
         return cls(origin_ns, 0.0, (), angle)
 
     def starting_at(self, origin_ns: int) -> PolynomialPath:
-        """Return a copy of the path that starts at `origin_ns`."""
+        """Return a copy of the path with the start time `origin_ns`."""
         return replace(self, origin_ns=origin_ns)
 
     def has_ended(self, now_ns: int) -> bool:
