@@ -44,7 +44,7 @@ class Bench:
         self.wall_ns = 1_700_000_000 * S
         self.sampled: Any = None
         self.ended = 0
-        self.power = SimpleNamespace(
+        self.power: Any = SimpleNamespace(
             said="", reading=None, error=lambda: self.power.said, latest=lambda: self.power.reading
         )
         self.now_ns = 0
@@ -278,7 +278,7 @@ class Devices:
         self.records: list[dict[str, Any]] = []
         self.said: list[tuple[str, bool, str]] = []
         self.log_error = ""
-        self.power = SimpleNamespace(
+        self.power: Any = SimpleNamespace(
             said="",
             error=lambda: self.power.said,
             latest=lambda: SimpleNamespace(voltage=5.1, current=0.2, power=1.02),

@@ -74,12 +74,7 @@ class Bench:
                 epoch_ns=EPOCH, record=lambda packet, _, **values: self.records.append((packet, values))
             ),
             events=SimpleNamespace(report=self._report),
-            facts=SimpleNamespace(
-                update=lambda fact, is_so, _, text: (
-                    self.facts.setdefault(fact, []).append(is_so),
-                    self.fact_texts.__setitem__(fact, text),
-                )
-            ),
+            facts=SimpleNamespace(update=self._update),
             streams=SimpleNamespace(note=lambda name, at: self.notes.append((name, at))),
             jobs=SimpleNamespace(submit=self._submit),
         )
@@ -121,6 +116,10 @@ class Bench:
         """Return the past estimate of a body that rotates about x at 0.01 rad/s."""
         quaternion = from_rotation_vector(np.array([0.01 * at * 1e-9, 0.0, 0.0]))
         return SimpleNamespace(quaternion=quaternion, rate=np.array([0.01, 0.0, 0.0]), covariance=COVARIANCE)
+
+    def _update(self, fact: Any, is_so: bool, _: int, text: str) -> None:
+        self.facts.setdefault(fact, []).append(is_so)
+        self.fact_texts[fact] = text
 
     def _report(self, kind: Any, _: int, text: str) -> None:
         self.reports.append(kind)

@@ -196,10 +196,10 @@ class Flown:
     """Steering of a body whose estimation and control are test doubles, with a drive that answers."""
 
     def __init__(self) -> None:
+        self.fault = ""
         self.drive, self.coils, self.watch = _drive([False, False, False])
         self.coils.state = lambda: Mock(error=self.fault)  # type: ignore[attr-defined]
         self.watch.test_wave = lambda currents: None
-        self.fault = ""
         self.said: dict[str, tuple[bool, str]] = {}
         facts_ = SimpleNamespace(
             update=lambda fact, holds, _, text: self.said.__setitem__(fact.name, (holds, text))

@@ -21,6 +21,7 @@ from flight.loop.facts import FlightClock
 from flight.loop.state import Learned
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, as_orbit
+from flight.schema.devices import camera_model
 from flight.schema.document import ConfigError
 from hal.interfaces.devices import GpsReading
 from knightcube.astro.quaternion import attitude_matrix, normalise
@@ -142,7 +143,7 @@ def test_a_camera_that_searches_for_objects_has_the_field_of_its_shorter_side() 
     wide = configuration.replace(given, camera=configuration.replace(camera, columns=4 * camera.rows))
     wider = body._sensor(wide)
     assert wider is not None
-    focal = body.camera_model(wide.camera).focal_length  # type: ignore[arg-type]
+    focal = camera_model(wide.camera).focal_length  # type: ignore[arg-type]
     assert wider.half_field == pytest.approx(math.atan(camera.rows / 2.0 / focal))
 
 
@@ -160,10 +161,10 @@ def test_the_coil_monitor_knows_full_currents_and_the_disturbance() -> None:
     assert response.settle_ns == 100_000_000
     np.testing.assert_allclose(np.diag(response.dipole_per_ampere), 0.648)
     _, dipole = config().largest_torques()
-    found.environment.state = lambda _: None  # type: ignore[method-assign]
+    cast(Any, found.environment).state = lambda _: None
     assert response.disturbance(0) == pytest.approx(dipole / 0.99e-3), "without an orbit, no air"
     low = SimpleNamespace(position=np.array([0.0, 0.0, 6.878e6]))
-    found.environment.state = lambda _: cast(Any, low)  # type: ignore[method-assign]
+    cast(Any, found.environment).state = lambda _: low
     assert response.disturbance(0) > dipole / 0.99e-3
     never = configuration.replace(config(), pointing=configuration.replace(config().pointing, coil_test=0.0))
     assert estimation(never).coil_monitor._settings.self_test is None
@@ -314,7 +315,7 @@ def test_sun_readings_go_to_the_acquisition_and_to_the_filter() -> None:
     bench.found.sun_acquisition, bench.found._sun = Mock(), Mock()
     bench.found._sun.accept.return_value = "dim"
     assert bench.found.accept_sun(cast(Any, "reading")) == "dim"
-    bench.found.sun_acquisition.update_sun.assert_called_once_with("reading")  # type: ignore[attr-defined]
+    bench.found.sun_acquisition.update_sun.assert_called_once_with("reading")
     bench.found._sun.accept.assert_called_once_with("reading")
 
 
@@ -459,14 +460,16 @@ def test_the_spin_packet_comes_four_times_a_second_in_detumbling_only() -> None:
 def test_an_extrapolated_field_is_reported_with_its_error() -> None:
     viewed = Viewed()
     viewed.cycle(40)
-    assert viewed.said["field-extrapolated"][0] is False
+    exact, _ = viewed.said["field-extrapolated"]
+    assert exact is False
     viewed.environment.field_sigma = lambda now: 1.5e-7
     viewed.cycle(80)
     holds, text = viewed.said["field-extrapolated"]
     assert (holds, "additional error of 150 nT" in text) == (True, True)
     viewed.environment.known = False
     viewed.cycle(120)
-    assert viewed.said["field-extrapolated"][0] is None
+    unknown, _ = viewed.said["field-extrapolated"]
+    assert unknown is None
     viewed.said.clear()
     viewed.cycle(121)
     assert viewed.said == {}, "checked once a second"

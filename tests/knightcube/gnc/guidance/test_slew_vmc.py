@@ -302,7 +302,12 @@ def test_the_plan_of_least_heat_of_the_shortest_possible_duration_is_chosen(
     assert plan.horizon == pytest.approx(120.4)
     each = [slew_vmc._planned(task, 120.4, states) for states in (smooth_states(), bent)]
     assert plan.energy == pytest.approx(min(one.energy for one in each if one is not None))
-    monkeypatch.setattr(slew_vmc, "prey_paths", lambda *_: asked.append(0.0) or iter(()))
+
+    def none(_: SlewTask, horizon: float) -> Iterator[FloatArray]:
+        asked.append(horizon)
+        return iter(())
+
+    monkeypatch.setattr(slew_vmc, "prey_paths", none)
     asked.clear()
     with pytest.raises(PlanningError, match=r"over 86 to 100 s, from 0 guesses"):
         plan_task(replace(task, longest=100.0))
