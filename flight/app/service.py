@@ -30,8 +30,8 @@ the coil driver runs. With the first heartbeat, READY is reported to the service
 are open and the loop runs.
 
 When large memory blocks are freed, glibc raises its threshold for mapping blocks separately (mallopt(3)).
-Frames are then allocated on the heap, where small blocks cause fragmentation, and the heap grows. Fixed
-thresholds prevent the growth of the heap; a C library other than glibc ignores them.
+With a raised threshold, frames are allocated on the heap, where small blocks cause fragmentation, and the
+heap grows. Fixed thresholds prevent the growth of the heap; a C library other than glibc ignores them.
 """
 
 from __future__ import annotations
@@ -371,8 +371,8 @@ class Collector:
 _THROTTLE_NS = 1_000_000_000
 """Shortest time (ns) between events of one kind; a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""Time (ns) of three periods of the coil driver's job. If the job does not run for this time, heartbeats are
-withheld."""
+"""Time (ns) without a run of the coil driver's job after which heartbeats are withheld: three periods of the
+job."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,

@@ -98,10 +98,10 @@ def unprotect(
 
 
 COMMAND_SPIS = (1, 2)
-"""Primary and reserve SPI of command frames."""
+"""Primary and reserve SPI (security parameter index) of command frames."""
 
 TELEMETRY_SPIS = (3, 4)
-"""Primary and reserve SPI of telemetry frames."""
+"""Primary and reserve SPI (security parameter index) of telemetry frames."""
 
 
 def may_change(spi: int, changed: int) -> bool:
@@ -380,8 +380,7 @@ class Gate:
         """Accept frames of the given SPIs and restore lost copies of their associations.
 
         If `store_every` is above 1, the counter is stored only once per `store_every` counts. The ground
-        station receives telemetry with such a value of `store_every`. Telemetry can be authenticated without
-        being `encrypted`.
+        station uses a value above 1 for telemetry. Telemetry can be authenticated without being `encrypted`.
         """
         self._vault, self._parse, self._mask, self._window = vault, parse, mask, window
         self._store_every, self._encrypted = store_every, encrypted

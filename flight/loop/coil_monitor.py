@@ -11,11 +11,12 @@ prediction of each hypothesis (`flight.loop.coil_currents`). One hypothesis is t
 Each other hypothesis assumes one fault of one coil: the coil is open or shorted, or one leg of its H-bridge
 is stuck. A coil is diagnosed as broken when the readings reject the hypothesis of healthy coils, and all
 hypotheses that explain the later readings concern this coil. Several axes remain possible if no axis or
-several axes are driven. Each of these axes is then driven alone by a small probe current, one after another.
-The other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil draws
-current. A reversed coil is detected from the angular acceleration, which also distinguishes a faulty current
-monitor from a broken coil. Averaged over longer bins, the acceleration reveals missing torque at currents
-that are too small for the current monitor. The probe then shows whether the coil is open.
+several axes are driven. The axes that remain possible are driven alone, one after another, by a small probe
+current. The other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil
+draws current. A reversed coil is detected from the angular acceleration, which also distinguishes a faulty
+current monitor from a broken coil. Averaged over longer bins, the acceleration reveals missing torque at
+currents that are too small for the current monitor. If torque is missing, a probe shows whether the coil is
+open.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -33,9 +34,9 @@ A coil that rotates the body in the wrong direction is not isolated, but used wi
 whose torque is too small is used with its estimated gain. The class `CoilCorrection` contains sign and gain
 of each coil, and converts between the actual coil currents, which determine the supply current, and the
 effective currents, with which healthy coils would cause the same torque. A correction made in a tumble is
-reviewed when the body is slower than `tumble_rate`. The motion then confirms the coil's sign, or the sign is
-changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current until the body
-is slow, or for ten minutes.
+reviewed when the body is slower than `tumble_rate`. In the review, the motion confirms the coil's sign, or
+the sign is changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current
+until the body is slow, or for ten minutes.
 
 The diagnosis of a broken coil is not final. While the body is slow, a broken coil is used again for a trial
 ten minutes after its diagnosis, and at most three times. If the fault persists, the coil is diagnosed as
@@ -118,12 +119,12 @@ class SelfTest:
 
     While a satellite points, its coil currents of a few mA reveal neither an open nor a reversed coil. A coil
     that the motion has not confirmed for `interval_ns` is therefore driven alone by a known current with the
-    signs +, -, -, + in four equal quarters. After these four quarters, neither the rate nor the attitude has
-    changed. Duration and current of a test follow from the gyro's noise, so that a test measures the gain of
-    a healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a test is the
-    angular acceleration times the square of the duration of one of the four quarters. `CoilResponse`
-    evaluates the response, with the errors of the inertia as nuisance parameters. During a test, the supply
-    current is also compared with the command, as at any other time.
+    signs +, -, -, + in four equal quarters. After the four quarters of a test, neither the rate nor the
+    attitude has changed. Duration and current of a test follow from the gyro's noise, so that a test measures
+    the gain of a healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a
+    test is the angular acceleration times the square of the duration of one of the four quarters.
+    `CoilResponse` evaluates the response, with the errors of the inertia as nuisance parameters. During a
+    test, the supply current is also compared with the command, as at any other time.
     """
 
     def __init__(self, response: CoilResponse, rate_noise: float, settings: SelfTestSettings) -> None:
@@ -702,7 +703,8 @@ class CoilMonitor:
     def _look_further(self, axes: set[int], now_ns: int) -> None:
         """Probe the next suspected axis; after the last axis, collect new evidence.
 
-        Until then, no hypothesis explained the evidence, as with an intermittent fault or a faulty monitor.
+        After the last axis, no hypothesis explained the evidence, as with an intermittent fault or a faulty
+        monitor.
         """
         ends_ns = self._probe.begin(axes, now_ns, self._prime)
         self._evidence.begin_segment()

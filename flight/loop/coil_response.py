@@ -7,14 +7,14 @@ the last bins estimates the gain of each coil, together with a constant disturba
 about each free axis. The fit accounts for the correlated noise of neighbouring differences. The gain is 1 for
 a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the commands vary too little, the
 standard deviation of the gain is large, and no finding about the axis is made. A gain larger than
-`LARGEST_GAIN` is physically impossible and shows that the model is wrong. In this case, no finding about any
-axis is made.
+`LARGEST_GAIN` is physically impossible and shows that the model is wrong. If the model is wrong, no finding
+about any axis is made.
 
 The torques of the coils are normal to the field, and their gains can hardly be separated from each other
 within a short time. The gain of each coil is therefore estimated under the assumption that the other coils
 are healthy. The gains of healthy coils may differ from 1 by the relative errors of the configured coil
 dipoles. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of another
-axis. A coil is considered reversed if this hypothesis is far more likely than that of healthy coils.
+axis. A coil is considered reversed if a reversed coil explains the motion far better than healthy coils.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils appear reversed. The fit therefore subtracts the

@@ -287,8 +287,8 @@ class StreamState(IntEnum):
 class StreamLimits:
     """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value in the value's unit.
 
-    `has_silence_alarm` states whether another monitored condition reports missing readings. The condition
-    `poor` then does not report them.
+    `has_silence_alarm` states whether another monitored condition reports missing readings. Missing readings
+    with another condition are not reported by the condition `poor`.
     """
 
     name: str

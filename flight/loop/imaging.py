@@ -405,7 +405,8 @@ class ObjectTracks:
 
     In frames without identified stars, the tracks refer to the star field of the earlier frames
     (`knightcube.vision.objects.star_field`). Control and telemetry receive the tracks in the axes of the
-    attitude estimate. The error of this estimate is part of the recorded covariances of the directions.
+    attitude estimate. The error of the attitude estimate is part of the recorded covariances of the
+    directions.
     """
 
     def __init__(self, settings: TrackSettings, body: FlightBody, services: Services) -> None:

@@ -19,7 +19,8 @@ can simulate a power loss before any call.
 
 The number of each boot is also written to files in the folder of the state and in the folder of the run.
 After the repair of a file system or the restore of a backup, an intact copy of the state may be outdated. An
-outdated copy is recognised by a boot count that is smaller than the boot number in these files.
+outdated copy is recognised by a boot count that is smaller than the boot number in the files of the two
+folders.
 
 The control thread sets values in memory, and a ticker thread writes them to disk. The state is also written
 at the start, before the loop runs, and at the end, when the coil currents are zero. A disk that hangs delays
@@ -327,7 +328,7 @@ class LinuxFiles:
         return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
-        """Create an empty file instead of any existing file, and return a descriptor for writing."""
+        """Create an empty file, which replaces any existing file, and return a descriptor for writing."""
         with suppress(FileNotFoundError):
             os.unlink(path)
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)

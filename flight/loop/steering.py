@@ -3,7 +3,7 @@
 The coil drive excludes failed axes, and reallocates the current among the remaining axes so that the
 direction of the torque is preserved. The sent commands are compared with the supply current and the body's
 motion (`flight.loop.coil_monitor`). When a coil is diagnosed as broken, a monitored condition becomes active
-and reports an event. The reaction to this event excludes the axis.
+and reports an event. The reaction to the event `coil-broken` excludes the axis.
 
 All currents in the loop are effective currents, with which healthy coils would have the same dipole. The coil
 drive converts effective currents to actual coil currents by the signs and gains that the coil monitor has
@@ -223,7 +223,7 @@ class Steering:
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
         self._body, self._drive, self._facts = body, drive, services.facts
-        self._has_rate = True  # whether a body rate is known: from the newest reading or a substitute
+        self._has_rate = True  # whether the newest reading or another source gives the body rate
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
         """Follow the path or hold its end; without a measured estimate, control is lost if `ever_started`."""

@@ -159,12 +159,12 @@ class Winding(Section, frozen=True, kw_only=True):
     """One coil of a satellite, which is a torque rod or an air coil, with its H-bridge.
 
     A positive current makes a dipole moment along `axis`, which may have any length. The dipole moment per
-    ampere is `dipole_per_ampere` (m^2), or `turns` times `area` (m^2) of an air coil. On the testbed, these
-    values are in the section `plant`. The value `current_limit` (A) replaces the limit in the section
-    `coils`. The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them,
-    the coils use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are
-    swapped. The `position` (m, body axes) of the coil's centre relative to the inertial unit gives the field
-    that `knightcube bringup` expects at the magnetometer.
+    ampere is `dipole_per_ampere` (m^2), or `turns` times `area` (m^2) of an air coil. On the testbed, the
+    values of the coils are in the section `plant`. The value `current_limit` (A) replaces the limit in the
+    section `coils`. The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without
+    them, the coils use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose
+    leads are swapped. The `position` (m, body axes) of the coil's centre relative to the inertial unit gives
+    the field that `knightcube bringup` expects at the magnetometer.
     """
 
     axis: Vector
@@ -228,9 +228,9 @@ class Coils(Section, frozen=True, kw_only=True):
     def slots(self) -> tuple[Winding, ...]:
         """The coils in the order of the flight application; the last coil may be fictitious.
 
-        If the coils lie in a plane, a fictitious coil along the normal of the plane is appended. This coil
-        has two free PWM channels. The dipole moment of the fictitious coil is half the weakest coil's moment,
-        so that plans use it little.
+        If the coils lie in a plane, a fictitious coil along the normal of the plane is appended. The
+        fictitious coil has two unused PWM channels. The dipole moment of the fictitious coil is half the
+        weakest coil's moment, so that plans use it little.
         """
         axes = np.array([coil.direction() for coil in self.windings]).T
         if np.linalg.matrix_rank(axes, LEAST_SPREAD) == 3:
@@ -485,8 +485,8 @@ class Camera(Section, frozen=True, kw_only=True):
     `vision_slow_after` s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
 
     With `learn_lens`, the star tracker estimates lens parameters, line time and point spread from its solved
-    frames, and the next boot continues with the estimates. These values are not estimated for a camera that
-    is exact according to `accuracy`.
+    frames, and the next boot continues with the estimates. Nothing is estimated for a camera that is exact
+    according to `accuracy`.
     """
 
     device: V4l2Device | AravisDevice | None = None

@@ -325,7 +325,7 @@ def _read_once(text: str, name: str) -> Document:
 
 
 def _composed(text: str) -> tuple[_Loader, yaml.Node | None]:
-    """Return a loader and the root node of a text. Raises YAMLError with the words of PyYAML's own parser."""
+    """Return a loader and the root node of a text. Raises YAMLError with the text of PyYAML's own parser."""
     if not _TOLERATED.search(text):
         with suppress(ImportError, yaml.YAMLError):
             fast = _FastLoader(text)

@@ -197,9 +197,9 @@ class Link(Section, frozen=True, kw_only=True):
     Idle frames raise the rate to `idle_rate` bytes/s. Telemetry is always authenticated, and readable without
     a key if `encrypt_telemetry` is false. The section `coding` describes the channel coding. A flight
     computer returns to its previous release if it has power and receives no authentic frame for
-    `command_loss` s. After this time has passed once more, it returns to its previous configuration, and
-    after a third time to the configuration accepted on the ground. A `command_loss` of 0 disables these
-    returns.
+    `command_loss` s. When `command_loss` s have passed a second time, the computer returns to its previous
+    configuration, and a third time, to the configuration accepted on the ground. A `command_loss` of 0
+    disables these returns.
     """
 
     keys: Annotated[str, Meta(min_length=1)]

@@ -438,7 +438,8 @@ class EstimatedEnvironment:
     def _has_false_time(self, fix: GpsFix, time_ns: int) -> bool:
         """Return whether only the time stated by a fix contradicts the elements.
 
-        Such a fix agrees with the elements if its time is replaced by the time that was known before.
+        A fix with a false time agrees with the elements if its time is replaced by the time that was known
+        before.
         """
         if self._elements is None or self._agrees_with_elements(fix):
             return False

@@ -11,11 +11,11 @@ The learned states are stored for the next boot in three parts, without the cros
 parts. The part `attitude-errors` contains the biases and matrices of gyro and magnetometer and the
 misalignment of the star camera. The part `attitude-torques` contains the residual dipole in shadow and in
 sunlight and the torques. The part `body` contains the inertia and the matrix of the coils. The matrix of the
-coils applies to dipoles that were computed with the signs and gains from the coil monitor. These signs and
-gains are therefore stored too, in the entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s)
-for which the learned states were estimated. At the next boot, the covariance of each state grows by its
-random walk over the elapsed time, and by a fraction of its initial covariance, because switching a sensor off
-and on changes its bias.
+coils applies to dipoles that were computed with the signs and gains from the coil monitor. The signs and
+gains from the coil monitor are therefore stored too, in the entry `coil-factors`. Another entry,
+`learned-at`, is the time (UTC, s) for which the learned states were estimated. At the next boot, the
+covariance of each state grows by its random walk over the elapsed time, and by a fraction of its initial
+covariance, because switching a sensor off and on changes its bias.
 """
 
 from __future__ import annotations
@@ -214,7 +214,8 @@ class StepReplay:
         self.refused_gyros = self.refused_fields = self.contradicted = 0
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
-        self._innovation = "body", 0.0  # tested states, and normalised square, of the newest gyro innovation
+        # The states that the newest gyro innovation tests, and the normalised square of the innovation.
+        self._innovation = "body", 0.0
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
@@ -239,7 +240,7 @@ class StepReplay:
         """Process the last two steps again with unknown dipoles if the gyro contradicts the dipoles.
 
         The earlier of the two steps is included, because the deviation may have begun during that step. The
-        mean rate of the step then shows only a part of the deviation.
+        mean rate of that step shows only a part of the deviation.
         """
         steps, refused = self.steps, self.refused_gyros > 0
         now_ns = steps[-1].end_ns
@@ -596,8 +597,9 @@ class OrbitFilter:
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
         """Reset the learned matrix of the coils whose assumed dipole was multiplied by `change` (n,).
 
-        The relative standard deviations of the corrected dipoles are `deviations` (n,). Without this reset,
-        the filter would apply a correction twice, in the dipole and in the matrix that it learned before.
+        The relative standard deviations of the corrected dipoles are `deviations` (n,). Without a reset of
+        the matrix, the filter would apply a correction twice, in the dipole and in the matrix that it learned
+        before.
         """
         self._close()
         self._replay.correct_coils(change, deviations)

@@ -97,7 +97,7 @@ NEW_KEY = telecommand(
 
 @dataclass(frozen=True, slots=True)
 class NewKey(_Directive):
-    """Directive to change the key of an SPI."""
+    """Directive to change the key of an SPI (security parameter index)."""
 
     spi: int
     generation: int

@@ -106,8 +106,9 @@ class SegmentStore:
     def append(self, packets: Sequence[bytes]) -> None:
         """Write packets and begin a new segment file whenever the current file is full.
 
-        Raises OSError if a write fails. The attribute `packets` then counts the completely written packets,
-        the file is truncated after the last complete packet, and `append` may be called again.
+        Raises OSError if a write fails. After a failed write, the attribute `packets` counts the completely
+        written packets, the file is truncated after the last complete packet, and `append` may be called
+        again.
         """
         chunk: list[bytes] = []
         size = self._size

@@ -174,8 +174,8 @@ class Packer:
 
         A text that is too long for its field is truncated between two characters, and a counter that exceeds
         its range wraps. NaN is accepted in all floating-point fields. Raises TelemetryError for a missing or
-        unknown field, a wrong array length or a value out of range. The sequence count does not change in
-        this case.
+        unknown field, a wrong array length or a value out of range; the sequence count is unchanged after an
+        error.
         """
         given = fields if values is None else {**values, **fields} if fields else values
         layout = self._layouts[packet.name]
