@@ -66,7 +66,10 @@ class TargetLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target; `index` is the number of a configured step, at least COMMANDED for a command, or KEPT."""
+    """A target of a body.
+
+    The attribute `index` is the number of a configured step, COMMANDED plus the number of a command, or KEPT.
+    """
 
     index: int
     law: TargetLaw

@@ -314,7 +314,7 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in step number `place`; `doubted` if earlier estimates were contradicted."""
+        """Start from an attitude in the step `place`; if `doubted`, earlier estimates were contradicted."""
         first = self.steps[place]
         self.free.start(
             attitude.quaternion,
@@ -571,7 +571,7 @@ class OrbitFilter:
         return self._free.slow
 
     def description(self, time_ns: int) -> dict[str, FloatArray]:
-        """Return the estimated inertia, coils and sensors by the field names of the description packet.
+        """Return the estimates of inertia, coils and sensors as fields of the description packet.
 
         The standard deviation of the star camera's attitude is propagated to `time_ns`.
         """

@@ -573,7 +573,7 @@ class PointingPlanner:
         elif job.running is not None:
             self._continue(job, result.value, now_ns)
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
-            self._wanted = True  # this plan was requested before the damping: plan again
+            self._wanted = True  # a plan requested before the damping is replaced
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:

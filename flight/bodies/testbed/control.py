@@ -447,7 +447,7 @@ class ThreadTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError for a goal or q2 beyond its limit."""
+        """Return the target of command `number`. Raises UsageError for a goal or a too large q2."""
         if isinstance(wanted, PointingTarget):
             raise UsageError("the testbed accepts only a target q2, not a pointing goal")
         if not abs(wanted) <= Q2_LIMIT:  # NaN compares false
