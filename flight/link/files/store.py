@@ -133,7 +133,7 @@ class FileError(FlightError):
 
 
 class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """State of an outgoing transfer of file `path`, sent as `name`; `origin` identifies its command."""
+    """State of an outgoing transfer of file `path`, sent as `name`; `origin` identifies the command."""
 
     number: _Long
     destination: _Entity
