@@ -357,7 +357,7 @@ class LensKnowledge:
         configured: the configured camera, whose aspect, shear and tangential distortion are not estimated.
         prior: configured values (11,) of PARAMETERS, line time and point-spread width.
         spread: configured standard deviations (11,) of the values in `prior`.
-        values: estimated values (11,) of the same parameters.
+        values: estimated values (11,) of the parameters in `prior`.
         covariance: covariance (11, 11) of `values`.
         frames: number of frames from which the values were estimated.
         contradictions: number of times that a frame contradicted the estimated values.

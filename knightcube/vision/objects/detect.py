@@ -316,8 +316,8 @@ _UNIFORM = 1.15
 _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided; every part must be bright enough.
 _PARTS = 12
-# Largest ratio of the excess chi-square that remains with an object to the decrease by the object:
-# for every object, and for a uniform streak that resembles the streak of a star.
+# Largest ratio of the excess chi-square that remains with an object to the decrease by the object.
+# The second value is for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
 # Fraction of the required decrease of chi-square above which light may be a segment of an object's streak.
 _PART = 0.6

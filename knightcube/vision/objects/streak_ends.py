@@ -688,9 +688,9 @@ def chord_outward(endpoints: FloatArray) -> FloatArray:
 def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
     """Return the centre of rotation (2,), px, which is nearest to the perpendicular bisectors of streaks.
 
-    Each streak is given by its two ends (n, 2, 2), px. The centre is the farther away, the more nearly the
-    rotation axis is normal to the boresight; for parallel chords the centre is NaN. Source: Sease, eq. (3.17)
-    and (3.18) as corrected in the errata.
+    Each streak is given by its two ends (n, 2, 2), px. The centre is far away if the rotation axis is nearly
+    normal to the boresight, and NaN for parallel chords. Source: Sease, eq. (3.17) and (3.18) as corrected in
+    the errata.
     """
     chord = endpoints[:, 1] - endpoints[:, 0]
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)

@@ -421,7 +421,8 @@ class _Candidate:
     """A motion from the joint fit, with its rotation vector over the exposure (3,), rad, and its streaks.
 
     For a rolling shutter, `middles` (n, 2), px, are the centres of the n bright streaks, and `excess` (n,) is
-    the chi-square of each streak minus the number of its pixels. For a global shutter, both arrays are empty.
+    the chi-square of each streak minus the number of its pixels. For a global shutter, `middles` and `excess`
+    are empty.
     """
 
     result: MotionResult

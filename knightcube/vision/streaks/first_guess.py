@@ -620,8 +620,8 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The circles are divided into intervals of one streak length, each with its most significant streak.
-    # This streak is counted if no adjacent interval, on any circle, has a more significant streak.
+    # The most significant streak in each interval of one streak length along a circle is a candidate.
+    # A candidate counts if no adjacent interval on the same or a neighbouring circle has a better candidate.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)

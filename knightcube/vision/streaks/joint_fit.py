@@ -84,7 +84,7 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# First-iteration displacement (px) of a star outside the motion fit above which pixels are selected again.
+# Displacement (px) of a star without effect on the motion above which the first iteration reselects pixels.
 # Later iterations ignore the displacements of such stars, which are often poorly known.
 _FAINT_DRIFT = 3.2
 # Change of the angular acceleration, as a fraction of the rotation, above which pixels are selected again.
@@ -529,7 +529,7 @@ _LEAST_REACH, _MOST_REACH = 10.0, 40.0
 _STEPS = 41
 # Minimum significance (standard deviations) of the flux near a streak end for the end to be measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Upper limit of a sample's intensity, as a multiple of the expected value, because of other stars.
+# Upper limit of a sample's intensity (multiple of its expectation), which limits the effect of other stars.
 _CAP = 2.0
 # Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3

@@ -766,7 +766,7 @@ def _add_scaled(total: Any, factor: Any, values: Any) -> None:
         total[k] += factor * values[k]
 
 
-# Ratio of a star's Fisher information to the largest of all stars below which the star is ignored.
+# Ratio of a star's Fisher information to the largest information of any star below which it is ignored.
 _NOTHING = 1e-9
 # Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.
 _KNOWN = 1e-4
