@@ -59,7 +59,7 @@ def power_bench(
     coils = ScriptedCoils()
     sections = SECTIONS if bus is not None else SECTIONS | {"bus_monitor": None}
     devices: dict[str, Any] = {"coils": coils}
-    session = bench_session(devices, power=Power(battery=Battery(capacity=2.0), **sections))  # type: ignore[arg-type]
+    session = bench_session(devices, power=Power(battery=Battery(capacity=2.0), **sections))
     monitors = {BATTERY: ScriptedMonitor(session, coils, *battery)}
     if bus is not None:
         monitors[BUS] = ScriptedMonitor(session, coils, *bus)
@@ -143,7 +143,7 @@ def test_a_monitor_without_a_new_reading_is_reported_and_not_compared() -> None:
 def test_the_guardian_of_the_coils_is_kept_awake() -> None:
     session, coils, _ = power_bench((7.4, 0.3, 1.0))
     beats: list[int] = []
-    session.guardian = SimpleNamespace(beat=lambda: beats.append(len(coils.commands)))  # type: ignore[assignment]
+    session.guardian = SimpleNamespace(beat=lambda: beats.append(len(coils.commands)))
     step_power(session)
     assert beats == list(range(1, len(coils.commands)))  # after each command but the last, which sets zero
 

@@ -159,8 +159,8 @@ def dask(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     cloudpickle = SimpleNamespace(
         register_pickle_by_value=by_value.append, unregister_pickle_by_value=by_value.remove
     )
-    monkeypatch.setitem(sys.modules, "distributed", distributed)  # type: ignore[arg-type]
-    monkeypatch.setitem(sys.modules, "cloudpickle", cloudpickle)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "distributed", distributed)
+    monkeypatch.setitem(sys.modules, "cloudpickle", cloudpickle)
     monkeypatch.setattr(cluster, "archive_of", lambda root: b"packages")
     return by_value
 

@@ -209,7 +209,7 @@ class Scripted:
                 STEPS, name, self.step(name, outcomes.get(name, Outcome(values=VALUES.get(name, {}))))
             )
         drawing = SimpleNamespace(draw_bench=lambda *words: self.pictures.append(words))
-        monkeypatch.setitem(sys.modules, "ground.report.figures", drawing)  # type: ignore[arg-type]
+        monkeypatch.setitem(sys.modules, "ground.report.figures", drawing)
         monkeypatch.setattr(bringup, "_opened", self.opened)
 
     @contextmanager
@@ -381,6 +381,7 @@ def test_a_real_session_asks_the_person_and_the_coils_are_zero_at_the_end(
     config = reader.replace(orbit_config(), simulation=None)
     options = argparse.Namespace(config=Path("flight.yaml"), wired=None, yes=yes)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    session: Any
     with bringup._opened(options, "", config, False) as session:
         assert session.guardian is guardian
         assert guardian.ready
@@ -410,7 +411,7 @@ def test_focusing_ends_when_enter_is_pressed(
     monkeypatch.setattr(bringup, "start_guardian", lambda rig, stack: None)
     options = argparse.Namespace(config=Path("flight.yaml"), wired=None, yes=False)
     pressed: list[Any] = []
-    monkeypatch.setattr(bringup.select, "select", lambda *words: (pressed, [], []))
+    monkeypatch.setattr("ground.commands.bringup.select.select", lambda *words: (pressed, [], []))
     line = io.StringIO("\nmore")
     monkeypatch.setattr("sys.stdin", line)
     with bringup._opened(options, "", reader.replace(orbit_config(), simulation=None), False) as session:

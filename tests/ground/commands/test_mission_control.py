@@ -321,7 +321,8 @@ def test_the_passes_are_predicted_from_elements_or_configuration(monkeypatch: py
 
     monkeypatch.setattr(mission_control, "predicted", predicted)
     assert mission_control._forecast(options()) is None
-    assert mission_control._forecast(options("--station", "Berlin,52,13")) == ("prediction", "stations")
+    found: Any = mission_control._forecast(options("--station", "Berlin,52,13"))
+    assert found == ("prediction", "stations")
     assert mission_control._forecast(options("--stations", "x", "--elements", "y.tle")) is not None
     assert sources == [DEMO, Path("y.tle")]
 
