@@ -362,7 +362,7 @@ class ModeControl:
         steering: Steering,
         services: Services,
     ) -> None:
-        """Connect the machine with body and steering; `stop` ends the flight after the cycle for a reason.
+        """Connect the machine with body and steering; `stop`, given a reason, ends the flight.
 
         Raises FlightError and ConfigError.
         """

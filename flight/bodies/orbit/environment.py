@@ -91,7 +91,7 @@ class Witness:
 
 
 class FixSequence:
-    """GPS fixes with consistent orbit and receiver time; `joined` is the number that agree with `first`."""
+    """GPS fixes with consistent orbit and time; `joined` counts the fixes that agree with `first`."""
 
     def __init__(self, fix: GpsFix, offset_ns: int) -> None:
         """`offset_ns` is the receiver's UTC minus the time of the host's clock."""

@@ -589,7 +589,7 @@ NOBODY = Origin()
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a file transfer, open if `condition` is None; `said` describes its end or suspension."""
+    """Progress of a file transfer, open if `condition` is None; `said` describes the end or suspension."""
 
     outgoing: bool
     source: int
