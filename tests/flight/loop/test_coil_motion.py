@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,21 +142,24 @@ def test_the_share_of_a_suspected_fault_in_the_motion(axis: int, carried: float 
     assert same is None, "a fault that changes nothing cannot be observed"
 
 
+def strength_of(response: CoilResponse) -> Any:
+    """Return the strength of the coils, or None."""
+    return response.strength
+
+
 def test_the_strength_of_the_coils_is_their_acceleration_in_the_field_of_the_last_pause() -> None:
     found = CoilResponse(ResponseSettings(INERTIA, DIPOLES, 1e-5, settle_ns=100_000_000))
-    assert found.strength is None
+    assert strength_of(found) is None
     found.commanded(5, (0.1, 0.0, 0.0))
     found.observe_motion(CYCLE_NS, np.zeros(3), FIELD)
     found.observe_motion(2 * CYCLE_NS, np.zeros(3), FIELD)
-    assert found.strength is None, "the coils are driven"
+    assert strength_of(found) is None, "the coils are driven"
     found.commanded(2 * CYCLE_NS, (0.0, 0.0, 0.0))
     found.observe_motion(6 * CYCLE_NS - 1, np.zeros(3), FIELD)
-    assert found.strength is None, "their field has not decayed"
+    assert strength_of(found) is None, "their field has not decayed"
     found.observe_motion(6 * CYCLE_NS, np.zeros(3), FIELD)
     expected = [np.linalg.norm(np.linalg.solve(INERTIA, np.cross(DIPOLES[:, k], FIELD))) for k in range(3)]
-    strength = found.strength
-    assert strength is not None
-    np.testing.assert_allclose(strength, expected)
+    np.testing.assert_allclose(strength_of(found), expected)
     found.commanded(6 * CYCLE_NS, (0.1, 0.0, 0.0))
     turn = np.array([0.0, 0.0, 0.4])
     for cycle in range(7, 15):
@@ -164,9 +168,7 @@ def test_the_strength_of_the_coils_is_their_acceleration_in_the_field_of_the_las
     c, s = math.cos(angle), math.sin(angle)
     turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ FIELD
     expected = [np.linalg.norm(np.linalg.solve(INERTIA, np.cross(DIPOLES[:, k], turned))) for k in range(3)]
-    later = found.strength
-    assert later is not None
-    np.testing.assert_allclose(later, expected, rtol=2e-3)
+    np.testing.assert_allclose(strength_of(found), expected, rtol=2e-3)
 
 
 def test_a_window_has_the_commands_in_force_and_one_cycle_more() -> None:
