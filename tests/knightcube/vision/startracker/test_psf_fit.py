@@ -323,8 +323,8 @@ def test_the_terms_of_the_noise_are_not_negative() -> None:
     assert fitted(bent) == pytest.approx((0.0, float(bent @ light**2) / of_square))
     assert fitted(-light) == (0.0, 0.0)
     same = np.full(4, 2.0)
-    sums = (float(np.sum(same**power)) for power in (2, 3, 4))
-    assert psf_fit._non_negative(*sums, 16.0, 32.0) == pytest.approx((1.0, 0.0))
+    first, second, third = (float(np.sum(same**power)) for power in (2, 3, 4))
+    assert psf_fit._non_negative(first, second, third, 16.0, 32.0) == pytest.approx((1.0, 0.0))
 
 
 def test_the_mismatch_of_the_psf_is_the_median_over_the_stars() -> None:

@@ -1,15 +1,30 @@
-"""Tests of right ascension, declination and roll, and of aberration."""
+"""Tests of right ascension, declination and roll, of aberration, and of lens errors."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, SPEED_OF_LIGHT, earth_from_sun, earth_velocity
 from knightcube.astro.quaternion import IDENTITY, angle_between, attitude_matrix
-from knightcube.vision.startracker.sky_map import Pointing, _bent, apparent
+from knightcube.vision.camera.lens import EXACT, Pinhole
+from knightcube.vision.startracker import sky_map
+from knightcube.vision.startracker.sky_map import (
+    Pointing,
+    ShortTrails,
+    SkyMap,
+    _bent,
+    apparent,
+    bend_slope,
+    bent,
+    known_bend,
+    usual_bend,
+)
 from sim_hal.worlds.orbit import sun_position
 from tests.support.compiled_forms import assert_forms_agree
 
@@ -105,3 +120,107 @@ def test_the_compiled_lens_errors_equal_those_in_numpy() -> None:
     for k in range(8):
         assert_forms_agree(_bent, seen, 0.1 * np.eye(8)[k])
     assert_forms_agree(_bent, seen, draw.normal(0.0, 0.1, 8))
+
+
+_BEND = np.array([0.02, -0.03, 0.004, 0.006, 0.05, -0.03, 0.01, -0.02])
+
+
+def test_lens_errors_displace_the_tangents_by_the_stated_formula() -> None:
+    """The tangents u are displaced by the formula in the docstring of the module.
+
+    The displacement is (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u + p (u_x, -u_y) + q (u_y, u_x), to first
+    order in the lens errors.
+    """
+    tangent = np.random.default_rng(3).uniform(-0.3, 0.3, (20, 2))
+    seen = np.column_stack([tangent, np.ones(20)])
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    small = 1e-4 * _BEND
+    x, y = tangent.T
+    square = x**2 + y**2
+    radial = small[0] * x + small[1] * y + small[4] * square + small[5] * square**2
+    dx = radial * x + square * small[2] + small[6] * x + small[7] * y
+    dy = radial * y + square * small[3] - small[6] * y + small[7] * x
+    found = bent(seen, small)
+    assert np.linalg.norm(found, axis=1) == pytest.approx(np.ones(20))
+    assert found[:, :2] / found[:, 2:] - tangent == pytest.approx(
+        np.stack([dx, dy], axis=1), rel=1e-3, abs=1e-11
+    )
+    slope = bend_slope(seen)
+    for k in range(8):
+        step = 1e-6 * np.eye(8)[k]
+        assert slope[:, :, k] == pytest.approx((bent(seen, step) - bent(seen, -step)) / 2e-6, abs=1e-8)
+    assert bent(seen, np.zeros(8)) is seen
+
+
+_CAMERA = Pinhole(800, 600, 1500.0)
+
+
+def test_prior_lens_errors_have_their_size_at_the_corner() -> None:
+    """One standard deviation of a lens error displaces the corner by the fraction of a typical lens."""
+    corner = 500.0 / 1500.0
+    sigma = usual_bend(_CAMERA) ** -0.5
+    assert len(sigma) == 8
+    assert sigma[:2] == pytest.approx([sky_map._TILT * corner] * 2)
+    for k, share in ((2, sky_map._DECENTRING), (3, sky_map._DECENTRING)):
+        assert sigma[k] * corner**2 / corner == pytest.approx(share)
+    assert sigma[4] * corner**2 == pytest.approx(sky_map._DISTORTION[0])
+    assert sigma[5] * corner**4 == pytest.approx(sky_map._DISTORTION[1])
+    assert sigma[6:] == pytest.approx([sky_map._ASPECT] * 2)
+
+
+def test_a_calibrated_lens_has_errors_of_its_stated_accuracy() -> None:
+    corner = 500.0 / 1500.0
+    none = known_bend(_CAMERA, EXACT)
+    assert none.shape == (0,)
+    sigma = known_bend(_CAMERA, replace(EXACT, centre=3.0, distortion=0.006)) ** -0.5
+    assert len(sigma) == 6
+    assert sigma[:2] == pytest.approx([3.0 / 1500.0] * 2)
+    assert sigma[4] * corner**2 == pytest.approx(0.006)
+    assert sigma[5] * corner**4 == pytest.approx(0.002)
+    assert sigma[2:4] == pytest.approx([3.0 / 1500.0 * sigma[4]] * 2)
+    # An exactly known value has a small error, so that the equations stay regular.
+    centre = known_bend(_CAMERA, replace(EXACT, centre=3.0)) ** -0.5
+    assert centre[4] * corner**2 == pytest.approx(sky_map._LEAST_DISTORTION)
+    distortion = known_bend(_CAMERA, replace(EXACT, distortion=0.006)) ** -0.5
+    assert distortion[0] == pytest.approx(sky_map._LEAST_CENTRE / 1500.0)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("velocity", [None, np.array([20e3, -15e3, 9e3])])
+@pytest.mark.parametrize("bend", [np.zeros(8), 0.3 * _BEND])
+def test_pixels_and_directions_are_inverse(
+    bend: FloatArray,
+    velocity: FloatArray | None,
+    mirrored: bool,
+) -> None:
+    quaternion = np.array([0.3, -0.2, 0.5, 0.79]) / np.linalg.norm([0.3, -0.2, 0.5, 0.79])
+    sky = SkyMap(_CAMERA, quaternion, bend, velocity, mirrored)
+    points = np.array([[20.0, 30.0], [700.0, 100.0], [399.5, 299.5], [250.0, 580.0]])
+    directions = sky.directions(points)
+    assert np.linalg.norm(directions, axis=1) == pytest.approx(np.ones(4))
+    assert sky.pixels(directions) == pytest.approx(points, abs=1e-3 if velocity is not None else 1e-5)
+    exchanged = points * [-1.0, 1.0] + [799.0, 0.0] if mirrored else points
+    plain = bent(_CAMERA.unit_vectors(exchanged), bend) @ attitude_matrix(quaternion)
+    if velocity is None:
+        assert directions == pytest.approx(plain)
+    else:
+        # The star is behind its apparent direction.
+        assert apparent(directions, velocity) == pytest.approx(plain, abs=1e-7)
+        assert np.linalg.norm(directions - plain, axis=1).max() > 3e-5
+
+
+def test_short_trails_are_the_displacements_of_stars_during_the_exposure() -> None:
+    """A star moves as v' = -omega x v. The delay of a row displaces a star by its motion until the row."""
+    turn = np.array([2e-3, -1e-3, 4e-3])
+    trails = ShortTrails(turn, 0.0, 0.0)
+    points = np.array([[100.0, 450.0], [700.0, 100.0]])
+    rays = _CAMERA.unit_vectors(points)
+
+    def at(part: float) -> FloatArray:
+        return _CAMERA.project(rays - part * np.cross(turn, rays))
+
+    moved = trails.of(_CAMERA, rays)
+    assert moved == pytest.approx(at(0.5) - at(-0.5), rel=1e-4)
+    assert np.linalg.norm(moved, axis=1).min() > 1.0
+    assert trails.late(_CAMERA, points) == pytest.approx(moved * [[450.0 - 299.5], [100.0 - 299.5]])
+    assert not trails.of(_CAMERA, -rays).any()

@@ -326,7 +326,7 @@ def test_a_frame_of_long_parallel_areas_is_one_of_streaks() -> None:
     # Areas in all directions do not follow one rotation of the camera.
     crossed = _areas(direction=np.array([0.0, 1.5, 0.7, 2.2, 0.3, 1.1, 2.8, 0.0, 0.0, 0.0]))
     assert frame_shape(crossed).kind is FrameKind.POINTS
-    alone = _areas(length=np.full(10, 20.0), direction=np.arange(10) * 1.3)
+    alone = _areas(length=np.full(10, 20.0), direction=np.arange(10.0) * 1.3)
     assert frame_shape(alone).kind is FrameKind.NEITHER
     assert frame_shape(alone).length == 0.0
     # Small or thick areas are not classified.

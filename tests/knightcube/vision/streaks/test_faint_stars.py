@@ -95,7 +95,7 @@ def test_a_polar_grid_consists_of_circles_about_the_rotation_axis() -> None:
 
 def _grid(length: float) -> PolarGrid:
     """Return a polar grid of 12 circles and 160 samples with the given streak length in samples."""
-    polar, azimuth = 0.5 + 0.002 * np.arange(12), -0.8 + 0.01 * np.arange(160)
+    polar, azimuth = 0.5 + 0.002 * np.arange(12.0), -0.8 + 0.01 * np.arange(160.0)
     return PolarGrid(np.eye(3), polar, azimuth, length, 0.01 * length, np.sin(polar) * 900.0)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import first_guess
 from knightcube.vision.streaks.first_guess import (
@@ -125,9 +125,10 @@ def _drawn(
     motion: CameraMotion, stars: FloatArray = _STARS, flux: FloatArray = _FLUX, gap: float = 0.0
 ) -> BrightRegions:
     """Return the regions of streaks without noise. Fragments are separated by a `gap` of the exposure."""
-    time = (np.arange(200) + 0.5) / 200.0 - 0.5
+    time = (np.arange(200.0) + 0.5) / 200.0 - 0.5
     parts = [time] if gap == 0.0 else [time[time < -0.5 * gap], time[time > 0.5 * gap]]
-    owner, columns, rows, lights, shapes = [], [], [], [], []
+    shapes: list[tuple[FloatArray, FloatArray, float, float, bool]] = []
+    pixels: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
     for star, light in zip(stars, flux, strict=True):
         for part in parts:
             where = paths(_SMALL, motion, np.tile(star, (len(part), 1)), part).position
@@ -139,13 +140,10 @@ def _drawn(
             size, ways = np.linalg.eigh((away * own[:, None]).T @ away / own.sum())
             cut = bool(row.min() < 3 or column.min() < 3 or row.max() > 196 or column.max() > 236)
             shapes.append((centre, ways[:, 0], np.sqrt(12.0 * (size[1] - size[0])), own.sum(), cut))
-            owner.append(np.full(len(row), len(owner)))
-            columns.append(column)
-            rows.append(row)
-            lights.append(own)
-    parts_of = (np.array(each) for each in zip(*shapes, strict=True))
-    pixels = (np.concatenate(each) for each in (owner, columns, rows, lights))
-    return BrightRegions(*parts_of, *pixels, 0.05)
+            pixels.append((np.full(len(row), len(pixels)), column, row, own))
+    centre, normal, length, total, cuts = (np.array(each) for each in zip(*shapes, strict=True))
+    owner, columns, rows, lights = (np.concatenate(each) for each in zip(*pixels, strict=True))
+    return BrightRegions(centre, normal, length, total, cuts, owner, columns, rows, lights, 0.05)
 
 
 def _polar(guess_frame: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -96,7 +96,7 @@ def _stars_on_circles(time: FloatArray, angle: FloatArray, stars: FloatArray) ->
     """Return the positions of stars after the camera has rotated by `angle` (m,) about its boresight."""
     x, y = (stars - _CENTRE).T
     sine, cosine = np.sin(angle), np.cos(angle)
-    return np.stack([x * cosine + y * sine, y * cosine - x * sine], axis=1) + _CENTRE
+    return np.asarray(np.stack([x * cosine + y * sine, y * cosine - x * sine], axis=1) + _CENTRE)
 
 
 _PINHOLE = Pinhole(1024, 824, 2903.0)
@@ -240,7 +240,7 @@ def test_a_calibrated_lens_becomes_a_pinhole_with_the_same_image() -> None:
     assert np.abs(ideal - _STARS).max() > 2.0
     assert camera.distorted(ideal) == pytest.approx(_STARS, abs=0.05)
     assert camera.undistorted(_STARS) == pytest.approx(ideal, abs=0.05)
-    covariance = np.eye(2)
+    covariance = ((1.0, 0.0), (0.0, 1.0))
     assert streak_pinhole(lens, CameraKnowledge()) == lens.ideal
     assert streak_pinhole(lens, replace(CameraKnowledge(), covariance=covariance)) == camera
     assert streak_pinhole(_PINHOLE, replace(CameraKnowledge(), covariance=covariance)) is _PINHOLE

@@ -351,10 +351,10 @@ def _weighted(
     model: float, signal: float, ceiling: float, clip: float, inside: bool = True
 ) -> tuple[float, float]:
     """Return weight and residual of one pixel with the gain 4 electrons/count and the noise variance 7."""
-    one = np.ones(1, dtype=np.float32)
-    pixels = np.array([1]), np.array([inside]), one * signal, one * 7.0, one * ceiling
+    signals, floors, ceilings = (np.array([each], dtype=np.float32) for each in (signal, 7.0, ceiling))
+    pixels = np.array([1]), np.array([inside]), signals, floors, ceilings
     total = np.array([-99.0, model, -99.0], dtype=np.float32)
-    weight, residual = residuals(total, tuple(each.astype(each.dtype) for each in pixels), (4.0, clip))
+    weight, residual = residuals(total, pixels, (4.0, clip))
     return float(weight[0]), float(residual[0])
 
 

@@ -380,9 +380,9 @@ def test_the_intensity_of_a_reversing_motion_is_that_of_many_instants(share: flo
     solved = np.linalg.lstsq(design, data * np.sqrt(weight), rcond=None)[0]
     expected = float(np.sum((data * np.sqrt(weight) - design @ solved) ** 2))
     terms = across**2, across * data, across
-    sums = (np.bincount(nearest, weight * each, len(places)) for each in terms)
+    square, cross, plain = (np.bincount(nearest, weight * each, len(places)).astype(float) for each in terms)
     moments = float(np.sum(weight)), float(weight @ data), float(weight @ data**2)
-    one = uncertainty._PathLight(places, *sums, moments, 500)
+    one = uncertainty._PathLight(places, square, cross, plain, moments, 500)
     found = uncertainty._reversal_chi2(one, np.array([share, 0.2]), np.array([length, 20.0, 25.0]), 1.2)
     assert found.shape == (2, 3)
     assert found[0, 0] == pytest.approx(expected, rel=1e-3)
