@@ -1,4 +1,4 @@
-"""Tests of the correction of streak lengths and of the selection of fitted stars."""
+"""Tests of the correction of streak lengths, the selection of fitted stars, and the steps of the fit."""
 
 from __future__ import annotations
 
@@ -7,13 +7,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import joint_fit
 from knightcube.vision.streaks.fit_windows import window_areas
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, positions
-from knightcube.vision.streaks.joint_fit import FitProblem, find_light_ends, stretched
+from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, paths, positions
+from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, WorkBudget, find_light_ends, stretched
+from knightcube.vision.streaks.normal_equations import (
+    ALONE,
+    SHARED,
+    EliminatedEquations,
+    Evaluation,
+    Solution,
+)
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
+from tests.support.compiled_forms import assert_forms_agree
 
 _STARS = 16
 
@@ -128,3 +138,242 @@ def test_a_fit_with_a_much_wider_point_spread_is_rejected() -> None:
     camera, scene = _taken(60.0, 300.0)
     assert joint_fit.joint_fit(camera, scene) is not None
     assert joint_fit.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None
+
+
+_SMALL = Pinhole(120, 100, 700.0)
+
+
+def _small_problem(image: FloatArray | None = None, **settings: object) -> FitProblem:
+    noise = np.random.default_rng(2).normal(100.0, 4.0, (100, 120)) if image is None else image
+    frame = reduce_frame(np.rint(noise).astype(np.uint16), 60000.0, 1.0)
+    chosen = replace(LikelihoodSettings(), **settings)  # type: ignore[arg-type]  # named settings
+    return FitProblem(frame, _SMALL, Shutter(), chosen, 1.0)
+
+
+def _small_scene() -> StreakScene:
+    """Return three stars with streaks of about 30 px, of which the last does not determine the motion."""
+    stars = np.array([[30.0, 40.0], [60.0, 50.0], [90.0, 70.0]])
+    light, trusted = np.array([4000.0, 3000.0, 2000.0]), np.array([True, True, False])
+    motion = CameraMotion.steady(np.array([0.02, 0.04, 0.01]))
+    return StreakScene(motion, 1.1, stars, light, np.array([1.0, 2.0, 3.0]), trusted)
+
+
+def test_work_is_counted_in_pixels() -> None:
+    budget = WorkBudget()
+    passes = int(joint_fit._MOST_WORK / (joint_fit._PASS * 1e6))
+    for _ in range(passes):
+        budget.passed(1_000_000)
+    assert not budget.exhausted
+    budget.passed(1_000_000)
+    assert budget.exhausted
+    other = WorkBudget()
+    evaluations = int(joint_fit._MOST_WORK / (10_000 + joint_fit._EVALUATION))
+    for _ in range(evaluations):
+        other.evaluated(10_000)
+    assert not other.exhausted
+    other.evaluated(10_000)
+    assert other.exhausted
+
+
+def test_the_acceleration_is_fitted_if_the_rate_changes() -> None:
+    camera = _small_problem()
+    assert camera.free.tolist() == [True, True, True, False, False, False, True]
+    assert replace(camera, growing=True).free.all()
+    assert camera.undecided
+    assert not replace(camera, growing=True).undecided
+    assert not _small_problem(rate_model="constant").undecided
+
+
+def _solution(shared: list[float], alone: FloatArray) -> Solution:
+    nothing = EliminatedEquations(
+        np.zeros(0, np.int64), np.zeros((3, 4, 4)), np.zeros((3, 0, 4)), np.zeros((0, 0))
+    )
+    return Solution(np.array(shared), alone, nothing)
+
+
+def test_a_step_of_the_fit_is_limited_at_the_ends_of_the_streaks() -> None:
+    """The step of the shared parameters moves no streak end by more than 3 px."""
+    scene = _small_scene()
+    alone = np.array([[0.5, -1.0, 100.0, 0.2], [30.0, 40.0, -9000.0, 1.0], [0.0, 0.0, 50.0, -1.0]])
+    small = _solution([1e-4, 2e-4, -1e-4, 0.0, 0.0, 0.0, 0.02], alone)
+    after, wanted = joint_fit._stepped(scene, small, _SMALL)
+    assert after.motion.rate == pytest.approx([0.0201, 0.0402, 0.0099])
+    assert after.motion.acceleration == pytest.approx(np.zeros(3))
+    assert after.width == pytest.approx(1.12)
+    # The position of a star moves by 3 px at most, and its flux keeps at least 30 %.
+    assert after.stars == pytest.approx(scene.stars + np.array([[0.5, -1.0], [1.8, 2.4], [0.0, 0.0]]))
+    assert after.light == pytest.approx([4100.0, 900.0, 2050.0])
+    assert after.sky == pytest.approx([1.2, 3.0, 2.0])
+    time = np.repeat([-0.5, 0.5], 3)
+    stars = np.tile(scene.stars, (2, 1))
+    moved = positions(_SMALL, after.motion, stars, time) - positions(_SMALL, scene.motion, stars, time)
+    assert wanted == pytest.approx(np.linalg.norm(moved, axis=1).max(), rel=0.02)
+    large = _solution([1e-2, 2e-2, -1e-2, 0.01, 0.0, 0.0, 0.02], alone)
+    limited, wanted = joint_fit._stepped(scene, large, _SMALL)
+    share = joint_fit._LONGEST_STEP / wanted
+    assert share < 0.5
+    assert limited.motion.rate == pytest.approx(scene.motion.rate + share * large.shared[:3])
+    assert limited.motion.acceleration == pytest.approx(share * large.shared[3:6])
+    assert limited.width == pytest.approx(1.1 + share * 0.02)
+    assert limited.light[0] == pytest.approx(4000.0 + share * 100.0)
+    wide, wanted = joint_fit._stepped(scene, _solution([0.0] * 6 + [-2.0], 0.0 * alone), _SMALL)
+    assert wanted == 2.0
+    assert wide.width == pytest.approx(0.7 * 1.1)
+
+
+def test_windows_are_cut_again_if_the_streak_ends_have_moved() -> None:
+    camera, scene = _small_problem(), _small_scene()
+
+    def drifted(after: StreakScene, faint: float = 50.0) -> bool:
+        return joint_fit._drifted(camera, scene, after, faint)
+
+    assert not drifted(scene)
+    for share, moved in ((0.98, False), (1.02, True)):
+        way = share * joint_fit._DRIFT
+        for star, expected in ((1, moved), (2, False)):
+            for axis in (0, 1):
+                stars = scene.stars.copy()
+                stars[star, axis] -= way
+                assert drifted(replace(scene, stars=stars)) == expected
+        stars = scene.stars.copy()
+        stars[2, 0] += way
+        assert drifted(replace(scene, stars=stars), joint_fit._DRIFT) == moved
+    size = float(np.linalg.norm(scene.motion.rate))
+    for share, moved in ((0.95, False), (1.05, True)):
+        growth = np.array([0.0, 0.0, share * joint_fit._GROWN * size])
+        assert drifted(replace(scene, motion=CameraMotion(scene.motion.rate, growth))) == moved
+
+
+def _evaluation(stars: int, steps: FloatArray) -> Evaluation:
+    """Return normal equations of stars whose scores ask for `steps` (n, 7) of the shared parameters."""
+    rng = np.random.default_rng(9)
+    root = rng.normal(size=(stars, SHARED + ALONE, 60))
+    information = root @ root.swapaxes(1, 2)
+    whole = np.concatenate([steps, np.zeros((stars, ALONE))], axis=1)
+    noise = (root @ rng.normal(size=(stars, 60, 1)))[..., 0]
+    gradient = np.einsum("nij,nj->ni", information, whole) + noise
+    return Evaluation(information, gradient, np.full(stars, 100.0), np.full(stars, 105.0), [], 0, [])
+
+
+def _grows(evaluation: Evaluation) -> bool:
+    n = len(evaluation.chi2)
+    motion = CameraMotion.steady(np.array([0.02, 0.04, 0.01]))
+    scene = StreakScene(motion, 1.1, np.zeros((n, 2)), np.ones(n), np.zeros(n), np.ones(n, dtype=np.bool_))
+    camera = _small_problem()
+    windows = camera.windows(_small_scene())
+    return StreakFit(
+        scene, _solution([0.0] * 7, np.zeros((3, 4))), evaluation, 0.0, windows, camera.free
+    ).grows()
+
+
+def test_the_rate_changes_if_the_stars_agree_on_a_change() -> None:
+    """A change on which all stars agree is significant, and noise and the change of a single star are not."""
+    n = 12
+    none = np.zeros((n, SHARED))
+    assert not _grows(_evaluation(n, none))
+    common = none.copy()
+    common[:, 3:6] = [0.6, -0.5, 0.4]
+    assert _grows(_evaluation(n, common))
+    single = none.copy()
+    single[4, 3:6] = [12.0, -10.0, 8.0]
+    assert not _grows(_evaluation(n, single))
+    # With three stars, the scatter of the stars is not known.
+    assert not _grows(_evaluation(3, common[:3]))
+
+
+def test_the_misfit_is_the_median_chi_square_per_degree_of_freedom() -> None:
+    evaluation = replace(
+        _evaluation(3, np.zeros((3, SHARED))),
+        chi2=np.array([100.0, 300.0, 7.0]),
+        pixels=np.array([55.0, 105.0, 5.0]),
+    )
+    assert joint_fit.misfit(evaluation) == pytest.approx(3.0)
+    assert joint_fit.misfit(evaluation, np.array([0, 1])) == pytest.approx(2.5)
+    assert joint_fit.misfit(evaluation, np.array([2])) == pytest.approx(7.0)
+    assert np.isnan(joint_fit.misfit(evaluation, np.zeros(0, np.int64)))
+
+
+def test_a_large_change_of_the_rate_is_excessive_unless_it_is_known() -> None:
+    rate = np.array([0.3, 0.0, 0.4])
+    limit = joint_fit._MOST_CHANGE * 0.5
+    assert not joint_fit._excessive(CameraMotion(rate, np.array([0.0, 0.99 * limit, 0.0])))
+    excessive = CameraMotion(rate, np.array([0.0, 1.01 * limit, 0.0]))
+    assert joint_fit._excessive(excessive)
+    assert not joint_fit._excessive(replace(excessive, higher_terms=np.ones((1, 3))))
+
+
+def test_the_search_is_repeated_if_streak_ends_moved_far() -> None:
+    camera, scene = _small_problem(), _small_scene()
+    length = float(np.median(joint_fit.path_lengths(_SMALL, scene.motion, scene.stars)))
+    for share, far in ((0.97, False), (1.03, True)):
+        grown = scene.motion.rate * (1.0 + share * joint_fit._FAR / length)
+        before = replace(scene, motion=CameraMotion.steady(2.0 * scene.motion.rate - grown))
+        assert joint_fit._far(camera, before, scene) == far
+
+
+def test_subtracted_stars_leave_noise_and_their_model_errors() -> None:
+    """The frame without the stars has no streaks, and a larger noise where the stars were."""
+    camera, scene = _small_problem(), _small_scene()
+    flat = np.full((100, 120), 100.0)
+    windows = camera.windows(scene)
+    light = np.zeros(12_000)
+    light[windows.pixels] = joint_fit.light_of(_SMALL, Shutter(), scene, windows)
+    lit = _small_problem(flat + light.reshape(100, 120))
+    after = joint_fit._subtracted(lit, scene)
+    near = light > 5.0
+    assert np.abs(lit.frame.signal[near]).max() > 30.0
+    assert np.abs(after.frame.signal[near]).max() < 3.0
+    added = (joint_fit._SUBTRACTION_ERROR * light[near]) ** 2
+    assert after.frame.floor[near] - lit.frame.floor[near] == pytest.approx(added, rel=1e-3, abs=1e-3)
+    assert np.array_equal(after.frame.signal[light == 0.0], lit.frame.signal[light == 0.0])
+    nobody = scene.select(np.zeros(3, dtype=np.bool_))
+    assert joint_fit._subtracted(lit, nobody) is lit
+
+
+def test_the_brightest_stars_are_affordable_after_those_of_the_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    camera, scene = _small_problem(), _small_scene()
+    scene = replace(scene, light=np.array([10.0, 20.0, 30.0]), trusted=np.array([True, False, False]))
+    areas = window_areas(_SMALL, scene, camera.settings.reach)
+    monkeypatch.setattr(joint_fit, "_MOST_PIXELS", float(areas[0] + areas[2]) * 1.001)
+    assert joint_fit._affordable(camera, scene, 1.0).tolist() == [True, False, True]
+    assert joint_fit._affordable(camera, scene, 0.99).tolist() == [True, False, False]
+    assert joint_fit._affordable(camera, scene, 2.0).all()
+
+
+def test_the_brightness_along_a_path_is_the_mean_of_three_rows_of_pixels() -> None:
+    """The mean of a band of pixels is that of a linear image. Its error is that of the mean of samples."""
+    row, column = np.mgrid[:100, :120]
+    camera = _small_problem()
+    frame = replace(
+        camera.frame,
+        signal=(2.0 * column + 3.0 * row).astype(np.float32).reshape(-1),
+        floor=np.full(12_000, 16.0, dtype=np.float32),
+        bad=np.zeros(12_000, dtype=np.bool_),
+    )
+    camera = replace(camera, frame=frame)
+    motion = CameraMotion.steady(np.array([0.0, 0.05, 0.0]))
+    stars, time = np.array([[60.0, 50.0], [10.0, 50.0]]), np.linspace(-0.4, 0.2, 11)
+    mean, deviation = joint_fit.brightness(camera, motion, stars, np.tile(time, (2, 1)))
+    place = paths(_SMALL, motion, np.tile(stars[:1], (11, 1)), time).position
+    assert mean[0] == pytest.approx(np.mean(2.0 * place[:, 0] + 3.0 * 50.0), abs=1.0)
+    assert deviation[0] == pytest.approx(np.sqrt(16.0 / 33.0))
+    # The second path leaves the frame on more than 30 % of its length.
+    assert place[0, 0] - place[-1, 0] == pytest.approx(0.6 * 35.0, rel=0.02)
+    away = np.tile(np.linspace(0.0, 0.5, 10), (2, 1))
+    assert np.isfinite(joint_fit.brightness(camera, motion, stars, 0.6 * away)[0]).all()
+    assert np.isnan(joint_fit.brightness(camera, motion, stars, away)[0]).tolist() == [False, True]
+    bad = frame.bad.copy().reshape(100, 120)
+    bad[:, 64:] = True
+    lost = replace(camera, frame=replace(frame, bad=bad.reshape(-1)))
+    assert np.isnan(joint_fit.brightness(lost, motion, stars, np.tile(time, (2, 1)))[0]).tolist() == [
+        True,
+        False,
+    ]
+    path = paths(_SMALL, motion, np.repeat(stars, 11, axis=0), np.tile(time, 2))
+    arguments = np.ascontiguousarray(path.position.T), np.ascontiguousarray(path.velocity.T)
+    pixels = frame.signal, frame.floor, bad.reshape(-1)
+    assert_forms_agree(
+        joint_fit._band_means, *arguments, pixels, (120, 100), 11, relative=1e-5, compiled=False
+    )

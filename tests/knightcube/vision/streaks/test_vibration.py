@@ -10,6 +10,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import from_rotation_vector, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import EXACT, Pinhole
+from knightcube.vision.streaks import vibration
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.geometry import CameraMotion, Vibration, paths
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
@@ -112,3 +113,136 @@ def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() ->
         frame = _frame(41.0, 0.45, seed)
         found = frame.motion()
         assert found.rate is None or _sigmas(frame, found) < 4.0
+
+
+def _functions_are_those_of_time(functions: FloatArray, time: FloatArray, at: list[FloatArray]) -> None:
+    """Check values, slopes and ends of functions (n, b, 4) given on (b - 2,) times and at both ends.
+
+    The values `at` are those at a time before, at, and after each bin, and at both ends.
+    """
+    before, here, after, ends = at
+    assert functions[:, :, 0] == pytest.approx(here)
+    assert functions[:, :, 1] == pytest.approx((after - before) / 2e-5, rel=1e-5, abs=1e-5)
+    assert functions[:, :, 2] == pytest.approx(np.tile(ends[:, :1], len(time)))
+    assert functions[:, :, 3] == pytest.approx(np.tile(ends[:, 1:], len(time)))
+
+
+_TIME = np.linspace(-0.55, 0.55, 23)
+_TIMES = _TIME - 1e-5, _TIME, _TIME + 1e-5, np.array([-0.5, 0.5])
+_FREQUENCIES = np.array([1.3, 4.2])
+
+
+def _waves(frequency: FloatArray, time: FloatArray) -> FloatArray:
+    angle = 2.0 * np.pi * frequency[:, None] * time
+    return np.concatenate([np.sin(angle), np.cos(angle) - 1.0])
+
+
+def test_functions_of_time_have_their_slopes_and_ends() -> None:
+    powers = [np.stack([np.ones_like(t), t, t**2]) for t in _TIMES]
+    _functions_are_those_of_time(vibration._powers(_TIME), _TIME, powers)
+    waves = [_waves(_FREQUENCIES, t) for t in _TIMES]
+    _functions_are_those_of_time(vibration._waves(_FREQUENCIES, _TIME), _TIME, waves)
+    step = 1e-5
+    detuned = [
+        (_waves(_FREQUENCIES + step, t) - _waves(_FREQUENCIES - step, t)) / (2.0 * step) for t in _TIMES
+    ]
+    _functions_are_those_of_time(vibration._detuned_waves(_FREQUENCIES, _TIME), _TIME, detuned)
+
+
+def _sums(true: FloatArray, bins: int = 200, noise: float = 0.0) -> vibration._RotationSums:
+    """Return exact normal equations of a rotation given as a function (3, b, 4) of the time in each axis."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(bins, 12, 14)) * 3e4
+    information = root @ root.swapaxes(1, 2)
+    values = true.transpose(1, 2, 0).reshape(bins, 12, 1)
+    score = information @ values + noise * root @ rng.normal(size=(bins, 14, 1))
+    time = np.linspace(-0.55, 0.55, bins)
+    return vibration._RotationSums(
+        time, information.reshape(bins, 4, 3, 4, 3), score.reshape(bins, 4, 3), 3000.0
+    )
+
+
+def _true_rotation(one: Vibration, bins: int = 200) -> FloatArray:
+    time = np.linspace(-0.55, 0.55, bins)
+    values, slopes = one.rotation(time), one.rotation(time, 1)
+    ends = one.rotation(np.array([-0.5, 0.5]))
+    tiled = np.broadcast_to(ends[:, None], (3, bins, 2))
+    return np.asarray(np.concatenate([values[..., None], slopes[..., None], tiled], axis=2))
+
+
+def test_normal_equations_of_functions_are_sums_over_the_bins() -> None:
+    functions = np.random.default_rng(1).normal(size=(3, 6, 4))
+    sums = _sums(np.random.default_rng(2).normal(size=(3, 6, 4)), 6)
+    information, score = sums.normal_equations(functions)
+    expected, gradient = np.zeros((9, 9)), np.zeros(9)
+    for b in range(6):
+        # A coefficient of a function and an axis changes the four values of this axis.
+        design = np.einsum("fi,kl->fkil", functions[:, b], np.eye(3)).reshape(9, 12)
+        expected += design @ sums.information[b].reshape(12, 12) @ design.T
+        gradient += design @ sums.score[b].reshape(12)
+    assert information == pytest.approx(expected)
+    assert score == pytest.approx(gradient)
+
+
+def test_a_step_finds_amplitudes_and_frequency_of_a_vibration() -> None:
+    """Repeated steps find the true vibration, whose frequency is 0.15 cycles off at the beginning."""
+    sine, cosine = np.array([[2e-4, -1e-4, 0.0]]), np.array([[1e-4, 1e-4, -2e-4]])
+    true = Vibration(np.array([3.15]), sine, cosine)
+    found = Vibration().with_frequency(3.0)
+    for _ in range(8):
+        # The residuals are those of the vibration that was found before.
+        sums = _sums(_true_rotation(true) - _true_rotation(found))
+        found, added = vibration._improved(sums, found)
+    assert found.frequency == pytest.approx([3.15], abs=1e-3)
+    assert found.sine == pytest.approx(sine, abs=2e-6)
+    assert found.cosine == pytest.approx(cosine, abs=2e-6)
+    assert np.all(np.linalg.eigvalsh(added) >= -1e-30)
+    # A step of the frequency is limited, and the frequency is not below the lowest.
+    far = Vibration(np.array([4.5]), sine, cosine)
+    assert abs(vibration._improved(sums, far)[0].frequency[0] - 4.5) <= vibration._MOST_DETUNED + 1e-12
+    slow = Vibration(np.array([0.5]), sine, cosine)
+    assert vibration._improved(sums, slow)[0].frequency[0] >= vibration._LOWEST
+
+
+def test_the_strongest_frequency_is_that_of_the_vibration() -> None:
+    one = Vibration(np.array([3.15]), np.array([[2e-4, -1e-4, 0.0]]), np.array([[1e-4, 1e-4, -2e-4]]))
+    sums = _sums(_true_rotation(one), noise=1.0)
+    found = vibration._strongest_frequency(sums, Vibration(), 9.0)
+    assert found == pytest.approx(3.15, abs=0.5 * vibration._GRID + 1e-9)
+    # A frequency near a known frequency, or above the highest, is not tried.
+    other = vibration._strongest_frequency(sums, Vibration().with_frequency(3.15), 9.0)
+    assert other is None or abs(other - 3.15) >= vibration._LEAST_APART
+    assert vibration._strongest_frequency(sums, Vibration(), vibration._LOWEST) is None
+    nothing = _sums(np.zeros((3, 200, 4)), noise=1.0)
+    assert vibration._strongest_frequency(nothing, Vibration(), 9.0) is None
+
+
+def test_values_are_summed_from_one_index_to_the_next() -> None:
+    values = np.arange(12.0).reshape(6, 2)
+    found = vibration._sums_from(values, np.array([0, 2, 2, 5]))
+    assert found.tolist() == [[2.0, 4.0], [0.0, 0.0], [18.0, 21.0], [10.0, 11.0]]
+    assert vibration._precisions(3000.0, 2) == pytest.approx(
+        [(3000.0 / vibration._LOOSE) ** 2] * 9 + [(3000.0 / vibration._USUAL) ** 2] * 12
+    )
+
+
+@pytest.mark.parametrize("shift", [0.05, 0.2])
+def test_a_displacement_of_all_stars_is_a_common_motion(shift: float) -> None:
+    """The rms of a displacement that all stars have at the same time is measured, unless it is noise.
+
+    The displacement of a single star is not a common motion.
+    """
+    rng = np.random.default_rng(7)
+    stars, bins = 20, vibration._BINS
+    cell = np.repeat(np.arange(stars * bins), 3)
+    way = np.random.default_rng(8).normal(size=(bins, 2))
+    way *= shift / np.sqrt(np.mean(np.sum(way**2, axis=1)))
+    information = rng.uniform(200.0, 900.0, len(cell))
+    noise = rng.normal(size=(len(cell), 2)) * np.sqrt(0.5 * information)[:, None]
+    common = information[:, None] * np.tile(np.repeat(way, 3, axis=0), (stars, 1))
+    assert vibration._common_rms(cell, noise + common, information) == pytest.approx(shift, rel=0.25)
+    assert vibration._common_rms(cell, noise, information) == 0.0
+    single = np.where((cell // bins == 3)[:, None], 20.0 * common, 0.0)
+    assert vibration._common_rms(cell, noise + single, information) == 0.0
+    assert vibration._common_rms(cell[: 3 * bins], common[: 3 * bins], information[: 3 * bins]) == 0.0
+    assert vibration._common_rms(cell[:0], common[:0], information[:0]) == 0.0
