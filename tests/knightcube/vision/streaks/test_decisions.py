@@ -1,0 +1,362 @@
+"""Tests of the decisions of the rate estimator: streak check, sign of the rotation, and reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks import estimate
+from knightcube.vision.streaks.estimate import StreakVerdict, alike, check_streaks, with_rate, with_stars
+from knightcube.vision.streaks.faint_stars import FaintStars
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, path_lengths, positions
+from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
+from knightcube.vision.streaks.normal_equations import (
+    ALONE,
+    SHARED,
+    EliminatedEquations,
+    Evaluation,
+    Solution,
+)
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
+from knightcube.vision.streaks.uncertainty import RotationUncertainty
+from knightcube.vision.streaks.vibration import CommonMotion
+
+_PINHOLE = Pinhole(160, 140, 800.0)
+_MOTION = CameraMotion.steady(np.array([0.02, -0.03, 0.05]))
+
+
+def _problem(**settings: object) -> FitProblem:
+    noise = np.random.default_rng(2).normal(100.0, 4.0, (140, 160)).astype(np.uint16)
+    chosen = replace(LikelihoodSettings(), **settings)  # type: ignore[arg-type]  # named settings
+    return FitProblem(reduce_frame(noise, 60000.0, 1.0), _PINHOLE, Shutter(), chosen, 1.0)
+
+
+def _scene(stars: FloatArray, light: FloatArray, trusted: int) -> StreakScene:
+    n = len(stars)
+    return StreakScene(_MOTION, 1.1, stars, light, np.zeros(n), np.arange(n) < trusted)
+
+
+_NOBODY = FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
+
+
+def test_motions_are_alike_if_they_are_equal_or_opposite_within_half_a_percent() -> None:
+    one = np.array([0.0, 0.3, 0.4])
+    for share, equal in ((0.9, True), (1.1, False)):
+        off = np.array([share * estimate._SAME_MOTION * 0.5, 0.0, 0.0])
+        assert alike(one, one + off) == equal
+        assert alike(one, -one + off) == equal
+
+
+@pytest.mark.parametrize(
+    ("ends", "lit", "verdict"),
+    [
+        # Ends (start and end of each streak): NaN is outside the frame. Streaks without gaps are 1.
+        ([[1, 1]] * 8, [1] * 8, StreakVerdict.CONFIRMED),
+        ([[1, 1]] * 3 + [[0, 0]] * 5, [1] * 8, StreakVerdict.REJECTED),
+        ([[1, 1]] * 3 + [[np.nan, 0]] * 5, [1] * 8, StreakVerdict.REJECTED),
+        ([[1, 1]] * 2 + [[np.nan, 0]] * 2, [1] * 8, StreakVerdict.DOUBTFUL),
+        ([[1, 1]] * 3 + [[np.nan, 0]] * 3, [1] * 8, StreakVerdict.CONFIRMED),
+        ([[1, np.nan]] * 8, [1] * 8, StreakVerdict.DOUBTFUL),
+        ([[np.nan, np.nan]] * 8, [1] * 8, StreakVerdict.CONFIRMED),
+        ([[1, 1]] * 2, [0] * 1 + [1] * 7, StreakVerdict.CONFIRMED),
+        ([[1, 1]] * 2, [0] * 2 + [1] * 6, StreakVerdict.DOUBTFUL),
+        ([[1, 1]] * 3, [0] * 2 + [1] * 6, StreakVerdict.CONFIRMED),
+        ([[1, 1]] * 8, [0] * 3 + [1] * 5, StreakVerdict.REJECTED),
+    ],
+)
+def test_a_motion_is_confirmed_by_its_streak_ends_and_by_streaks_without_gaps(
+    ends: list[list[float]], lit: list[float], verdict: StreakVerdict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wrong ends or gaps reject a motion or make it doubtful, unless three streaks have two correct ends."""
+    monkeypatch.setattr(estimate, "true_ends", lambda *_: np.array(ends, dtype=float))
+    monkeypatch.setattr(estimate, "unbroken", lambda *_: np.array(lit, dtype=float))
+    stars = np.random.default_rng(1).uniform(50.0, 90.0, (8, 2))
+    scene = _scene(stars, np.full(8, 5000.0), 8)
+    monkeypatch.setattr(estimate, "chained_stars", lambda *_: np.zeros(8, dtype=np.bool_))
+    assert check_streaks(_problem(), scene, _NOBODY) is verdict
+
+
+def test_chains_and_trails_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "true_ends", lambda *_: np.ones((8, 2)))
+    monkeypatch.setattr(estimate, "unbroken", lambda *_: np.ones(8))
+    scene = _scene(np.random.default_rng(1).uniform(50.0, 90.0, (9, 2)), np.full(9, 5000.0), 8)
+    for count, verdict in ((3, StreakVerdict.CONFIRMED), (4, StreakVerdict.REJECTED)):
+        chained = (np.arange(9) < count) | (np.arange(9) == 8)
+        monkeypatch.setattr(estimate, "chained_stars", lambda *_, chained=chained: chained)
+        assert check_streaks(_problem(), scene, _NOBODY) is verdict
+    monkeypatch.setattr(estimate, "chained_stars", lambda *_: np.zeros(9, dtype=np.bool_))
+    growing = replace(scene, motion=CameraMotion(_MOTION.rate, 0.5 * _MOTION.rate))
+    slowly = replace(scene, motion=CameraMotion(_MOTION.rate, 0.3 * _MOTION.rate))
+    for share, verdict in ((0.45, StreakVerdict.CONFIRMED), (0.55, StreakVerdict.REJECTED)):
+        monkeypatch.setattr(estimate, "trailing_fraction", lambda *_, share=share: share)
+        assert check_streaks(_problem(), growing, _NOBODY) is verdict
+        assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.CONFIRMED
+
+
+def test_a_motion_is_doubtful_if_most_flux_of_complete_streaks_contradicts_it() -> None:
+    """Stars fainter than those of the motion, and stars at the border, do not contradict the motion."""
+    stars = np.array([[60.0, 60.0], [80.0, 70.0], [90.0, 50.0], [3.0, 70.0]])
+    for others, disagree in ((5500.0, False), (6500.0, True)):
+        light = np.array([6000.0, others, 3000.0, 9e4])
+        assert estimate._most_disagree(_problem(), _scene(stars, light, 1)) == disagree
+
+
+def _candidate(rate: list[float] | None, excess: list[float], place: float = 0.0) -> estimate._Candidate:
+    covariance = None if rate is None else 1e-8 * np.eye(3)
+    result = MotionResult(
+        StreakStatus.AMBIGUOUS if rate is not None else StreakStatus.FAILED,
+        1,
+        0.2,
+        rate=None if rate is None else np.array(rate),
+        covariance=covariance,
+    )
+    middles = 40.0 * np.arange(len(excess))[:, None] + np.array([place, 0.0])
+    return estimate._Candidate(result, np.zeros(3), StreakVerdict.CONFIRMED, middles, np.array(excess))
+
+
+def _rolling(
+    one: estimate._Candidate | None,
+    other: estimate._Candidate | None,
+    prior: FloatArray | None = None,
+    sigma: float = 1e-3,
+) -> tuple[MotionResult | None, list[float]]:
+    """Return the result if the two senses of a rotation about x give two candidates, and the senses tried."""
+    asked: list[float] = []
+
+    def fit_along(sense: FloatArray) -> estimate._Candidate | None:
+        asked.append(float(sense[0]))
+        return one if sense[0] > 0.0 else other
+
+    return estimate._rolling_result(fit_along, np.array([1.0, 0.0, 0.0]), prior, sigma, 3.0), asked
+
+
+def test_a_rolling_shutter_shows_the_sign_of_the_rotation() -> None:
+    """The sign with the smaller residuals of most streaks is chosen, if the difference is significant."""
+    ahead, back = [0.1, 0.002, 0.0], [-0.1, 0.002, 0.0]
+    better, worse = [0.0] * 12, [20.0] * 12
+    for excess, expected in (((better, worse), ahead), ((worse, better), back)):
+        found, asked = _rolling(_candidate(ahead, excess[0]), _candidate(back, excess[1], 2.9))
+        assert found is not None
+        assert found.rate == pytest.approx(expected)
+        assert asked == [1.0, -1.0]
+    unclear = (
+        ([0.0] * 4, [12.0] * 4, 0.0),  # the difference is below 50
+        ([0.0] * 3, [900.0, -900.0, 60.0], 0.0),  # the streaks contradict each other
+        (better, worse, 3.1),  # the stars have different positions
+    )
+    for one, other, apart in unclear:
+        found, _ = _rolling(_candidate(ahead, one), _candidate(back, other, apart))
+        assert found is not None
+        assert found.status is StreakStatus.AMBIGUOUS
+        # The mean of the first rate and the opposite of the second, with half of the difference as error.
+        assert found.rate == pytest.approx([0.1, 0.0, 0.0])
+        assert found.covariance == pytest.approx(1e-8 * np.eye(3) + np.diag([0.0, 0.002**2, 0.0]))
+
+
+def test_a_prior_rate_decides_on_the_sign_of_the_rotation() -> None:
+    ahead, back = _candidate([0.1, 0.0, 0.0], [0.0]), _candidate([-0.1, 0.0, 0.0], [0.0])
+    for prior, expected in ((0.05, 0.1), (-0.05, -0.1)):
+        found, asked = _rolling(ahead, back, np.array([prior, 0.0, 0.0]))
+        assert found is not None
+        assert found.status is StreakStatus.RATE
+        assert found.rate == pytest.approx([expected, 0.0, 0.0])
+        assert asked == [np.sign(prior)]
+    # A prior rate that is not significant does not decide.
+    assert _rolling(ahead, back, np.array([0.05, 0.0, 0.0]), 1.0)[1] == [1.0, -1.0]
+    failed = _candidate(None, [0.0])
+    found, asked = _rolling(failed, back, np.array([0.05, 0.0, 0.0]))
+    assert (found is failed.result, asked) == (True, [1.0])
+    # If only one sign can be fitted, the other may still be correct.
+    found, _ = _rolling(ahead, None)
+    assert found is not None
+    assert (found.status, found.rate, found.covariance) == (StreakStatus.FAILED, None, None)
+    assert _rolling(None, None)[0] is None
+
+
+_STARS = np.array([[60.0, 60.0], [80.0, 75.0], [95.0, 50.0], [95.9, 50.3], [40.0, 100.0]])
+_LIGHT = np.array([6000.0, 5000.0, 3000.0, 2500.0, 6.0])
+
+
+def _fit() -> StreakFit:
+    """Return a fit of five stars, of which the fourth is on the third, and the fifth is not significant."""
+    rng = np.random.default_rng(3)
+    root = (
+        rng.normal(size=(5, SHARED + ALONE, 30)) * np.array([3e3] * 6 + [90.0, 30.0, 20.0, 0.1, 1.0])[:, None]
+    )
+    information = root @ root.swapaxes(1, 2)
+    kept = np.array([0, 1, 2, 6])
+    own = np.linalg.inv(information[:, SHARED:, SHARED:])
+    gain = information[:, kept, SHARED:] @ own
+    inner = np.linalg.inv(
+        (information[:, kept[:, None], kept] - gain @ information[:, SHARED:][:, :, kept]).sum(0)
+    )
+    solution = Solution(np.zeros(SHARED), np.zeros((5, ALONE)), EliminatedEquations(kept, own, gain, inner))
+    chi2 = np.array([110.0, 230.0, 95.0, 100.0, 100.0])
+    evaluation = Evaluation(information, np.zeros((5, 11)), chi2, np.full(5, 105.0), [], 0, [])
+    scene = _scene(_STARS, _LIGHT, 2)
+    camera = _problem()
+    return StreakFit(scene, solution, evaluation, 0.0, camera.windows(scene), camera.free)
+
+
+def test_the_result_contains_the_fitted_stars_and_their_streaks() -> None:
+    """The ends of the streaks are those of the motion, with the covariance of motion and star.
+
+    A star on a brighter star, and a star that is not significant, are omitted.
+    """
+    last, camera = _fit(), _problem(psf_sigma=1.3)
+    found = with_stars(MotionResult(StreakStatus.FAILED, 7, 0.2), camera, last)
+    assert found.stars == pytest.approx(_STARS[:3])
+    assert found.flux == pytest.approx(_LIGHT[:3])
+    assert found.used.tolist() == [True, True, False]
+    joint = last.solution.joint
+    assert found.significance == pytest.approx(_LIGHT[:3] / np.sqrt(joint[:3, 9, 9]))
+    assert found.star_covariance == pytest.approx(joint[:3, 7:9, 7:9])
+    for end, time in enumerate((-0.5, 0.5)):
+        times = np.full(3, time)
+        assert found.endpoints[:, end] == pytest.approx(positions(_PINHOLE, _MOTION, _STARS[:3], times))
+        design = np.zeros((3, 2, 11))
+        for k, step in ((0, 1e-5), (1, 1e-5), (2, 1e-5), (7, 1e-2), (8, 1e-2)):
+            moved = []
+            for way in (1.0, -1.0):
+                change = way * step * np.eye(11)[k]
+                motion = CameraMotion.steady(_MOTION.rate + change[:3])
+                moved.append(positions(_PINHOLE, motion, _STARS[:3] + change[7:9], times))
+            design[:, :, k] = (moved[0] - moved[1]) / (2.0 * step)
+        covariance = design @ joint[:3] @ design.swapaxes(1, 2)
+        assert found.endpoint_covariance[:, end] == pytest.approx(
+            covariance, rel=1e-2, abs=1e-3 * covariance.max()
+        )
+    assert found.directions[:, 0] == pytest.approx(_PINHOLE.unit_vectors(found.endpoints[:, 0]))
+    assert found.directions[:, 1] == pytest.approx(_PINHOLE.unit_vectors(_STARS[:3]))
+    assert found.directions[:, 2] == pytest.approx(_PINHOLE.unit_vectors(found.endpoints[:, 1]))
+    assert found.length == pytest.approx(np.median(path_lengths(_PINHOLE, _MOTION, _STARS[:2])))
+    assert found.psf_sigma == pytest.approx(np.sqrt(1.1**2 - 1.0 / 12.0))
+    assert found.misfit == pytest.approx(1.1)
+    assert found.rate_model == "constant"
+    spread = np.sqrt(np.median(np.trace(found.endpoint_covariance[:, 0], axis1=1, axis2=2)))
+    assert found.residual == pytest.approx(spread / 800.0)
+    assert (found.checksum, found.exposure) == (7, 0.2)
+
+
+def _known(**changed: object) -> RotationUncertainty:
+    usual = RotationUncertainty(_MOTION.rate, 1e-8 * np.eye(3), 0.001, CommonMotion(), 0.0)
+    return replace(usual, **changed)  # type: ignore[arg-type]  # named attributes
+
+
+def _rated(
+    monkeypatch: pytest.MonkeyPatch,
+    known: RotationUncertainty,
+    change: Callable[[MotionResult], MotionResult] = lambda result: result,
+    verdict: StreakVerdict = StreakVerdict.CONFIRMED,
+    last_step: float = 0.0,
+    reversed_: float = 0.0,
+) -> MotionResult:
+    monkeypatch.setattr(estimate, "rotation_uncertainty", lambda *_: known)
+    monkeypatch.setattr(estimate, "reversal_improvement", lambda *_: reversed_)
+    last, camera = _fit(), _problem()
+    seen = with_stars(MotionResult(StreakStatus.FAILED, 7, 0.2), camera, last)
+    return with_rate(change(seen), camera, replace(last, last_step=last_step), verdict)
+
+
+def test_an_accepted_motion_has_a_rate_with_its_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = _rated(monkeypatch, _known())
+    assert found.status is StreakStatus.AMBIGUOUS
+    assert found.reason == ""
+    assert found.rate == pytest.approx(_MOTION.rate / 0.2)
+    assert found.covariance == pytest.approx(1e-8 / 0.04 * np.eye(3))
+    assert found.acceleration is None
+
+
+@pytest.mark.parametrize(
+    ("known", "options", "text"),
+    [
+        ({}, {"last_step": 2.1}, "the fit did not settle"),
+        ({"aside": 0.5}, {"change": lambda one: replace(one, misfit=4.2)}, "misfit 4.2"),
+        ({}, {"verdict": StreakVerdict.REJECTED}, "segments"),
+        ({"common_motion": CommonMotion(0.06, 0.01)}, {}, "0.06 px across and 1 %"),
+        ({"common_motion": CommonMotion(0.01, 0.06)}, {}, "0.01 px across and 6 %"),
+        ({"model_error": 0.0081}, {}, "uncertain by 0.8 %"),
+        ({}, {"reversed_": 31.0}, "reversed within the exposure"),
+    ],
+)
+def test_a_rejected_motion_has_a_reason(
+    known: dict[str, object], options: dict[str, object], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = _rated(monkeypatch, _known(**known), **options)  # type: ignore[arg-type]  # named options
+    assert found.status is StreakStatus.FAILED
+    assert text in found.reason
+    assert found.rate is None
+
+
+@pytest.mark.parametrize(
+    ("known", "options"),
+    [
+        ({}, {"last_step": 1.9}),
+        ({"aside": 0.44}, {"change": lambda one: replace(one, misfit=4.2)}),
+        ({"aside": 0.5}, {"change": lambda one: replace(one, misfit=3.9)}),
+        ({}, {"verdict": StreakVerdict.DOUBTFUL}),
+        ({"common_motion": CommonMotion(0.049, 0.049)}, {}),
+        ({"model_error": 0.0079}, {}),
+        ({}, {"reversed_": 29.0}),
+    ],
+)
+def test_a_motion_within_all_limits_is_accepted(
+    known: dict[str, object], options: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = _rated(monkeypatch, _known(**known), **options)  # type: ignore[arg-type]  # named options
+    assert found.status is StreakStatus.AMBIGUOUS
+    assert found.rate is not None
+
+
+def test_few_or_short_streaks_give_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    def few(result: MotionResult) -> MotionResult:
+        return replace(result, used=np.array([True, False, False]))
+
+    found = _rated(monkeypatch, _known(), few)
+    assert (found.status, found.reason) == (StreakStatus.TOO_FEW, "1 streaks agree, at least 2 are needed")
+    short = _rated(monkeypatch, _known(), lambda result: replace(result, length=2.9))
+    assert (short.status, short.reason) == (
+        StreakStatus.TOO_SHORT,
+        "streaks of 2.9 px are too short for a rate",
+    )
+    assert _rated(monkeypatch, _known(), lambda result: replace(result, length=3.1)).rate is not None
+    # The rotation is less than five standard deviations from zero.
+    size = float(np.linalg.norm(_MOTION.rate))
+    for share, status in ((4.9, StreakStatus.TOO_SHORT), (5.1, StreakStatus.AMBIGUOUS)):
+        covariance = (size / share) ** 2 * np.eye(3)
+        assert _rated(monkeypatch, _known(covariance=covariance)).status is status
+
+
+def test_double_images_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most streaks are double if each has another star within 8 px, with at least 30 % of the flux."""
+
+    def beside(distance: float, share: float, count: int) -> Callable[[MotionResult], MotionResult]:
+        def changed(result: MotionResult) -> MotionResult:
+            stars = np.concatenate([result.stars[:2], result.stars[:count] + np.array([distance, 0.0])])
+            flux = np.concatenate([result.flux[:2], share * result.flux[:count]])
+            return replace(result, stars=stars, flux=flux, used=np.arange(len(flux)) < 2)
+
+        return changed
+
+    for change, rejected in (
+        (beside(7.9, 0.31, 2), True),
+        (beside(8.1, 0.31, 2), False),
+        (beside(7.9, 0.29, 2), False),
+        (beside(7.9, 0.31, 1), True),
+    ):
+        found = _rated(monkeypatch, _known(), change)
+        assert ("most streaks are double" in found.reason) == rejected
+
+
+def test_a_scan_confirms_the_angle_of_a_motion() -> None:
+    rotation = np.array([0.06, 0.0, 0.08])
+    assert estimate._has_angle(rotation, [0.104, 0.3])
+    assert not estimate._has_angle(rotation, [0.106, 0.1])
+    assert not estimate._has_angle(rotation, [0.094])
+    assert not estimate._has_angle(rotation, [])
