@@ -12,7 +12,14 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import joint_fit
 from knightcube.vision.streaks.fit_windows import window_areas
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, paths, positions
+from knightcube.vision.streaks.geometry import (
+    CameraMotion,
+    Shutter,
+    StreakScene,
+    path_lengths,
+    paths,
+    positions,
+)
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, WorkBudget, find_light_ends, stretched
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
@@ -20,6 +27,7 @@ from knightcube.vision.streaks.normal_equations import (
     EliminatedEquations,
     Evaluation,
     Solution,
+    light_of,
 )
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
@@ -159,20 +167,17 @@ def _small_scene() -> StreakScene:
 
 
 def test_work_is_counted_in_pixels() -> None:
-    budget = WorkBudget()
-    passes = int(joint_fit._MOST_WORK / (joint_fit._PASS * 1e6))
-    for _ in range(passes):
-        budget.passed(1_000_000)
-    assert not budget.exhausted
-    budget.passed(1_000_000)
-    assert budget.exhausted
-    other = WorkBudget()
-    evaluations = int(joint_fit._MOST_WORK / (10_000 + joint_fit._EVALUATION))
-    for _ in range(evaluations):
-        other.evaluated(10_000)
-    assert not other.exhausted
-    other.evaluated(10_000)
-    assert other.exhausted
+    """The work is exhausted by one pass, or one evaluation, more than fit into the limit."""
+    for spend, pixels, work in (
+        (WorkBudget.passed, 1_000_000, joint_fit._PASS * 1e6),
+        (WorkBudget.evaluated, 10_000, 10_000.0 + joint_fit._EVALUATION),
+    ):
+        fitting = int(joint_fit._MOST_WORK / work)
+        for times, exhausted in ((fitting, False), (fitting + 1, True)):
+            budget = WorkBudget()
+            for _ in range(times):
+                spend(budget, pixels)
+            assert budget.exhausted == exhausted
 
 
 def test_the_acceleration_is_fitted_if_the_rate_changes() -> None:
@@ -304,7 +309,7 @@ def test_a_large_change_of_the_rate_is_excessive_unless_it_is_known() -> None:
 
 def test_the_search_is_repeated_if_streak_ends_moved_far() -> None:
     camera, scene = _small_problem(), _small_scene()
-    length = float(np.median(joint_fit.path_lengths(_SMALL, scene.motion, scene.stars)))
+    length = float(np.median(path_lengths(_SMALL, scene.motion, scene.stars)))
     for share, far in ((0.97, False), (1.03, True)):
         grown = scene.motion.rate * (1.0 + share * joint_fit._FAR / length)
         before = replace(scene, motion=CameraMotion.steady(2.0 * scene.motion.rate - grown))
@@ -317,7 +322,7 @@ def test_subtracted_stars_leave_noise_and_their_model_errors() -> None:
     flat = np.full((100, 120), 100.0)
     windows = camera.windows(scene)
     light = np.zeros(12_000)
-    light[windows.pixels] = joint_fit.light_of(_SMALL, Shutter(), scene, windows)
+    light[windows.pixels] = light_of(_SMALL, Shutter(), scene, windows)
     lit = _small_problem(flat + light.reshape(100, 120))
     after = joint_fit._subtracted(lit, scene)
     near = light > 5.0
