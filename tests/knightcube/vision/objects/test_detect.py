@@ -8,6 +8,8 @@ attitude from a crowded sky at rest.
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from knightcube.astro.attitude.solvers import rotation_between
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run
+from knightcube.vision.objects import detect as detect_module
 from knightcube.vision.objects.detect import (
     Judge,
     ObjectReport,
@@ -35,7 +38,7 @@ from knightcube.vision.objects.detect import (
     star_ends,
 )
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
-from knightcube.vision.objects.star_light import StarLight
+from knightcube.vision.objects.star_light import Explanation, StarLight
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from knightcube.vision.objects.streak_images import star_paths
 from knightcube.vision.streaks.estimate import estimate_motion
@@ -556,3 +559,173 @@ def test_all_forms_find_the_same_light_beside_a_path() -> None:
     for half, reach in (([0.0, 0.0], 3.0), ([1.5, -3.0], 6.0), ([0.0, 0.0], 100.0)):
         assert_forms_agree(_light_beside, region, draw.uniform(0.0, 9.0, 200), ends, np.array(half), reach)
     assert_forms_agree(_light_beside, region, np.ones(200), ends[[0, 0]], np.zeros(2), 2.0)
+
+
+def test_light_beside_the_path_of_a_star_is_that_of_pixels_beyond_the_reach() -> None:
+    """The path of the star is a parabola through both ends, which is sampled finely here."""
+    draw = np.random.default_rng(3)
+    region, light = draw.integers(0, 60, (300, 2)), draw.uniform(1.0, 9.0, 300)
+    ends, half = np.array([[10.0, 20.0], [45.0, 38.0]]), np.array([1.5, -3.0])
+    part = np.linspace(0.0, 1.0, 4001)[:, None]
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    bend = half - (half @ along) * along
+    path = ends[0] + part * (ends[1] - ends[0]) + 4.0 * part * (1.0 - part) * bend
+    distance = np.linalg.norm(region[:, None] - path, axis=2).min(axis=1)
+    clear = np.abs(distance - 6.0) > 0.4
+    count, other = _light_beside(region[clear], light[clear], ends, half, 6.0)
+    assert count == np.count_nonzero(distance[clear] > 6.0)
+    assert other == pytest.approx(light[clear][distance[clear] > 6.0].sum())
+
+
+def _judge(objects: ObjectSettings | None = None) -> Judge:
+    frame = np.random.default_rng(1).normal(400.0, 10.0, (512, 512)).astype(np.uint16)
+    segmented = segment_frame(frame, _SETTINGS)
+    return Judge(segmented, _ROTATION, _FRAME_CAMERA.pinhole, 2.0, _SETTINGS, objects or ObjectSettings())
+
+
+def _light(**values: Any) -> Any:
+    usual: dict[str, Any] = {"chi_square": 5000.0, "pixels": 1000, "expected": 900.0}
+    return SimpleNamespace(**(usual | values))
+
+
+@pytest.mark.parametrize(
+    ("gained", "remains", "misfit", "of_stars", "uniform", "expected"),
+    [
+        (600.0, 1000.0, 1.2, 5.0, False, True),
+        (599.0, 1000.0, 1.2, 5.0, False, False),
+        (600.0, 1799.0, 1.2, 5.0, False, True),
+        (600.0, 1801.0, 1.2, 5.0, False, False),
+        (600.0, 1000.0, 2.4, 4.9, False, True),
+        (600.0, 1000.0, 2.5, 4.9, False, False),
+        (600.0, 1000.0, 2.4, 4.7, False, False),
+        (600.0, 149.0, 2.4, 2.5, True, True),
+        (600.0, 149.0, 2.4, 2.5, False, False),
+        (600.0, 151.0, 2.4, 2.5, True, False),
+        (600.0, 1000.0, 3.9, 40.0, False, True),
+        (600.0, 1000.0, 4.1, 40.0, False, False),
+    ],
+)
+def test_an_object_decreases_chi_square_and_explains_its_pixels(
+    gained: float, remains: float, misfit: float, of_stars: float, uniform: bool, expected: bool
+) -> None:
+    """An object gains enough, explains its streak twice as well as stars, and most of the remaining light."""
+    light = _light(chi_square=900.0 + remains + gained)
+    found = Explanation(900.0 + remains, misfit, of_stars, 1e4)
+    assert _judge()._is_object(light, found, 600.0, uniform) == expected
+
+
+def test_stars_explain_pixels_with_a_small_chi_square() -> None:
+    judge = _judge()
+    assert judge._only_stars(_light(chi_square=1299.0), 300.0)
+    assert not judge._only_stars(_light(chi_square=1301.0), 300.0)
+    assert judge._only_stars(_light(chi_square=2499.0), 1600.0)
+    assert not judge._only_stars(_light(chi_square=2501.0), 1600.0)
+    assert judge._stars_or_unclear(_light(chi_square=2500.0)).verdict is Verdict.STARS
+    assert judge._stars_or_unclear(_light(chi_square=2501.0)).verdict is Verdict.UNCLEAR
+
+
+def test_a_streak_with_the_ends_of_a_star_moves_like_a_star() -> None:
+    ends = true_endpoints(_FRAME_CAMERA, _PLACE[None], _ROTATION)[0]
+    judge = _judge()
+    for within in (1.0, 2.0):
+        for way in (ends, ends[::-1]):
+            assert judge._moves_like_a_star(way, within)
+        off = ends + np.array([[0.0, 0.0], [2.2 * within, 0.0]])
+        assert not judge._moves_like_a_star(off, within)
+        near = ends + np.array([[0.0, 0.0], [0.9 * within, 0.0]])
+        assert judge._moves_like_a_star(near, within)
+
+
+def test_the_motion_among_the_stars_is_that_without_the_rotation() -> None:
+    """The ends of a star's streak have no motion among the stars; another point moves by its own distance."""
+    judge = _judge()
+    ends = true_endpoints(_FRAME_CAMERA, _PLACE[None], _ROTATION)[0]
+    rate, _ = judge._among_stars(ends)
+    assert rate == pytest.approx(0.0, abs=1e-9)
+    still = dataclasses.replace(judge, rotation=np.zeros(3))
+    middle = np.array(_FRAME_CAMERA.pinhole.centre)
+    rate, direction = still._among_stars(np.array([middle, middle + np.array([3.0, -4.0])]))
+    assert rate == pytest.approx(np.arctan(5.0 / _FOCAL) / 2.0)
+    assert direction == pytest.approx([0.6, -0.8], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fired", "gain", "few", "candidate", "verdict"),
+    [
+        (False, 0.0, 5000.0, False, Verdict.STAR),
+        (True, 299.0, 1200.0, False, Verdict.STARS),
+        (True, 299.0, 1400.0, False, Verdict.STARS),
+        (True, 299.0, 2600.0, False, Verdict.UNCLEAR),
+        (True, 301.0, 2600.0, True, Verdict.OBJECT),
+        (True, 301.0, 2600.0, False, Verdict.UNCLEAR),
+        (True, 301.0, 2400.0, False, Verdict.STARS),
+    ],
+)
+def test_a_streak_is_classified_by_its_pixels_if_an_indicator_fires(
+    fired: bool,
+    gain: float,
+    few: float,
+    candidate: bool,
+    verdict: Verdict,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found: Any = SimpleNamespace(flux=1.0) if candidate else None
+    light = _light(chi_square=few, chi_square_with=lambda _: few - gain)
+    monkeypatch.setattr(Judge, "_light", lambda *_, **__: light)
+    monkeypatch.setattr(Judge, "_candidate", lambda *_: found)
+    judged = _judge().streak(np.zeros((2, 2)), ("centre",) if fired else ())
+    assert judged.verdict is verdict
+    assert judged.candidate is found
+    # Lights that stars explain partly are kept, so that the rest of the region is searched.
+    assert (judged.light is light) == (verdict in {Verdict.STARS, Verdict.UNCLEAR})
+
+
+def test_a_region_with_many_corners_is_unclear_and_one_with_a_line_may_be_an_object(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    corners = np.array([[100.0, 100.0], [140.0, 110.0], [120.0, 150.0]])
+    asked: list[FloatArray] = []
+
+    def with_line(ends: FloatArray) -> float:
+        asked.append(ends)
+        return 2000.0 if np.abs(ends - corners[[0, 2]]).max() < 1.0 else 4000.0
+
+    found: Any = SimpleNamespace(flux=1.0)
+    light = _light(chi_square=5000.0, chi_square_with=with_line)
+    monkeypatch.setattr(Judge, "_light", lambda *_, **__: light)
+    tested: list[FloatArray] = []
+
+    def candidate(_: Judge, ends: FloatArray, *__: object) -> Any:
+        tested.append(ends)
+        return found
+
+    monkeypatch.setattr(Judge, "_candidate", candidate)
+    judge = _judge()
+    judged = judge.crowd(corners)
+    assert judged.verdict is Verdict.OBJECT
+    assert judged.candidate is found
+    assert len(asked) == 3
+    # The line is extended beyond both corners by the bias of the corner detector.
+    outward = (corners[0] - corners[2]) / np.linalg.norm(corners[0] - corners[2])
+    bias = _SETTINGS.endpoint_bias
+    assert tested[0] == pytest.approx(np.array([corners[0] + bias * outward, corners[2] - bias * outward]))
+    assert judge.crowd(np.tile(corners, (3, 1))[:7]).verdict is Verdict.UNCLEAR
+    near = corners[0] + np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 4.0]])
+    assert judge.crowd(near).verdict is Verdict.UNCLEAR
+    monkeypatch.setattr(Judge, "_candidate", lambda *_: None)
+    assert judge.crowd(corners).verdict is Verdict.UNCLEAR
+    small = _light(chi_square=1590.0, chi_square_with=with_line)
+    monkeypatch.setattr(Judge, "_light", lambda *_, **__: small)
+    assert judge.crowd(corners).verdict is Verdict.STARS
+
+
+def test_light_that_stars_do_not_explain_is_searched() -> None:
+    judge = _judge()
+    limit = judge.objects.crossing_improvement
+    for excess, explained in ((limit - 1.0, True), (limit + 1.0, False)):
+        light = _light(excess=lambda _, excess=excess: excess)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Judge, "_pixels_of", lambda *_: np.zeros((0, 2), np.int64))
+            one = detect_module.Judgement(Verdict.STARS, light=light)
+            assert judge.explained(one, 3) == explained
+    assert not judge.explained(detect_module.Judgement(Verdict.STAR), 3)

@@ -16,7 +16,10 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.startracker import image_fit
+from knightcube.vision.startracker.attitude_fit import stretched, turned
 from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, _fitted, attitude_by, fit_in_image
+from knightcube.vision.startracker.sky_map import bent
 from tests.knightcube.vision.startracker.unknown_lenses import drawn
 from tests.support.compiled_forms import assert_forms_agree
 
@@ -276,3 +279,96 @@ def test_the_compiled_fit_equals_that_in_numpy(scale: bool, bends: int, delayed:
     agreed, matrix, *_ = _fitted.numpy_form(*given, np.eye(3), 1.01, 1e-3 * known, scale)
     assert agreed
     assert np.abs(np.mean(observed - reference @ matrix.T, axis=0)).max() < 1e-2
+
+
+@pytest.mark.parametrize("scale", [False, True])
+@pytest.mark.parametrize("bends", [0, 6, 8])
+@pytest.mark.parametrize("shutter", [False, True])
+def test_the_normal_equations_are_those_of_numerical_derivatives(
+    scale: bool, bends: int, shutter: bool
+) -> None:
+    """Normal matrix and gradient are those of the residuals, differentiated numerically by each parameter."""
+    rng = np.random.default_rng(4)
+    points, _ = _streaks(rng, 9)
+    observed, reference = _CAMERA.unit_vectors(points + rng.normal(size=(9, 2))), _reference(points)
+    whitener = rng.normal(size=(9, 2, 3)) * 1e3
+    late = 1e-4 * rng.normal(size=(9, 3)) if shutter else np.zeros((0, 3))
+    matrix = attitude_matrix(_ATTITUDE)
+    count = 3 + int(scale) + bends + int(shutter)
+
+    def residuals(change: FloatArray) -> FloatArray:
+        rest = change[3 + int(scale) :]
+        seen = stretched(observed, float(np.exp(change[3])) if scale else 1.0)
+        bend = np.zeros(8)
+        bend[:bends] = rest[:bends]
+        seen = bent(seen, bend)
+        if shutter:
+            seen = seen - rest[bends] * late
+        missed = seen - reference @ turned(matrix, change[:3]).T
+        return np.asarray(np.einsum("nij,nj->ni", whitener, missed).reshape(-1))
+
+    steps = 1e-5 * np.eye(count)
+    design = np.stack([(residuals(step) - residuals(-step)) / 2e-5 for step in steps], axis=1)
+    normal, gradient = image_fit._normal(whitener, observed, reference @ matrix.T, late, scale, bends)
+    assert normal == pytest.approx(design.T @ design, rel=1e-5, abs=1e-6 * np.abs(normal).max())
+    expected = design.T @ residuals(np.zeros(count))
+    assert gradient == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(gradient).max())
+
+
+def test_a_late_shutter_is_fitted_with_its_prior() -> None:
+    """The delay is in units of its standard deviation, and its prior variance is one."""
+    rng = np.random.default_rng(6)
+    points = _streaks(rng, 30)[0]
+    covariance = np.tile(0.01 * np.eye(2), (30, 1, 1))
+    late = np.stack([0.01 * (points[:, 1] - 511.5), 0.002 * (points[:, 1] - 511.5)], axis=1)
+    start = multiply(from_rotation_vector(np.array([1e-3, -2e-3, 3e-3])), _ATTITUDE)
+    seen = points + 0.8 * late
+    found = fit_in_image(seen, covariance, _reference(points), _CAMERA, start, Unknowns(late=late))
+    assert found.delay == pytest.approx(0.8, abs=0.02)
+    assert np.linalg.norm(_error(found)) < 1e-4
+    none = fit_in_image(points, covariance, _reference(points), _CAMERA, start, Unknowns(late=late))
+    assert none.delay == pytest.approx(0.0, abs=1e-6)
+    assert none.bend.tolist() == [0.0] * 8
+    # Without effect on the positions, the prior keeps the delay at zero and its variance at one.
+    unknown = fit_in_image(seen, covariance, _reference(points), _CAMERA, start, Unknowns(late=1e-6 * late))
+    assert abs(unknown.delay) < 1e-2
+    fixed = fit_in_image(seen, covariance, _reference(points), _CAMERA, start)
+    assert fixed.delay == 0.0
+    assert np.linalg.norm(_error(fixed)) > 1e-3
+
+
+def test_the_excess_of_common_variance_over_a_factor_is_judged_by_the_likelihood() -> None:
+    """-2 ln L is the sum of the log determinants and of the chi-squares for multiplied variances."""
+    rng = np.random.default_rng(5)
+    points, covariance = _streaks(rng, 8)
+    seen = points + np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(8, 2)))
+    slopes = np.zeros((8, 3, 2))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0 / _CAMERA.focal_length
+    observed = _CAMERA.unit_vectors(seen)
+    held = image_fit._Seen(observed, slopes, covariance, _reference(points), Unknowns())
+    pose = image_fit._FittedPose(attitude_matrix(_ATTITUDE), 1.0)
+    agree = np.arange(8) < 6
+    for factor in (1.0, 3.0):
+        expected = 0.0
+        for k in range(6):
+            missed = held.missed(pose)[k] @ slopes[k] * _CAMERA.focal_length**2
+            whole = factor * covariance[k]
+            expected += np.log(np.linalg.det(whole)) + missed @ np.linalg.solve(whole, missed)
+        assert image_fit._surprise(held, pose, agree, factor) == pytest.approx(expected, rel=1e-6)
+
+
+def test_an_added_variance_makes_chi_square_equal_to_the_degrees_of_freedom() -> None:
+    rng = np.random.default_rng(8)
+    points = _streaks(rng, 40)[0]
+    own = np.tile(0.01 * np.eye(2), (40, 1, 1)) * rng.uniform(0.2, 3.0, (40, 1, 1))
+    noise = rng.normal(size=(40, 2)) * np.sqrt(own[:, 0, 0, None] + 0.09)
+    start = multiply(from_rotation_vector(np.array([1e-3, -2e-3, 3e-3])), _ATTITUDE)
+    seen = points + noise
+    found = fit_in_image(seen, own, _reference(points), _CAMERA, start, Unknowns(scatter=True))
+    wide = own + 0.09 * np.eye(2)
+    truth = fit_in_image(seen, wide, _reference(points), _CAMERA, start)
+    assert np.trace(found.fix.covariance) == pytest.approx(np.trace(truth.fix.covariance), rel=0.35)
+    assert 2.0 * found.fix.loss == pytest.approx(2.0 * found.agree.sum() - 3.0, abs=1.2)
+    assert found.agree.sum() >= 36
+    error = _error(found)
+    assert error @ np.linalg.solve(found.fix.covariance, error) < 16.3
