@@ -12,7 +12,7 @@ import numpy as np
 from flight.schema import reader
 from ground.bringup.bench import Session
 from ground.bringup.diagnosis import Finding
-from hal.interfaces.devices import Frame
+from hal.interfaces.devices import Frame, ImuLink, ImuReading
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
@@ -76,3 +76,39 @@ class ScriptedCamera:
         now_ns, exposure_ns = self.session().rig.clock.now_ns(), self.triggers[-1]
         begun_ns = now_ns - exposure_ns - round(self.late_s * SECOND_NS)
         return Frame(7 if self.frozen else number, begun_ns, exposure_ns, now_ns, np.asarray(pixels))
+
+
+class ScriptedUnit:
+    """Inertial unit at rest that samples at 40 Hz and measures given values.
+
+    The function `sample` returns rate, field and acceleration of the sample with a number. The attribute
+    `counts` has the counters of the link after the first question.
+    """
+
+    def __init__(
+        self,
+        session: Callable[[], Session],
+        sample: Callable[[int], tuple[FloatArray, FloatArray, FloatArray]],
+        **counts: Any,
+    ) -> None:
+        self.session, self.sample, self.counts = session, sample, counts
+        self.sent = self.asked = 0
+        self.rate_hz = 40.0
+
+    def poll(self) -> list[ImuReading]:
+        """Return the samples since the last call."""
+        due = int(self.session().rig.clock.now_ns() * 1e-9 * self.rate_hz)
+        found = [self._reading(number) for number in range(self.sent + 1, due + 1)]
+        self.sent = max(self.sent, due)
+        return found
+
+    def _reading(self, number: int) -> ImuReading:
+        time_ns = round(number / self.rate_hz * SECOND_NS)
+        return ImuReading(time_ns, time_ns, time_ns, np.array([0.0, 0.0, 0.0, 1.0]), *self.sample(number))
+
+    def link(self) -> ImuLink:
+        """Return zeros at the first question, and then the given counters."""
+        self.asked += 1
+        zeros = dict.fromkeys(("bytes_received", "packets", "bad_checksum", "discarded_bytes"), 0)
+        zeros |= {"out_of_range": 0, "not_finite": 0, "last_byte_ns": 0}
+        return ImuLink(**(zeros if self.asked == 1 else zeros | self.counts))
