@@ -7,9 +7,12 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.startracker import catalogue_refit
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -19,7 +22,10 @@ from knightcube.vision.startracker.solve import (
     solve_motion,
 )
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.streak_result import LikelihoodSettings
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene
+from knightcube.vision.streaks.joint_fit import FitProblem
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
 
@@ -159,3 +165,72 @@ def test_unsolved_uncalibrated_and_unstreaked_frames_are_not_fitted_again() -> N
         replace(first, motion=None),
     ):
         assert refit_with_catalogue(frame.pixels, other, sky(), _SETTINGS, _LIKELIHOOD) is other
+
+
+_PINHOLE = Pinhole(200, 160, 900.0)
+_COURSE = CameraMotion.steady(np.array([0.0, 0.04, 0.0]))
+"""A rotation that moves stars by 36 px to the left."""
+
+
+def test_known_stars_are_ordered_by_their_flux_within_the_frame() -> None:
+    """The fraction inside is that of nine instants; stars outside the frame are dropped."""
+    places = np.array([[100.0, 80.0], [0.0, 80.0], [100.0, 400.0], [60.0, 50.0], [216.0, 30.0]])
+    light = np.array([450.0, 900.0, 9000.0, 700.0, 8000.0])
+    found = catalogue_refit._Known.seen(_PINHOLE, _COURSE, places, light, 9)
+    inside = {100.0: 1.0, 0.0: 5.0 / 9.0, 60.0: 1.0, 216.0: 1.0 / 9.0}
+    expected = sorted(((light[k] * inside[places[k, 0]], k) for k in (0, 1, 3, 4)), reverse=True)
+    order = [k for _, k in expected]
+    assert found.places.tolist() == places[order].tolist()
+    assert found.light.tolist() == light[order].tolist()
+    assert found.inside == pytest.approx([inside[x] for x in places[order, 0]])
+    few = catalogue_refit._Known.seen(_PINHOLE, _COURSE, places, light, 2)
+    assert few.places.tolist() == places[order[:2]].tolist()
+
+
+def test_of_two_stars_within_two_pixels_the_fainter_is_a_twin() -> None:
+    places = np.array([[50.0, 50.0], [80.0, 20.0], [51.2, 51.5], [81.5, 21.5], [50.9, 90.0], [49.0, 49.0]])
+    known = catalogue_refit._Known(places, np.linspace(9.0, 1.0, 6), np.ones(6))
+    # The third and the last star are less than 2 px from the first, and the fourth 2.1 px from the second.
+    assert known.twins().tolist() == [False, False, True, False, False, True]
+
+
+def test_measured_stars_without_a_catalogue_star_are_foreign() -> None:
+    """A measured star is known if a catalogue star of similar flux is near it, or near its streak."""
+    known = catalogue_refit._Known(np.array([[100.0, 80.0]]), np.array([1000.0]), np.ones(1))
+    cases = (
+        ([104.9, 80.0], 1000.0, False),
+        ([100.0, 85.1], 1000.0, True),
+        ([104.9, 80.0], 3300.0, False),
+        ([104.9, 80.0], 3400.0, True),
+        ([130.0, 82.0], 1000.0, False),  # on the circle of the streak, within its length of 36 px
+        ([70.0, 78.0], 1000.0, False),
+        ([140.0, 80.0], 1000.0, True),
+        ([120.0, 83.0], 1000.0, True),
+    )
+    for place, flux, foreign in cases:
+        motion = MotionResult(StreakStatus.RATE, 1, 0.2, stars=np.array([place]), flux=np.array([flux]))
+        assert (catalogue_refit._foreign(_PINHOLE, _COURSE, motion, known).tolist() == [0]) == foreign
+
+
+def test_hidden_stars_are_subtracted_and_their_errors_added_to_the_noise() -> None:
+    scene = StreakScene(
+        _COURSE,
+        1.1,
+        np.array([[100.0, 80.0], [60.0, 40.0]]),
+        np.array([5000.0, 3000.0]),
+        np.zeros(2),
+        np.zeros(2, dtype=np.bool_),
+    )
+    frame = reduce_frame(np.full((160, 200), 100, np.uint16), 60000.0, 1.0)
+    camera = FitProblem(frame, _PINHOLE, Shutter(), LikelihoodSettings(), 1.0)
+    left = catalogue_refit._without(camera, scene)
+    light = frame.signal - left.signal
+    assert light.sum() == pytest.approx(8000.0, rel=0.02)
+    column, row = np.arange(32_000) % 200, np.arange(32_000) // 200
+    bright = light > 1.0
+    assert np.all(np.minimum(np.abs(row - 80), np.abs(row - 40))[bright] <= 6)
+    assert np.ptp(column[bright & (row > 60)]) == pytest.approx(36.0, abs=6.0)
+    added = (catalogue_refit._LIGHT_ERROR * light) ** 2
+    assert left.floor - frame.floor == pytest.approx(added, rel=1e-3, abs=1e-3)
+    nobody = scene.select(np.zeros(2, dtype=np.bool_))
+    assert catalogue_refit._without(camera, nobody) is frame
