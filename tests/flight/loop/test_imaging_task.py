@@ -600,3 +600,108 @@ def test_a_camera_whose_lens_is_not_learned_has_jobs_without_a_lens() -> None:
     assert bench.jobs[-1].lens is None
     bench.finish(FrameFound(motion(), None), 12 * S)
     assert bench.task.learned() == {}
+
+
+def test_a_low_battery_leaves_nearly_the_given_time_between_two_exposures() -> None:
+    bench = Bench()
+    bench.task.trigger(bench.cycle(1 * S))
+    bench.task.rest(60.0)
+    bench.task.trigger(bench.cycle(60_500 * MS - 1))
+    assert len(bench.triggers) == 1
+    assert bench.notes == [("camera", 60_500 * MS - 1)], "the pause counts as a good stream"
+    bench.task.serve(90 * S)
+    assert not any(bench.facts.get(facts.CAMERA_LOST, [])), "the age counts from the pause"
+    bench.task.trigger(bench.cycle(60_500 * MS))
+    assert len(bench.triggers) == 2, "half a second early, so that a late trigger skips none"
+    bench.task.rest(0.0)
+    bench.task.trigger(bench.cycle(60_600 * MS))
+    assert len(bench.triggers) == 3
+
+
+@pytest.mark.parametrize(("every", "made"), [(1, 16), (3, 5), (4, 4), (8, 2), (99, 2), (0, 16)])
+def test_under_overload_every_nth_exposure_is_made_up_to_a_limit(every: int, made: int) -> None:
+    """The camera makes every n-th due exposure, at least every eighth."""
+    bench = Bench(most_every=8)
+    bench.task.reduce(True, every)
+    for second in range(1, 17):
+        bench.task.trigger(bench.cycle(second * S))
+    assert len(bench.triggers) == made
+    assert bench.task.workload() == (16 - made, 0)
+    assert len(bench.notes) == 16 - made, "an exposure that is left out is no silent camera"
+    bench.frames.clear()
+    bench.task.serve(16 * S + 1)
+    assert facts.CAMERA_LOST not in bench.facts
+
+
+def test_objects_are_not_searched_under_overload() -> None:
+    bench = Bench(objects=ObjectMeasurementSettings())
+    for number, search in enumerate((False, True), start=1):
+        bench.task.reduce(search, 1)
+        bench.take(number, number * S, number * S + 300 * MS)
+        assert (bench.jobs[-1].objects is not None) is search
+        bench.finish(FrameFound(motion(), None), number * S + 400 * MS)
+
+
+def test_late_frames_are_those_that_meet_a_busy_worker_or_take_too_long() -> None:
+    bench = Bench()
+    bench.takes = False
+    bench.take(1, 1 * S, 1300 * MS)
+    assert bench.task.workload() == (0, 0), "the worker does not run"
+    bench.takes = True
+    bench.take(2, 2 * S, 2300 * MS)
+    bench.takes = False
+    bench.take(3, 3 * S, 3300 * MS)
+    assert bench.task.workload() == (0, 1)
+    bench.finish(FrameFound(motion(), None), 4300 * MS)
+    assert bench.task.workload() == (0, 1), "at the limit of two seconds"
+    bench.takes = True
+    bench.take(4, 5 * S, 5300 * MS)
+    bench.finish(FrameFound(motion(), None), 7300 * MS + 1)
+    assert bench.task.workload() == (0, 2)
+
+
+def test_a_problem_of_the_worker_is_reported() -> None:
+    bench = Bench()
+    bench.take(1, 1 * S, 1300 * MS)
+    bench.finish(FrameFound(motion(StreakStatus.TOO_SHORT), None, problem="no disk space"), 1400 * MS)
+    assert (events.VISION_FAILED, "no disk space") in zip(bench.reports, bench.texts, strict=True)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_points_among_unknown_stars_go_to_the_tracks_with_the_attitude_of_mid_exposure(known: bool) -> None:
+    bench = Bench(objects=ObjectMeasurementSettings())
+    taken: list[tuple[Any, ...]] = []
+    cast(Any, bench.task)._objects = SimpleNamespace(ingest_field=lambda *values: taken.append(values))
+    bench.estimate = bench.past(0) if known else None
+    bench.take(7, 1 * S, 1300 * MS)
+    field, seen = cast(Any, object()), motion(StreakStatus.TOO_SHORT)
+    bench.finish(FrameFound(seen, None, field=field), 1400 * MS)
+    ((sequence, middle, points, streaks, attitude, now_ns),) = taken
+    assert (sequence, middle, now_ns) == (7, 1100 * MS, 1400 * MS)
+    assert points is field
+    assert streaks is seen
+    if not known:
+        assert attitude is None
+        return
+    past = bench.past(1100 * MS)
+    np.testing.assert_allclose(attitude.quaternion, multiply(MOUNTING, past.quaternion))
+    turn = attitude_matrix(past.quaternion)
+    np.testing.assert_allclose(attitude.covariance, turn.T @ np.diag([4e-6, 9e-6, 1e-6]) @ turn)
+
+
+def test_the_course_of_a_job_has_the_rates_of_the_exposure_in_camera_axes() -> None:
+    """The mean of the course is that of a rate that increases linearly during the exposure."""
+    bench = Bench()
+    bench.estimate = bench.past(0)
+    times = np.array([900, 1000, 1200, 1300]) * MS
+    spin = np.array([[0.01, 0.0, 0.1 * (at - 1000 * MS) / (200 * MS)] for at in times.tolist()])
+    bench.navigation.rates = lambda *_: (times, spin)
+    bench.take(7, 1 * S, 1300 * MS)
+    rate = bench.jobs[0].rate_prior
+    assert rate is not None
+    assert rate.course is not None
+    # The rotation vector is the integral of the rate, with time in units of the exposure of 0.2 s.
+    np.testing.assert_allclose(rate.course.terms[0], 0.2 * TO_CAMERA @ [0.01, 0.0, 0.05], atol=1e-12)
+    np.testing.assert_allclose(rate.course.terms[1], 0.2 * TO_CAMERA @ [0.0, 0.0, 0.05], atol=1e-12)
+    np.testing.assert_allclose(rate.course.terms[2:], 0.0, atol=1e-12)
+    assert rate.course.sigma == pytest.approx(0.2 * 0.02)

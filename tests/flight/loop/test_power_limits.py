@@ -166,11 +166,13 @@ class Bench:
         self.task.begin(0)
         self.second = 0
 
-    def run(self, charge: float, seconds: int = 1, *, battery: bool = True, bus: bool = True) -> None:
+    def run(
+        self, charge: float, count: int = 1, *, battery: bool = True, bus: bool = True, step: int = 1
+    ) -> None:
         """Run the task with readings of an open-circuit voltage for a charge; the readings scatter."""
-        for _ in range(seconds):
-            self.second += 1
-            voltage = 6.0 + 2.0 * charge + 1e-6 * (self.second % 2)
+        for number in range(count):
+            self.second += step
+            voltage = 6.0 + 2.0 * charge + 1e-6 * (number % 2)
             for monitor, works in zip(self.monitors, (battery, bus), strict=False):
                 monitor.said = "" if works else "gone"
                 monitor.show(self.second * S, voltage, 0.0)
@@ -181,15 +183,15 @@ def test_loads_are_shed_and_return_in_the_order_of_the_charge() -> None:
     bench = Bench()
     bench.run(0.9, 2)
     assert (bench.shares, bench.rests, bench.records[-1]["shed"]) == ([], [], 0)
-    bench.run(0.35, 3600)
+    bench.run(0.35, 720, step=5)
     assert (bench.shares[-1], bench.rests[-1], bench.records[-1]["shed"]) == (0.3, 0.0, 1)
-    bench.run(0.25, 3600)
+    bench.run(0.25, 720, step=5)
     assert (bench.shares[-1], bench.rests[-1], bench.records[-1]["shed"]) == (0.3, 60.0, 2)
-    bench.run(0.38, 3600)
+    bench.run(0.38, 720, step=5)
     assert bench.records[-1]["shed"] == 2, "within the hysteresis of 0.1"
-    bench.run(0.45, 3600)
+    bench.run(0.45, 720, step=5)
     assert (bench.shares[-1], bench.rests[-1], bench.records[-1]["shed"]) == (0.3, 0.0, 1)
-    bench.run(0.9, 600)
+    bench.run(0.9, 120, step=5)
     assert (bench.shares[-1], bench.rests[-1], bench.records[-1]["shed"]) == (1.0, 0.0, 0)
     assert [text.split(":")[0] for text in bench.reports][:2] == ["battery-low", "battery-very-low"]
 
