@@ -627,7 +627,7 @@ def test_under_overload_every_nth_exposure_is_made_up_to_a_limit(every: int, mad
         bench.task.trigger(bench.cycle(second * S))
     assert len(bench.triggers) == made
     assert bench.task.workload() == (16 - made, 0)
-    assert len(bench.notes) == 16 - made, "an exposure that is left out is no silent camera"
+    assert len(bench.notes) == 16 - made, "the camera is not silent if an exposure is left out"
     bench.frames.clear()
     bench.task.serve(16 * S + 1)
     assert facts.CAMERA_LOST not in bench.facts
