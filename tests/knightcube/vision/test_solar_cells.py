@@ -12,7 +12,15 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.errors import UsageError
 from knightcube.vision import solar_cells
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
-from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
+from knightcube.vision.solar_cells import (
+    CoarseSun,
+    CoarseSunStatus,
+    FieldAndStrings,
+    KnownDirections,
+    SolarStringModel,
+    StringFix,
+    coarse_sun,
+)
 from knightcube.vision.sun import cameras_by_sun
 from sim_hal.emulators.power import SolarCellsModel
 from tests.sim_hal.earth_camera.scenes import pointing, random_direction
@@ -190,3 +198,158 @@ def test_no_camera_is_read_in_the_dark_and_all_without_a_coarse_sun() -> None:
     doubt = cameras_by_sun(CoarseSun(CoarseSunStatus.UNCERTAIN), _cameras())
     assert [choice.index for choice in doubt] == [0, 1, 2, 3]
     assert all(choice.possible for choice in doubt)
+
+
+_PLATES = SolarStringModel(
+    normals=np.array(
+        [
+            [1.0, 0.0, 0.0],
+            [-1.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0],
+            [0.0, -1.0, 0.0],
+            [0.0, 0.6, 0.8],
+            [0.0, 0.0, -1.0],
+        ]
+    ),
+    peaks=np.array([0.5, 0.6, 0.7, 0.8, 0.9, 1.0]),
+)
+
+
+def _unit(x: float, y: float, z: float) -> FloatArray:
+    return np.asarray(np.array([x, y, z]) / np.linalg.norm([x, y, z]))
+
+
+_SKY = KnownDirections(3e-5 * _unit(0.2, 0.5, -0.8), _unit(0.9, -0.3, 0.2), _unit(-0.1, 0.4, 0.9), 0.1, 0.05)
+
+
+def _currents(attitude: FloatArray, sky: KnownDirections = _SKY) -> FloatArray:
+    """Return the currents of the plates for an attitude, by the cosine law and the light of the Earth."""
+    matrix = quaternion.attitude_matrix(attitude)
+    direct = np.maximum(_PLATES.normals @ matrix @ sky.sun, 0.0)
+    reflected = sky.light * 0.5 * (1.0 + _PLATES.normals @ matrix @ sky.nadir)
+    return np.asarray(_PLATES.peaks * (direct + reflected))
+
+
+def _accepted(
+    estimator: FieldAndStrings, attitude: FloatArray, currents: FloatArray | None = None
+) -> StringFix | None:
+    field = quaternion.attitude_matrix(attitude) @ _SKY.field
+    known = _currents(attitude) if currents is None else currents
+    return estimator.accept(known, field, 1e-7, _SKY)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_field_and_strings_give_the_attitude(seed: int) -> None:
+    """The attitude maps the known field onto the measured field, and its rotation about the field is found.
+
+    The covariance is that of the field across the field, and that of the possible rotations about the field.
+    """
+    truth = quaternion.normalise(np.random.default_rng(seed).normal(size=4))
+    estimator = FieldAndStrings(_PLATES)
+    found = _accepted(estimator, truth)
+    assert found is not None
+    assert estimator.wrong == ""
+    body = quaternion.attitude_matrix(found.quaternion)
+    axis = quaternion.attitude_matrix(truth) @ _SKY.field / 3e-5
+    assert found.axis == pytest.approx(axis)
+    assert body @ _SKY.field / 3e-5 == pytest.approx(axis, abs=1e-9)
+    off = quaternion.angle_between(found.quaternion, truth)
+    assert off < 5.0 * found.about + np.radians(1.0)
+    assert found.about < np.radians(8.0)
+    across = 1e-7 / 3e-5
+    along = np.outer(axis, axis)
+    assert found.covariance == pytest.approx(found.about**2 * along + across**2 * (np.eye(3) - along))
+
+
+def test_a_failed_string_is_named_and_does_not_change_the_attitude() -> None:
+    truth = quaternion.normalise(np.array([0.3, -0.5, 0.2, 0.7]))
+    usual = _accepted(FieldAndStrings(_PLATES), truth)
+    assert usual is not None
+    estimator = FieldAndStrings(_PLATES)
+    currents = _currents(truth)
+    brightest = int(np.argmax(currents / _PLATES.peaks))
+    currents[brightest] = 0.0
+    found = _accepted(estimator, truth, currents)
+    assert found is not None
+    assert estimator.wrong == f"string {brightest + 1} contradicts the other strings or the field"
+    assert quaternion.angle_between(found.quaternion, truth) < 5.0 * found.about + np.radians(1.0)
+
+
+def test_no_attitude_is_found_in_the_dark_or_from_impossible_currents() -> None:
+    truth = quaternion.normalise(np.array([0.3, -0.5, 0.2, 0.7]))
+    estimator = FieldAndStrings(_PLATES)
+    assert _accepted(estimator, truth, 0.09 * _PLATES.peaks) is None
+    assert estimator.wrong == "no string has 0.1 of its peak current"
+    assert _accepted(estimator, truth, 0.9 * _PLATES.peaks) is None
+    assert "contradicts" in estimator.wrong
+    assert _accepted(estimator, truth) is not None
+    assert estimator.wrong == ""
+
+
+def test_the_sun_along_the_field_leaves_the_rotation_about_it_undetermined() -> None:
+    sky = KnownDirections(3e-5 * _SKY.sun, _SKY.sun, _SKY.sun, 0.1, 0.05)
+    truth = quaternion.normalise(np.array([0.3, -0.5, 0.2, 0.7]))
+    field = quaternion.attitude_matrix(truth) @ sky.field
+    estimator = FieldAndStrings(_PLATES)
+    assert estimator.accept(_currents(truth, sky), field, 1e-7, sky) is None
+    assert estimator.wrong == ""
+
+
+def test_earlier_readings_are_propagated_and_forgotten_after_two_minutes() -> None:
+    """The possible rotations turn with the body. Evidence against others decays within 120 s."""
+    truth = quaternion.normalise(np.array([0.3, -0.5, 0.2, 0.7]))
+    step = quaternion.from_rotation_vector(np.array([0.5, -0.3, 0.4]))
+    after = quaternion.multiply(step, truth)
+    estimator = FieldAndStrings(_PLATES)
+    first = _accepted(estimator, truth)
+    assert first is not None
+    estimator.turn(step, 1.0)
+    second = _accepted(estimator, after)
+    assert second is not None
+    assert quaternion.angle_between(second.quaternion, after) < 5.0 * second.about + np.radians(1.0)
+    assert second.about <= first.about + np.radians(1.0)
+    against = estimator._against.copy()
+    assert against.max() == solar_cells._MOST_VIOLATION
+    estimator.turn(quaternion.IDENTITY, 30.0)
+    assert estimator._against == pytest.approx(np.maximum(against - 0.75, 0.0))
+    estimator.turn(quaternion.IDENTITY, 90.0)
+    assert not estimator._against.any()
+    _accepted(estimator, after)
+    estimator.forget()
+    assert not estimator._against.any()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_known_field_is_rotated_onto_the_measured_field(sign: float) -> None:
+    """Also a field that is nearly opposite to the measured field is rotated onto it."""
+    estimator = FieldAndStrings(_PLATES)
+    axis = _unit(0.3, 0.4, -0.5)
+    known = sign * _unit(0.3, 0.41, -0.5)
+    base = estimator._aligned(axis, known)
+    assert quaternion.attitude_matrix(base) @ known == pytest.approx(axis, abs=1e-9)
+    assert np.linalg.norm(base) == pytest.approx(1.0)
+    again = estimator._aligned(axis, known)
+    assert quaternion.angle_between(again, base) < 1e-9
+
+
+def test_misfits_are_chi_squares_with_and_without_each_string() -> None:
+    estimator = FieldAndStrings(_PLATES)
+    base = quaternion.attitude_matrix(quaternion.normalise(np.array([0.1, 0.2, -0.4, 0.9])))
+    axis, tilt = _unit(0.2, -0.6, 0.7), 0.03
+    shares = np.array([0.4, 0.1, 0.3, 0.2, 0.7, 0.05])
+    whole, without = estimator._misfits(base, shares, axis, tilt, _SKY)
+    assert whole.shape == (solar_cells._TURNS,)
+    assert without.shape == (6, solar_cells._TURNS)
+    for trial in (0, 37, 121):
+        turn = quaternion.attitude_matrix(quaternion.from_rotation_vector(np.radians(2.0 * trial) * axis))
+        sunlight, slope = solar_cells._sunlight(_PLATES.normals @ turn @ base @ _SKY.sun)
+        earth = 0.5 * (1.0 + _PLATES.normals @ turn @ base @ _SKY.nadir)
+        left = shares - sunlight - 0.1 * earth
+        own = _PLATES.sigma**2 + (tilt**2 + np.radians(2.0) ** 2 / 12.0) * slope**2
+        common = solar_cells._COMMON**2 * np.outer(sunlight, sunlight) + 0.05**2 * np.outer(earth, earth)
+        covariance = np.diag(own) + common
+        assert whole[trial] == pytest.approx(left @ np.linalg.solve(covariance, left))
+        for omitted in range(6):
+            kept = np.delete(np.arange(6), omitted)
+            part = left[kept] @ np.linalg.solve(covariance[np.ix_(kept, kept)], left[kept])
+            assert without[omitted, trial] == pytest.approx(part)
