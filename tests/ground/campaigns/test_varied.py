@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,17 @@ import yaml
 
 from flight.app.cli import main
 from ground.campaigns import varied
-from ground.campaigns.runner import Result, fly
-from ground.campaigns.varied import draw_campaign, variation_of, varied_campaign
+from ground.campaigns.runner import Case, Result, fly
+from ground.campaigns.varied import (
+    draw_campaign,
+    figures_of,
+    fly_case,
+    numbers_drawn,
+    variation_of,
+    varied_campaign,
+)
+from ground.report import figures
+from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError
 
 DEMO = Path(__file__).parents[3] / "config" / "step_demo.yaml"
@@ -251,3 +262,155 @@ def test_the_temporary_files_of_a_campaign_killed_after_its_last_result_are_dele
     fly(campaign, 1, 1, tmp_path / "out", workers=1)
     assert not left.exists()
     assert not (tmp_path / "out" / "temporary").is_symlink()
+
+
+# One flight of a campaign, with an artificial report.
+
+CASE = Case("flight-00003", (1, 3), {"config": "name: x\n", "drawn": {"a": 1.0}, "duration": 5.0, "seed": 77})
+ROW = {"worst": 1.0, "limit": 2.0, "unit": "deg", "verdict": "pass", "margin": 1.0}
+
+
+class Flight:
+    """Flight whose report and ending are given; the requests are noted."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, verdict: str = "pass", *, interrupted: bool = False
+    ) -> None:
+        self.requests: list[Any] = []
+        self.error: Exception | None = None
+        self.flown = SimpleNamespace(
+            interrupted=interrupted, ending=SimpleNamespace(mode="hold", faults={"imu-silent": 2})
+        )
+        thesis = ROW | {"quantity": "power", "verdict": verdict}
+        report = {"requirements": [ROW | {"quantity": "pointing to target 3, rms"}], "thesis": [thesis]}
+        monkeypatch.setattr(varied, "fly", self.fly)
+        monkeypatch.setattr(varied, "read_run", lambda folder: folder)
+        monkeypatch.setattr(varied, "summarise", lambda run: report)
+
+    def fly(self, request: Any) -> Any:
+        self.requests.append((request, request.config_path.read_text()))
+        if self.error is not None:
+            raise self.error
+        return self.flown
+
+
+def test_a_flight_keeps_its_drawn_values_and_its_limited_measures(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(monkeypatch)
+    found = fly_case(CASE)
+    judged = {"worst": 1.0, "limit": 2.0, "unit": "deg", "verdict": "pass"}
+    assert found == {
+        "key": "flight-00003",
+        "drawn": {"a": 1.0},
+        "judged": [{"quantity": "pointing, rms", **judged}, {"quantity": "power", **judged}],
+        "error": "",
+        "seed": 77,
+        "duration": 5.0,
+        "mode": "hold",
+        "faults": {"imu-silent": 2},
+    }
+    ((request, text),) = flight.requests
+    assert text == "name: x\n"
+    assert (request.duration, request.seed, request.config_path.name) == (5.0, 77, "flight-00003.yaml")
+    assert not request.config_path.exists(), "the folder of the flight is temporary"
+
+
+def test_a_flight_beyond_a_limit_or_with_an_error_keeps_its_configuration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = Flight(monkeypatch, "miss")
+    assert fly_case(CASE)["config"] == "name: x\n"
+    flight.error = NotResponding("imu", "silent")
+    found = fly_case(CASE)
+    assert (found["error"], found["config"], found["judged"]) == (str(flight.error), "name: x\n", [])
+    assert "mode" not in found
+    Flight(monkeypatch, interrupted=True)
+    with pytest.raises(KeyboardInterrupt):
+        fly_case(CASE)
+
+
+def test_the_worst_value_of_each_quantity_counts_and_missing_values_are_unknown() -> None:
+    rows = [
+        {"judged": [ROW | {"quantity": "a", "worst": 1.0}, ROW | {"quantity": "a", "worst": 3.0}]},
+        {"judged": [ROW | {"quantity": "a", "worst": None}, ROW | {"quantity": "b", "worst": 5.0}]},
+        {"judged": [ROW | {"quantity": "a", "worst": None}, ROW | {"quantity": "a", "worst": 2.0}]},
+    ]
+    found = figures_of(rows)
+    assert list(found) == ["a", "b"]
+    assert found["a"][:2] == (2.0, "deg")
+    assert found["a"][2] == pytest.approx([3.0, math.nan, 2.0], nan_ok=True)
+    assert found["b"][2] == pytest.approx([math.nan, 5.0, math.nan], nan_ok=True)
+    drawn = [{"drawn": {"x": 1, "on": True, "name": "n"}}, {"drawn": {"x": 2.5, "on": False, "name": "m"}}]
+    assert numbers_drawn(drawn) == {"x": [1.0, 2.5]}
+
+
+def test_the_printed_table_lists_twenty_failed_flights_and_the_facts_list_all(tmp_path: Path) -> None:
+    campaign = varied_campaign(DEMO, [], None)
+    found = campaign.summarise([result(k, 9.0) for k in range(23)], tmp_path)
+    assert len(found.facts["failed flights"]) == 23
+    assert "flight-00019" in found.text
+    assert "flight-00020" not in found.text
+    assert "further failed flights, in summary.json: 3" in found.text
+    again = found.facts["failed flights"][4]["fly it again"]
+    assert again == f"knightcube run {tmp_path / 'failed' / 'flight-00004'}.yaml --seed 4"
+    timed = result(1, 9.0) | {"duration": 2.5}
+    (row,) = campaign.summarise([timed], tmp_path).facts["failed flights"]
+    assert row["fly it again"].endswith("--seed 1 --duration 2.5")
+    good = campaign.summarise([result(k, 1.0) for k in range(3)], tmp_path / "good")
+    assert "failed" not in good.text
+    assert not (tmp_path / "good").exists()
+    (figure,) = campaign.summarise([result(k, 1.0 * k) for k in range(1, 5)], tmp_path).facts["figures"]
+    assert (figure["n"], figure["within"], figure["median"], figure["maximum"]) == (4, 4, 2.5, 4.0)
+    assert figure["95 %"] == pytest.approx(3.85)
+
+
+def test_the_picture_shows_each_measure_over_each_drawn_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[Any] = []
+    monkeypatch.setattr(figures, "save", lambda figure, file: saved.append((figure, file)))
+    results = [result(k, worst) for k, worst in enumerate((1.0, 40.0, 2.0, math.inf, None))]
+    for k, one in enumerate(results):
+        one["drawn"] = {"mass": float(k), "size": 10.0 * k, "name": "x"}
+        one["judged"].append(
+            {"quantity": "power", "worst": 0.5 * k, "limit": 9.0, "unit": "W", "verdict": "pass"}
+        )
+    assert draw_campaign(results, tmp_path / "x.png")
+    ((figure, file),) = saved
+    assert file == tmp_path / "x.png"
+    axes = figure.axes
+    assert len(axes) == 4
+    good, beyond, infinite, limit = axes[0].get_lines()
+    assert good.get_xydata().tolist() == [[0.0, 1.0], [2.0, 2.0]]
+    assert beyond.get_xydata().tolist() == [[1.0, 40.0]]
+    assert infinite.get_xydata().tolist() == [[3.0, 1.0]]
+    assert limit.get_ydata()[0] == 4.0
+    assert axes[1].get_lines()[0].get_xdata().tolist() == [0.0, 20.0]
+    assert [ax.get_xlabel() for ax in axes] == ["", "", "mass", "size"]
+    assert [ax.get_ylabel() for ax in axes] == ["error, deg", "", "power, W", ""]
+    assert [ax.get_yscale() for ax in axes] == ["log", "log", "linear", "linear"]
+    assert len(axes[2].get_lines()) == 3, "all powers are finite and within the limit"
+    assert figure.get_size_inches() == pytest.approx([2.0 + 3.2 * 2, 0.8 + 2.4 * 2])
+
+
+def test_the_strongest_influence_is_the_largest_rank_correlation(tmp_path: Path) -> None:
+    """Ranks of the drawn numbers: x rises with the error, except for one exchange, and y falls."""
+    results = [result(k, worst) for k, worst in enumerate((0.1, 0.2, 0.4, 0.8))]
+    for one, x, y in zip(results, (1.0, 3.0, 2.0, 9.0), (5.0, 4.0, 3.0, -90.0), strict=True):
+        one["drawn"] = {"x": x, "y": y}
+    campaign = varied_campaign(DEMO, [], None)
+    (row,) = campaign.summarise(results, tmp_path).facts["figures"]
+    assert row["strongest influence"] == "y -1.00"
+    for one in results:
+        del one["drawn"]["y"]
+    (row,) = campaign.summarise(results, tmp_path).facts["figures"]
+    assert row["strongest influence"] == "x +0.80"  # 1 - 6 * 2 / (4 * 15), Spearman
+    (row,) = campaign.summarise(results[:2], tmp_path).facts["figures"]
+    assert row["strongest influence"] == "-"
+
+
+def test_the_name_of_a_campaign_states_values_duration_and_checksum() -> None:
+    long = varied_campaign(DEMO, [variation_of("plant.inertia=5%"), variation_of("steps[0].q2=1..2")], 2.5)
+    assert long.name.startswith("step_demo with plant.inertia=5%, steps[0].q2=1..2, 2.5 s (CRC ")
+    assert ", 2.5 s" not in varied_campaign(DEMO, [], None).name
+    with pytest.raises(UsageError, match="has no section `simulation`"):
+        varied_campaign(DEMO.with_name("testbed.yaml"), [], None)
