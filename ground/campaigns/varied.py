@@ -25,6 +25,7 @@ from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.report import drawing, summarise
 from ground.telemetry import read_run
 from hal.interfaces.errors import DeviceError
+from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError, UsageError
 from sim_hal.settings import Simulation
 
@@ -297,14 +298,20 @@ def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
 def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
     """Return the key of the random parameter that correlates most with `values`, and the rank correlation."""
     known = np.isfinite(values)
-    ranks = np.argsort(np.argsort(np.array(values)[known]))
+    ranks = _ranks(np.array(values)[known])
     best = ("", 0.0)
     for key, numbers in drawn.items():
-        own = np.argsort(np.argsort(np.array(numbers)[known]))
+        own = _ranks(np.array(numbers)[known])
         if len(ranks) > 2 and np.ptp(ranks) and np.ptp(own):
             correlation = float(np.corrcoef(ranks, own)[0, 1])
             best = max(best, (key, correlation), key=lambda pair: abs(pair[1]))
     return f"{best[0]} {best[1]:+.2f}" if best[0] else "-"
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Return the ranks (n,) of values (n,), where equal values have their mean rank."""
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1))[places])
 
 
 def _why(result: Result) -> str:

@@ -408,6 +408,20 @@ def test_the_strongest_influence_is_the_largest_rank_correlation(tmp_path: Path)
     assert row["strongest influence"] == "-"
 
 
+def test_equal_drawn_numbers_have_their_mean_rank(tmp_path: Path) -> None:
+    """The ranks 1.5, 1.5, 3.5, 3.5 correlate with 1, 2, 3, 4 by 2 / sqrt(5) = 0.894."""
+    results = [result(k, worst) for k, worst in enumerate((0.1, 0.2, 0.4, 0.8))]
+    for one, x in zip(results, (7.0, 7.0, 8.0, 8.0), strict=True):
+        one["drawn"] = {"same": 1.0, "x": x}
+    campaign = varied_campaign(DEMO, [], None)
+    (row,) = campaign.summarise(results, tmp_path).facts["figures"]
+    assert row["strongest influence"] == "x +0.89"
+    for one in results:
+        del one["drawn"]["x"]
+    (row,) = campaign.summarise(results, tmp_path).facts["figures"]
+    assert row["strongest influence"] == "-"
+
+
 def test_the_name_of_a_campaign_states_values_duration_and_checksum() -> None:
     long = varied_campaign(DEMO, [variation_of("plant.inertia=5%"), variation_of("steps[0].q2=1..2")], 2.5)
     assert long.name.startswith("step_demo with plant.inertia=5%, steps[0].q2=1..2, 2.5 s (CRC ")
