@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.link import events
+from flight.link.events import Mode
 from flight.link.telemetry.definitions import STREAK, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
+from flight.loop.facts import FACTS, StreamState
 from ground.report import format_report, summarise
 from ground.report.signals import coil_power, covariance_matrices, mean_rates
 from ground.telemetry import Run, read_run, scan
@@ -28,6 +31,7 @@ from tests.ground.report.synthetic import (
     make_run,
 )
 from tests.manual_clock import ManualClock
+from tests.support.packed_run import packed_run
 
 OVERSHOOT = 100.0 * math.exp(-math.pi * DAMPING / math.sqrt(1.0 - DAMPING**2))
 
@@ -307,3 +311,137 @@ def test_the_text_of_the_barest_run_says_what_is_missing(tmp_path: Path) -> None
     text = format_report(summarise(short(tmp_path, **changes)))
     assert "note: no target packets" in text
     assert "unknown" in text
+
+
+# Values of single packets.
+
+
+def test_the_identity_of_a_run_is_that_of_its_packets() -> None:
+    first = {
+        "config_name": "demo", "config_crc": 77, "software": "1.2", "seed": 9, "utc_ns": 5, "simulated": 1,
+        "realtime": 0, "control_period_ns": 25_000_000, "duration": 10.0,
+    }  # fmt: skip
+    later = first | {"utc_ns": 12, "seed": 10}
+    run = packed_run(run=[(0.0, first), (2.0, later)], control=[(9.93, {})])
+    assert summarise(run)["run"] == {
+        "folder": "run", "duration_s": 9.93, "cut_short": False, "duration_planned_s": 10.0,
+        "config_name": "demo", "config_crc": 77, "software": "1.2", "seed": 9, "utc_ns": 12,
+        "simulated": True, "realtime": False, "control_period_s": 0.025,
+    }  # fmt: skip
+    short_run = packed_run(run=[(0.0, first)], control=[(9.92, {})])
+    assert summarise(short_run)["run"]["cut_short"], "more than three periods are missing"
+
+
+def test_health_states_shares_of_good_streams_conditions_and_worst_values() -> None:
+    """The states of a stream are unknown, good, and others; a stream that is never fitted is not listed."""
+    states = StreamState.GOOD, StreamState.STALE, StreamState.NOT_FITTED
+    good, lost, not_fitted = map(int, states)
+    rows = [
+        (1.0, {"imu": good, "field": good, "coils": lost, "power": not_fitted, "camera": not_fitted,
+               "facts": 0b101, "fed": 3, "clock_steps": 1, "cpu_share": 0.5, "proportional": 2e8,
+               "memory_slope": 1.0, "disk_free": 9e9, "temperature": math.nan}),
+        (2.0, {"imu": good, "field": lost, "coils": lost, "power": not_fitted, "camera": good,
+               "facts": 0b1, "fed": 4, "clock_steps": 2, "cpu_share": 0.2, "proportional": 1e8,
+               "memory_slope": 0.5, "disk_free": 8e9, "temperature": math.nan}),
+        (3.0, {"imu": good, "field": good, "coils": lost, "power": not_fitted, "camera": good,
+               "facts": 0, "fed": 5, "clock_steps": 2, "cpu_share": math.nan, "proportional": math.nan,
+               "memory_slope": math.nan, "disk_free": math.nan, "temperature": math.nan}),
+    ]  # fmt: skip
+    found = summarise(packed_run(health=rows))["health"]
+    assert found["streams_good"] == pytest.approx({"imu": 1.0, "field": 2 / 3, "coils": 0.0, "camera": 2 / 3})
+    assert found["facts"] == [FACTS[0].name, FACTS[2].name]
+    assert (found["watchdog_fed"], found["clock_steps"]) == (5, 2)
+    assert (found["cpu_share"], found["proportional_bytes"]) == pytest.approx((0.5, 2e8))
+    assert (found["memory_slope_bytes_per_hour"], found["disk_free_bytes"]) == pytest.approx((1800.0, 8e9))
+    assert found["temperature_c"] is None
+    assert summarise(packed_run(event=[(0.0, {"name": "x"})]))["health"] is None
+
+
+def test_cycles_jobs_rate_groups_and_plans_have_their_statistics() -> None:
+    timing = [(0.1 * k, {"lateness": 1e-5 * k, "execution": 2e-5 * k}) for k in range(101)]
+    control = [(0.1 * k, {"cycle": cycle}) for k, cycle in enumerate((10, 11, 14, 15))]
+    jobs = [
+        (1.0, {"name": "vision", "execution": 0.3, "outcome": "done"}),
+        (2.0, {"name": "planner", "execution": 0.1, "outcome": "done"}),
+        (3.0, {"name": "vision", "execution": 0.5, "outcome": "failed"}),
+        (4.0, {"name": "vision", "execution": 0.1, "outcome": "done"}),
+    ]
+    groups = [
+        (
+            1.0,
+            {"name": "slow", "period": 1.0, "cycles": 5, "slips": 1, "overruns": 2, "mean": 0.1, "max": 0.2},
+        ),
+        (1.0, {"name": "fast", "period": 0.1, "cycles": 40}),
+        (
+            2.0,
+            {
+                "name": "fast",
+                "period": 0.1,
+                "cycles": 50,
+                "slips": 3,
+                "overruns": 4,
+                "mean": 0.01,
+                "max": 0.03,
+            },
+        ),
+    ]
+    plans = [
+        (1.0, {"accepted": 1, "status": "solved", "horizon": 10.0, "peak_current": 0.05}),
+        (2.0, {"accepted": 1, "status": "stretched", "horizon": 13.0, "peak_current": 0.04}),
+        (3.0, {"accepted": 0, "status": "infeasible", "horizon": 99.0, "peak_current": 0.9}),
+        (4.0, {"accepted": 0, "status": "stretched", "horizon": 99.0, "peak_current": 0.9}),
+    ]
+    found = summarise(
+        packed_run(cycle_timing=timing, control=control, job_timing=jobs, rate_group=groups, plan=plans)
+    )
+    assert (found["cycles"]["count"], found["cycles"]["skipped"]) == (4, 2)
+    assert found["cycles"]["lateness_s"] == pytest.approx({"p50": 5e-4, "p99": 9.9e-4, "max": 1e-3})
+    assert found["cycles"]["execution_s"] == pytest.approx({"p50": 1e-3, "p99": 1.98e-3, "max": 2e-3})
+    planner, vision = found["jobs"]
+    assert (planner["name"], planner["count"], planner["outcomes"]) == ("planner", 1, {"done": 1})
+    assert (vision["name"], vision["count"], vision["outcomes"]) == ("vision", 3, {"done": 2, "failed": 1})
+    assert vision["execution_s"] == pytest.approx({"p50": 0.3, "p99": 0.496, "max": 0.5})
+    fast, slow = found["rate_groups"]
+    assert fast == {
+        "name": "fast", "period_s": pytest.approx(0.1), "cycles": 50, "slips": 3, "overruns": 4,
+        "mean_s": pytest.approx(0.01), "max_s": pytest.approx(0.03),
+    }  # fmt: skip
+    assert (slow["name"], slow["cycles"], slow["slips"], slow["overruns"]) == ("slow", 5, 1, 2)
+    assert found["planner"] == {
+        "plans": 4, "accepted": 2, "refused": 2, "stretched": 1,
+        "refusals": {"infeasible": 1, "stretched": 1},
+        "longest_horizon_s": 13.0, "peak_current_a": pytest.approx(0.05),
+    }  # fmt: skip
+    empty = summarise(packed_run(event=[(0.0, {"name": "x"})]))
+    assert empty["cycles"] == {"count": 0, "skipped": 0, "lateness_s": None, "execution_s": None}
+    assert (empty["planner"]["longest_horizon_s"], empty["planner"]["peak_current_a"]) == (None, None)
+
+
+def test_events_are_counted_with_those_that_were_suppressed_and_coils_are_listed() -> None:
+    broken, trusted = events.COIL_BROKEN.name, events.COIL_TRUSTED.name
+    rows = [
+        (1.5, {"name": "b", "severity": 2, "text": "first", "suppressed": 4}),
+        (2.0, {"name": broken, "severity": 3, "text": "coil x"}),
+        (2.5, {"name": "b", "severity": 1, "text": "second", "suppressed": 1}),
+        (3.0, {"name": trusted, "severity": 1, "text": "coil x again"}),
+    ]
+    found = summarise(
+        packed_run(event=rows, mode=[(1.0, {"mode": int(Mode.DETUMBLE), "trigger": "t", "reason": "r"})])
+    )
+    assert found["events"][0] == {"name": "b", "count": 7, "severity": 2, "first_s": 1.5, "text": "first"}
+    assert [one["name"] for one in found["events"]] == ["b", broken, trusted]
+    assert found["coils"] == [
+        {"time_s": 2.0, "name": broken, "text": "coil x"},
+        {"time_s": 3.0, "name": trusted, "text": "coil x again"},
+    ]
+    assert found["modes"] == [{"mode": Mode.DETUMBLE.label, "at_s": 1.0, "trigger": "t", "reason": "r"}]
+
+
+def test_the_largest_currents_and_the_mean_power_are_those_of_the_log() -> None:
+    control = [(0.1 * k, {"current_written": [0.01 * k, -0.09, 0.0]}) for k in range(5)]
+    truth = [(0.1 * k, {"current": [0.0, 0.02, -0.12]}) for k in range(5)]
+    housekeeping = [(float(k), {"coil_power": 0.1 * k}) for k in (1, 2, 3)]
+    power = summarise(packed_run(control=control, truth=truth, housekeeping=housekeeping))["power"]
+    assert power["peak_current_a"] == pytest.approx(0.09)
+    assert power["peak_current_actual_a"] == pytest.approx(0.12)
+    assert power["bus_average_w"] == pytest.approx(0.2)
