@@ -74,7 +74,7 @@ enabled: true
 authModules: [{class: org.yamcs.security.YamlAuthModule}]
 """
 USERS, USER = "etc/users.yaml", "admin"
-"""File of Yamcs's password, and name of Yamcs's user.
+"""File that contains the password of Yamcs, and user name in Yamcs.
 
 Without the file, Yamcs accepts a publicly known default password.
 """

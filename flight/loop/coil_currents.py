@@ -344,7 +344,7 @@ class StuckLeg:
         self._await()
 
     def _give_up(self) -> None:
-        """End the search until the supply current is normal again."""
+        """Suspend the search until the supply current is normal again."""
         self.reset()
         self._step = _Step.NO_CURE
 

@@ -233,7 +233,7 @@ def _voltage(monitor: PowerMonitor | None) -> float:
 def _coil_changes(
     config: Config, found: diagnosis.CoilsFound, clipped: bool, *, axes_known: bool
 ) -> dict[str, Any]:
-    """Return the changes of windings and shunt that the findings about single coils imply.
+    """Return the corrected configuration values of windings and shunt, given the findings for each coil.
 
     If `axes_known` is false, the axes of the coils are not changed, because a coil's field at the
     magnetometer is not parallel to the axis of the coil.

@@ -112,7 +112,7 @@ def ground_files_folder(keys: Path) -> Path:
 
 
 def terminal_of(options: argparse.Namespace) -> Terminal:
-    """Return the terminal for the link options.
+    """Return the link to the satellite that the command-line options describe.
 
     Raises UsageError for invalid options, and FlightError if the link cannot be opened.
     """

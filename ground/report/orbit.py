@@ -377,9 +377,9 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
     while the attitude is fine and the body rotates slowly. An instant is unobstructed if the true body rate
     is below `camera.max_rate` and the true boresight is outside `pointing.cones` of Sun and Earth. An instant
-    has a measurement if a frame exposed before the next instant gives an attitude or a rate. The longest gap
-    is the longest total time of consecutive unobstructed instants without a measurement. Returns None without
-    a star camera or a truth log.
+    is measured if a frame exposed between this instant and the next gives an attitude or a rate. The longest
+    gap is the longest total time of consecutive unobstructed instants without a measurement. Returns None
+    without a star camera or a truth log.
     """
     camera = config.camera
     if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):

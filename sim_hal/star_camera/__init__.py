@@ -1,4 +1,4 @@
-"""Image model of the star camera: a corrected version of Sease 2013, chapter 2, for the true motion.
+"""Image model of the star camera: Sease 2013, chapter 2, corrected, for any motion during the exposure.
 
     model = StarCameraModel(field_of_view=np.radians(20.0))
     stars = catalogue.load()

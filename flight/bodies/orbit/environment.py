@@ -99,7 +99,7 @@ class FixSequence:
         self.joined = 1
         self._offset_ns = offset_ns
         self._offered = 1
-        self._strength = np.zeros(3)  # sums of squared field deviations from two orbits; number of fields
+        self._strength = np.zeros(3)  # sums of squared field errors of two orbits; number of readings
         self._is_refuted = False
         self._shadowed = np.zeros(2)  # number of sunlit fixes at which each orbit predicts shadow
 

@@ -314,7 +314,7 @@ def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
 def _tracker(
     config: TestbedConfig, plant: SingleAxisPlant, reader: ThreadReader, cage: CageField | None
 ) -> Tracker:
-    """Return the tracker for the coil on body x or, in a Helmholtz cage, for the coils on x and z."""
+    """Return the path tracker of the coil on body x or, in a Helmholtz cage, of the coils on x and z."""
     period, dipole = 1.0 / CONTROL_RATE_HZ, dipole_per_ampere(config)
     controller = controller_of(config.control, plant, period, config.identification)
     tracker = ThreadTracker(controller, reader, dipole)

@@ -302,7 +302,7 @@ class DeleteFile(_Directive):
 
 @dataclass(frozen=True, slots=True)
 class Activate(_Directive):
-    """Directive to begin the trial of the signed artefact in bundle `name` (docs/fly/renewal.md)."""
+    """Command to start the trial of the signed software in bundle `name` (docs/fly/renewal.md)."""
 
     name: str
     sum: bytes

@@ -524,7 +524,7 @@ class AttitudeFilter:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
-        """Apply measurements in order to the newest checkpoint; return whether `asked` passed the gate."""
+        """Replay measurements in time order from the newest checkpoint, and return whether `asked` passed."""
         replay = Replay(self._model, self._history.newest, measurements)
         replay.advance()
         self._history.replace_from(len(self._history), replay.checkpoints)

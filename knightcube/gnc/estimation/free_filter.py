@@ -808,8 +808,9 @@ class FreeFilter:
     def _curvature(self, by_inertia: FloatArray) -> FloatArray:
         """Return the noise density (3, 3), rad^2/s^3, of second order in the error of the inertia.
 
-        The derivative of the acceleration with respect to the error is `by_inertia` (3, 6). Without noise of
-        second order, the first seconds of a fast tumble make the uncertainty of an unknown inertia too small.
+        The derivative of the acceleration with respect to the error is `by_inertia` (3, 6). Without this
+        noise, which represents neglected terms of second order, the first seconds of a fast tumble make the
+        uncertainty of an unknown inertia too small.
         """
         spread = self.covariance[INERTIA, INERTIA]
         relative = spread.diagonal()[:3] * (self.motion.trace / self.motion.inertia.diagonal()) ** 2

@@ -1,9 +1,9 @@
 """The motion of a rigid body as the filters model it: Euler's equation and propagation with covariance.
 
 The equation of motion is J w' = -w x J w + m x A(q) B + thread torque (Sease, eq. (5.2), corrected), where m
-is the dipole moment of the coils. A body on the testbed's thread rotates only about its y axis. For such a
-suspended body, a torque T causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta
-- c w (Sease, eq. (5.4)).
+is the dipole moment of the coils. A body suspended from the testbed's thread rotates only about its y axis.
+For such a suspended body, a torque T causes the acceleration T_y / J22 about y, and the thread adds the
+torque -k theta - c w (Sease, eq. (5.4)).
 
 The function `propagate` integrates state and covariance. The attitude error is a small rotation about the
 body axes. Unmodelled angular accelerations are represented by random walks.

@@ -92,8 +92,8 @@ _HOPELESS = 1.5
 _EXCHANGES, _EVALUATIONS = 6, 150
 """Largest number of updates of the imposed limits, and of evaluations of the heat per run of NLopt."""
 _TOLERANCE, _MET, _KEPT = 1e-6, 1e-6, 1e-5
-"""Relative tolerance of the heat (first value), tolerance of the scaled constraints (second value), and
-largest accepted excess over a limit (third value)."""
+"""Relative tolerance of the minimised heat of the coils (first value), tolerance of the scaled constraints
+(second value), and largest accepted excess over a limit (third value)."""
 
 
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:

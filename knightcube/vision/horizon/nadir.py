@@ -609,7 +609,7 @@ def nadir_of_cameras(
         cameras: all cameras of the body.
         knowledge: prior knowledge as for `find_nadir`, but in body axes instead of camera axes.
         settings: settings of the search, or None for the defaults.
-        hidden: masks (rows, columns) of structure in the images, by the index of the camera.
+        hidden: masks (rows, columns) of pixels that structure obstructs, by the index of the camera.
 
     Raises:
         ValueError: if an image or a mask does not have the size of its camera, or if pixels are not finite.

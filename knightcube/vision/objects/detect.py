@@ -312,7 +312,7 @@ _FEW_PATHS = 2
 _GOOD_FIT = 1.4
 # Upper limit of chi-square per pixel along a uniform streak (three standard deviations for 1000 pixels).
 _UNIFORM = 1.15
-# Minimum ratio of the brightness of a star's path to that of a line which may be a segment of the path.
+# A detected line is a segment of a star's path only if the path has at least this fraction of its brightness.
 _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided; every part must be bright enough.
 _PARTS = 12
@@ -783,7 +783,7 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # The angle of a pixel on the boresight, which is the largest, is used for all directions.
+    # A pixel subtends the largest angle on the boresight; that angle is used for all directions.
     sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

@@ -6,7 +6,7 @@ spread function (PSF). The rotation of the camera determines the paths of the st
 uniformly from one end of its streak to the other, on a line that is straight either in the image or relative
 to the stars. A line that is straight in the image is curved relative to the stars if the camera rotates about
 the boresight. The brightnesses of stars and object are fitted by non-negative least squares. The hypothesis
-of stars only also explains two stars whose streaks overlap or touch, and a segment of a faint star's streak.
+without an object also explains two stars whose streaks overlap or touch, and a segment of a faint streak.
 Stars do not explain light that is not on the path of a star, or light that ends within such a path.
 
 A star's streak has the same brightness from end to end. The brightness of a star is therefore at most the

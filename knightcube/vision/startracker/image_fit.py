@@ -495,7 +495,7 @@ def _surprise(seen: _Seen, pose: _FittedPose, agree: BoolArray, factor: float) -
 def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
-    Bright points that disagree with the fit for their measured variances may agree for the larger variances.
+    Bright points that disagree with the fit given their own variances may agree given the larger ones.
     The common variance is estimated again with all points that agree. Excluded streaks remain excluded.
     """
     own = seen

@@ -47,7 +47,7 @@ _CROSSING_SAMPLES = 17
 _DIAGONAL = 1.03
 # Number of instants at which the direction of a segment of a path is evaluated.
 _DIRECTION_INSTANTS = 7
-# Lower limit of the cosine between a path and the normal of a line of pixels beyond the end of the path.
+# Lower limit of the cosine between a path and the normal of the pixel rows (or columns) that it crosses.
 _MOST_BENT = 0.5
 # Width (px) of the gap between adjoining parts of a straight path. Pixels in the gap belong to neither part.
 _SEAM = 0.003

@@ -187,7 +187,7 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
 def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, dict[str, Any]]) -> None:
     """The fragment contains the estimated lens.
 
-    The accuracies of the lens come from the packet `lens` and are rounded up.
+    The standard deviations of the lens come from the packet `lens` and are rounded up.
     """
     place, _ = flown
     config = as_orbit(load(place / "first" / "config.yaml"))

@@ -358,7 +358,7 @@ class Stage:
         self.signals.received = self.turns <= 0
 
     class Gateway:
-        """Gateway that counts the turns of mission control."""
+        """Gateway that counts how often mission control calls it."""
 
         port = 4321
 

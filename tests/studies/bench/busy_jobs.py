@@ -47,7 +47,7 @@ class Again:
         return result
 
     def rest(self) -> None:
-        """Stop repeating the last job until the next job arrives."""
+        """Pause the repetition of the last job until the next job arrives."""
         self._goes.clear()
 
     def _repeat(self, run: Callable[[Any], Any]) -> None:

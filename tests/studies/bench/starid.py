@@ -184,7 +184,7 @@ def row_of(
 
 
 def memory_of_index() -> float:
-    """Return the memory growth, MB, of a process that loads the index and identifies a list."""
+    """Return the memory growth, MB, of a process that loads the index and identifies the stars of a list."""
     script = (
         "import resource, numpy as np\n"
         "from knightcube.vision.startracker.index.build import default_index\n"
