@@ -16,15 +16,19 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import from_matrix, from_rotation_vector
 from knightcube.errors import UsageError
+from knightcube.vision import sun as sun_module
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.initial_guess import shortest_turn
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
 from knightcube.vision.sun import (
     LINEAR,
+    Circle,
+    SunMeasurement,
     SunSettings,
     SunStatus,
     cameras_by_sun,
     find_sun,
+    fit_circle,
     sample,
     sun_of_cameras,
 )
@@ -377,3 +381,149 @@ def test_strings_in_one_plane_leave_the_cameras_above_and_below_it_possible() ->
     ]
     possible = {choice.index for choice in cameras_by_sun(coarse, mounted) if choice.possible}
     assert possible == {0, 1, 2}
+
+
+def _rim(count: int, radius: float, centre: tuple[float, float], noise: float, seed: int = 1) -> FloatArray:
+    angle = np.arange(count) * 2.0 * np.pi / count
+    away = radius + noise * np.random.default_rng(seed).normal(size=count)
+    return np.asarray(np.array(centre) + away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+def test_a_circle_is_fitted_through_the_points_of_a_rim() -> None:
+    """A fifth of the points are on another curve and do not change the circle."""
+    points = _rim(60, 5.0, (2.0, -1.0), 0.01)
+    points[40:52] *= 1.4
+    found = fit_circle(points, 0.02)
+    assert found is not None
+    assert found.centre == pytest.approx([2.0, -1.0], abs=0.01)
+    assert found.radius == pytest.approx(5.0, abs=0.01)
+    assert not found.used[40:52].any()
+    assert found.used[:40].all()
+    assert found.residual == pytest.approx(0.01, rel=0.3)
+    # The covariance is that of a linear fit of centre and radius to points of unit variance.
+    offset = points[found.used] - found.centre
+    design = np.column_stack([offset / np.linalg.norm(offset, axis=1)[:, None], np.ones(len(offset))])
+    expected = np.linalg.inv(design.T @ design)[:2, :2]
+    ratio = found.shape / expected
+    assert ratio == pytest.approx(np.full((2, 2), ratio[0, 0]), rel=0.02)
+    assert 1.0 <= ratio[0, 0] < 2.0
+    assert fit_circle(points[:5], 0.02) is None
+    assert fit_circle(np.stack([np.arange(20.0), np.arange(20.0)], axis=1), 0.02) is None
+
+
+def test_correlated_errors_of_a_rim_increase_the_covariance() -> None:
+    """If the errors of neighbours have the correlation r, the variance grows by (1 + r)/(1 - r)."""
+    angle = np.arange(80) * 2.0 * np.pi / 80
+    wavy = 5.0 + 0.01 * np.sin(8.0 * angle)
+    points = wavy[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    found = fit_circle(points, 0.02)
+    assert found is not None
+    correlation = np.cos(8.0 * 2.0 * np.pi / 80)
+    assert found.shape[0, 0] == pytest.approx(2.0 / 80 * (1.0 + correlation) / (1.0 - correlation), rel=0.02)
+    # Opposite errors of neighbours do not decrease the variance.
+    saw = 5.0 + 0.01 * np.where(np.arange(80) % 2 == 0, 1.0, -1.0)
+    other = fit_circle(saw[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1), 0.02)
+    assert other is not None
+    assert other.shape[0, 0] == pytest.approx(2.0 / 80, rel=0.02)
+
+
+def test_the_smaller_of_two_nearly_equal_circles_is_preferred() -> None:
+    inner, outer = _rim(60, 5.0, (0.0, 0.0), 0.0), _rim(60, 7.0, (0.0, 0.0), 0.0)
+    for count, radius in ((24, 7.0), (28, 5.0)):
+        mixed = np.where((np.arange(60) % 60 < count)[:, None], inner, outer)
+        found = sun_module._consensus(mixed, 0.05)
+        assert found is not None
+        assert found == pytest.approx([0.0, 0.0, radius], abs=1e-6)
+
+
+def test_distances_from_a_circle_have_their_derivatives() -> None:
+    points, circle = np.array([[3.0, 4.0], [-1.0, 0.5]]), np.array([0.5, -0.2, 2.0])
+    distance, slopes = sun_module._distances(points, circle)
+    assert distance == pytest.approx(np.linalg.norm(points - circle[:2], axis=1) - 2.0)
+    for k, step in enumerate(1e-6 * np.eye(3)):
+        ahead, behind = (sun_module._distances(points, circle + way * step)[0] for way in (1.0, -1.0))
+        assert slopes[:, k] == pytest.approx((ahead - behind) / 2e-6)
+
+
+def _disc(radius_deg: float, used: int, points: int, endless: int, residual_px: float, stretch: float) -> str:
+    """Return the flaw of a disc on a camera with a scale of 700 px/rad and a stretched second axis."""
+    scale = np.diag([700.0, 700.0 * stretch])
+    per_radian = 700.0 * np.sqrt(stretch)
+    mask = np.arange(points) < used
+    circle = Circle(np.zeros(2), np.radians(radius_deg), mask, residual_px / per_radian, np.eye(2))
+    rim = sun_module._Rim(np.array([0.0, 0.0, 1.0]), np.eye(3)[:2], np.zeros((points, 2)), 0, endless)
+    return sun_module._flaw(sun_module._Disc(rim, circle, scale), SunSettings())
+
+
+def test_a_disc_is_refused_beyond_each_limit() -> None:
+    """The default limits are 0.35 to 0.6 deg, 55 % of the directions, 110 deg of arc, and 0.25 px."""
+    spokes = sun_module._SPOKES
+    assert _disc(0.45, spokes, spokes, 0, 0.1, 1.0) == ""
+    assert _disc(0.351, spokes, spokes, 0, 0.1, 1.0) == ""
+    assert _disc(0.349, spokes, spokes, 0, 0.1, 1.0) == "a patch of 0.35 deg radius, too small,"
+    assert _disc(0.599, spokes, spokes, 0, 0.1, 1.0) == ""
+    assert _disc(0.62, spokes, spokes, 0, 0.1, 1.0) == "a patch of 0.62 deg radius, too large,"
+    few = int(0.54 * spokes)
+    assert (
+        _disc(0.45, few, spokes, 0, 0.1, 1.0) == f"an edge on the circle in only {few} of {spokes} directions"
+    )
+    assert _disc(0.45, few, few, spokes - few, 0.1, 1.0).endswith(f"{few} of {spokes} directions")
+    assert _disc(0.45, few, few + 1, 0, 0.1, 1.0) == ""
+    short = int(109.0 / 360.0 * spokes)
+    assert _disc(0.45, short, short, 0, 0.1, 1.0) == (
+        f"too short an arc of the limb, {short * 360 // spokes} deg,"
+    )
+    enough = int(np.ceil(110.0 / 360.0 * spokes))
+    assert _disc(0.45, enough, enough, 0, 0.1, 1.0) == ""
+    assert _disc(0.45, spokes, spokes, 0, 0.249, 1.0) == ""
+    assert _disc(0.45, spokes, spokes, 0, 0.26, 1.0) == "an edge that deviates from a circle by 0.26 px rms"
+    # A lens that stretches the disc by 1.44 also stretches its blur, so that 0.3 px are permitted.
+    assert _disc(0.45, spokes, spokes, 0, 0.299, 1.44) == ""
+    assert _disc(0.45, spokes, spokes, 0, 0.301, 1.44) != ""
+
+
+def test_a_measured_sun_has_a_covariance_across_its_direction() -> None:
+    direction = np.array([0.0, 0.6, 0.8])
+    basis = np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])
+    tangent = np.array([[4e-8, 1e-8], [1e-8, 2e-8]])
+    measured = SunMeasurement(direction, basis, tangent, np.zeros(2), 0.008, 0.1, 6.0, False)
+    assert measured.covariance @ direction == pytest.approx(np.zeros(3), abs=1e-20)
+    assert basis @ measured.covariance @ basis.T == pytest.approx(tangent)
+    assert measured.sigma == pytest.approx(np.sqrt(3e-8))
+
+
+def test_a_direction_contradicts_the_strings_beyond_five_standard_deviations() -> None:
+    direction, basis = np.array([0.0, 0.0, 1.0]), np.eye(3)[:2]
+    strings = CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.diag([4e-4, 1e-4]))
+    for share, contradicts in ((0.98, False), (1.02, True)):
+        for axis, sigma in ((0, 0.02), (1, 0.01)):
+            off = np.zeros(3)
+            off[axis] = share * 5.0 * sigma
+            seen = (direction + off) / np.linalg.norm(direction + off)
+            assert sun_module._contradicts(seen, strings) == contradicts
+    assert sun_module._contradicts(-direction, strings)
+    assert not sun_module._contradicts(-direction, CoarseSun(CoarseSunStatus.UNCERTAIN))
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("stride", (1,), (0,)),
+        ("level", (1e-9,), (0.0, np.inf)),
+        ("tolerance", (1e-9,), (0.0, np.inf)),
+        ("rim_sigma", (1e-9,), (0.0,)),
+        ("floor_sigma", (1e-9,), (0.0,)),
+        ("least_agreement", (0.5, 1.0), (0.49, 1.01)),
+        ("least_arc", (1e-6, 2.0 * np.pi), (0.0, 6.29)),
+        ("least_radius", (1e-6,), (0.0, np.radians(0.6))),
+        ("greatest_radius", (0.49,), (0.5, np.radians(0.35))),
+    ],
+)
+def test_settings_of_the_sun_have_their_ranges(
+    name: str, good: tuple[float, ...], bad: tuple[float, ...]
+) -> None:
+    for value in good:
+        assert getattr(SunSettings(**{name: value}), name) == value  # type: ignore[arg-type]  # named settings
+    for value in bad:
+        with pytest.raises(UsageError, match=name):
+            SunSettings(**{name: value})  # type: ignore[arg-type]  # named settings
