@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from flight.schema.bodies import as_testbed
-from flight.schema.reader import parse
+from flight.schema.reader import load_testbed, parse
 from ground import report
 from ground.commands import identify
 from ground.commands.identify import _Identified
 from ground.identification.fit import (
+    DURATION,
     AbsolutePlant,
     MotionConstants,
     MotionNoise,
@@ -298,3 +299,44 @@ def test_the_run_of_a_satellite_gives_its_learned_values_without_a_fit(
         with pytest.raises(UsageError, match=f"--{name}: .* is the folder of a flight, give a configuration"):
             identify.run(options)
         setattr(options, name, None)
+
+
+@pytest.mark.parametrize(("duration", "given_run"), [(None, False), (45.0, True)])
+def test_the_flight_has_pulses_and_the_given_duration_seed_and_folder(
+    duration: float | None, given_run: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    requests: list[Any] = []
+    configs: list[Any] = []
+    result = SimpleNamespace(folder=tmp_path / "flown", interrupted=given_run, reason="Ctrl-C", log_error="")
+
+    def fly(request: Any, progress: Any) -> Any:
+        requests.append(request)
+        configs.append(load_testbed(request.config_path))
+        return result
+
+    monkeypatch.setattr("flight.app.flight.fly", fly)
+    monkeypatch.setattr("flight.app.run.default_folder", lambda path: Path("runs") / path)
+    options = argparse.Namespace(
+        source=DEMO, run=tmp_path / "here" if given_run else None, duration=duration, seed=4, realtime=True
+    )
+    assert identify._fly(options) == tmp_path / "flown"
+    (request,), (config,) = requests, configs
+    assert config.duration == (duration or DURATION)
+    assert (request.seed, request.realtime) == (4, True)
+    assert request.out == (tmp_path / "here" if given_run else Path("runs/step_demo-identify"))
+    assert request.config_path.name == "step_demo.yaml"
+    assert not request.config_path.exists()
+    said = capsys.readouterr().err
+    assert said == (
+        "knightcube: Ctrl-C: the identification uses the part that was flown\n" if given_run else ""
+    )
+    result.interrupted, result.log_error = False, "disk full"
+    identify._fly(options)
+    assert capsys.readouterr().err == "knightcube: disk full\n"
+
+
+def test_a_satellite_is_identified_from_a_run_only() -> None:
+    options = argparse.Namespace(source=DEMO.with_name("orbit_3u.yaml"))
+    with pytest.raises(UsageError, match="a satellite is identified from a run: make a run with `knightcube"):
+        identify._fly(options)
