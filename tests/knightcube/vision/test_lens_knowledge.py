@@ -15,9 +15,17 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.vision import lens_knowledge
 from knightcube.vision.camera.lens import CameraKnowledge, Lens, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings
-from knightcube.vision.lens_knowledge import LensKnowledge, axes_turn
+from knightcube.vision.lens_knowledge import (
+    CalibrationError,
+    LensFit,
+    LensKnowledge,
+    MatchedFrame,
+    axes_turn,
+    parameters_of,
+)
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -322,3 +330,124 @@ def test_the_priors_of_a_frame_are_in_the_axes_of_the_configured_lens() -> None:
     assert through.tracker.scale == (1.0, 1.0)
     assert through.camera == known.camera
     assert replace(job, lens=(LensKnowledge.of(DESCRIBED, KNOWN), 0.0)).with_lens().camera is DESCRIBED
+
+
+def _matched(lens: Lens, count: int, seed: int, late: bool) -> tuple[MatchedFrame, FloatArray]:
+    """Return stars with correlated position errors, and the attitude of their frame."""
+    rng = np.random.default_rng(seed)
+    attitude = normalise(rng.normal(size=4))
+    seen = lens.unit_vectors(rng.uniform([20.0, 20.0], [620.0, 460.0], (count, 2)))
+    root = rng.normal(size=(count, 2, 2)) * 0.1 + 0.3 * np.eye(2)
+    covariance = root @ root.swapaxes(1, 2)
+    points = lens.project(seen) + np.einsum("nij,nj->ni", root, rng.normal(size=(count, 2)))
+    sigma = np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2))
+    by_line = 1e5 * rng.normal(size=(count, 2)) if late else None
+    return MatchedFrame(points, sigma, seen @ attitude_matrix(attitude), covariance, by_line), attitude
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_step_of_the_calibration_solves_the_equations_of_lens_and_attitudes(late: bool) -> None:
+    """The step is that of dense equations with numerical derivatives by all lens parameters and rotations.
+
+    The information about the lens is that after elimination of the rotations.
+    """
+    lens = Lens(640, 480, 1800.0, (321.0, 238.0), 0.03, -0.01, 0.002, -0.001, 0.0005, -0.0003)
+    frames, attitudes = zip(
+        *(_matched(lens, count, seed, late) for seed, count in enumerate((14, 9))), strict=True
+    )
+    start = parameters_of(lens) + np.array([2.0, 1.0, -1.0, 0.01, 0.02, 1e-3, 1e-3, 1e-4, 2e-4])
+    start = np.append(start, 1e-6) if late else start
+    fit = LensFit(start, np.array(attitudes))
+    rng = np.random.default_rng(5)
+    weights = [rng.uniform(0.2, 1.0, len(frame.points)) for frame in frames]
+    steps = np.array([1e-2, 1e-3, 1e-3, 1e-5, 1e-4, 1e-6, 1e-6, 1e-6, 1e-6, 1e-9])[: len(start)]
+    count = len(start)
+
+    def missed(change: FloatArray) -> FloatArray:
+        turned = [
+            multiply(from_rotation_vector(change[count + 3 * k : count + 3 * k + 3]), attitude)
+            for k, attitude in enumerate(attitudes)
+        ]
+        moved = LensFit(start + change[:count], np.array(turned))
+        parts = [
+            np.sqrt(weight)[:, None] * lens_knowledge.residuals(frame, moved, k)
+            for k, (frame, weight) in enumerate(zip(frames, weights, strict=True))
+        ]
+        return np.concatenate(parts).reshape(-1)
+
+    every = np.append(steps, np.full(6, 1e-6))
+    design = -np.stack([(missed(d) - missed(-d)) / (2.0 * d.sum()) for d in np.diag(every)], axis=1)
+    prior = 1.0 / (np.array([5.0, 3.0, 3.0, 0.02, 0.05, 1e-3, 1e-3, 1e-3, 1e-3, 1e-5])[:count]) ** 2
+    expected = start + 0.3 * np.array([5.0, 3.0, 3.0, 0.02, 0.05, 1e-3, 1e-3, 1e-3, 1e-3, 1e-5])[:count]
+    normal, gradient = design.T @ design, design.T @ missed(np.zeros(count + 6))
+    own, cross = normal[count:, count:], normal[count:, :count]
+    information = normal[:count, :count] - cross.T @ np.linalg.solve(own, cross)
+    normal[range(count), range(count)] += prior
+    gradient[:count] += prior * (expected - start)
+    solved = np.linalg.solve(normal, gradient)
+    found = lens_knowledge.step(frames, fit, weights, prior, expected)
+    scale = np.sqrt(np.outer(np.diag(information), np.diag(information)))
+    assert found.information / scale == pytest.approx(information / scale, abs=1e-4)
+    assert found.fit.parameters - start == pytest.approx(solved[:count], rel=1e-3, abs=1e-9)
+    for k, attitude in enumerate(attitudes):
+        turned = multiply(from_rotation_vector(solved[count + 3 * k : count + 3 * k + 3]), attitude)
+        matrix = attitude_matrix(found.fit.attitudes[k]) @ attitude_matrix(turned).T
+        assert matrix == pytest.approx(np.eye(3), abs=1e-6)
+    assert found.decrease == pytest.approx(float(gradient @ solved), rel=1e-3)
+    dense = lens_knowledge.step(frames, fit, weights, np.diag(prior), expected)
+    assert dense.fit.parameters == pytest.approx(found.fit.parameters)
+
+
+def test_frames_that_do_not_determine_the_lens_are_refused() -> None:
+    lens = Lens(640, 480, 1800.0, (321.0, 238.0))
+    frame, attitude = _matched(lens, 12, 3, False)
+    fit = LensFit(parameters_of(lens), attitude[None])
+    nothing = np.zeros(9)
+    few = frame.select(np.arange(12) < 5)
+    with pytest.raises(CalibrationError, match="do not separate"):
+        lens_knowledge.step([few], fit, [np.ones(5)], nothing, fit.parameters)
+    one = frame.select(np.arange(12) < 1)
+    with pytest.raises(CalibrationError, match="frame 0: its matches do not determine its attitude"):
+        lens_knowledge.step([one], fit, [np.ones(1)], np.ones(9), fit.parameters)
+
+
+def test_wrong_matches_get_small_weights_and_are_not_accepted() -> None:
+    """The spread is the median length of the residuals, relative to that of normal errors, and at least 1.
+
+    The median length of two-dimensional normal errors is sqrt(2 ln 2).
+    """
+    median = np.sqrt(2.0 * np.log(2.0))
+    lengths = [np.array([0.1, 0.2, 3.0 * median]), np.array([3.0 * median, 40.0, 50.0])]
+    assert lens_knowledge.residual_spread(lengths) == pytest.approx(3.0)
+    assert lens_knowledge.residual_spread([np.array([0.1, 0.2, 9.0])]) == 1.0
+    scale = 3.0 * lens_knowledge._CAUCHY
+    for weight, length in zip(lens_knowledge.cauchy_weights(lengths), lengths, strict=True):
+        assert weight == pytest.approx(scale**2 / (scale**2 + length**2))
+    limit = 3.0 * lens_knowledge._CUT
+    close = [np.array([0.999 * limit, 3.0 * median, 3.0 * median]), np.array([1.001 * limit, 0.1])]
+    assert lens_knowledge.residual_spread(close) == pytest.approx(3.0)
+    assert [mask.tolist() for mask in lens_knowledge.accepted_matches(close)] == [
+        [True, True, True],
+        [False, True],
+    ]
+    with pytest.raises(CalibrationError, match="behind the camera"):
+        lens_knowledge.residual_spread([np.array([1.0, np.inf, np.inf])])
+
+
+def test_stars_beside_the_camera_have_infinite_residuals() -> None:
+    lens = Lens(640, 480, 1800.0, (321.0, 238.0), 0.02)
+    frame, attitude = _matched(lens, 4, 6, True)
+    fit = LensFit(np.append(parameters_of(lens), 0.0), attitude[None])
+    usual = lens_knowledge.residuals(frame, fit, 0)
+    assert usual == pytest.approx(
+        frame.weighted(frame.points - lens.project(frame.directions @ attitude_matrix(attitude).T))
+    )
+    behind = replace(frame, directions=frame.directions * np.array([[1.0], [-1.0], [1.0], [1.0]]))
+    found = lens_knowledge.residuals(behind, fit, 0)
+    assert np.isinf(found[1]).all()
+    assert found[[0, 2, 3]] == pytest.approx(usual[[0, 2, 3]])
+    assert frame.late is not None
+    late = LensFit(np.append(parameters_of(lens), 2e-6), attitude[None])
+    assert lens_knowledge.residuals(frame, late, 0) == pytest.approx(
+        usual - frame.weighted(2e-6 * frame.late)
+    )

@@ -12,8 +12,12 @@ from knightcube.astro.quaternion import from_rotation_vector, multiply, to_rotat
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.streaks import vibration
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.geometry import CameraMotion, Vibration, paths
+from knightcube.vision.streaks.fit_windows import LINES
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, Vibration, paths
+from knightcube.vision.streaks.joint_fit import FitProblem
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
+from knightcube.vision.streaks.vibration import CommonMotion, StreakResiduals, find_common_motion
 from tests.support.supersampled import Optics, Sky, light
 
 _PINHOLE = Pinhole.from_field_of_view(560, 560, np.radians(7.0))
@@ -246,3 +250,36 @@ def test_a_displacement_of_all_stars_is_a_common_motion(shift: float) -> None:
     assert vibration._common_rms(cell, noise + single, information) == 0.0
     assert vibration._common_rms(cell[: 3 * bins], common[: 3 * bins], information[: 3 * bins]) == 0.0
     assert vibration._common_rms(cell[:0], common[:0], information[:0]) == 0.0
+
+
+@pytest.mark.parametrize(("across", "along"), [(0.1, 0.0), (0.0, 0.08), (0.0, 0.0)])
+def test_residuals_at_equal_times_are_a_common_motion(across: float, along: float) -> None:
+    """Displacements across all streaks, and changes of their brightness, are measured as rms values.
+
+    The streaks of twelve stars are along rows. The residuals are those of a displacement, in px, or of a
+    relative change of the brightness, that is a sine of the time.
+    """
+    rng = np.random.default_rng(6)
+    pinhole, n, blocks = Pinhole(400, 300, 1200.0), 12, 6
+    motion = CameraMotion.steady(np.array([0.0, 0.06, 0.0]))
+    stars, light = rng.uniform([100.0, 50.0], [300.0, 250.0], (n, 2)), rng.uniform(3e3, 9e3, n)
+    scene = StreakScene(motion, 1.1, stars, light, np.zeros(n), np.ones(n, dtype=np.bool_))
+    star = np.repeat(np.arange(n), blocks)
+    time = np.tile(np.linspace(-0.49, 0.49, blocks * LINES).reshape(blocks, LINES), (n, 1))
+    images = np.zeros((n * blocks, 7, LINES, 5), dtype=np.float32)
+    images[:, 0] = rng.uniform(0.01, 0.03, images[:, 0].shape)
+    images[:, 1] = rng.uniform(-0.02, 0.02, images[:, 0].shape)
+    wave = np.sin(2.0 * np.pi * 2.0 * time)[..., None]
+    counts = light[star, None, None]
+    # Positive displacements are along the normal of the path, which is to the left of the motion.
+    residual = counts * (across * wave * images[:, 1] + along * wave * images[:, 0])
+    residual = residual + rng.normal(0.0, 1.0, residual.shape)
+    weight = np.ones(residual.shape, dtype=np.float32)
+    left = StreakResiduals(star, time, images, weight, residual.astype(np.float32))
+    frame = reduce_frame(np.full((300, 400), 100, np.uint16), 60000.0, 1.0)
+    camera = FitProblem(frame, pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    found = find_common_motion(camera, scene, left)
+    assert found.across == pytest.approx(across / np.sqrt(2.0), rel=0.2)
+    assert found.along == pytest.approx(along / np.sqrt(2.0), rel=0.2)
+    none = StreakResiduals(star[:0], time[:0], images[:0], weight[:0], left.residual[:0])
+    assert find_common_motion(camera, scene, none) == CommonMotion(0.0, 0.0)
