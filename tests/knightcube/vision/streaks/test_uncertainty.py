@@ -35,6 +35,7 @@ from knightcube.vision.streaks.uncertainty import (
 from knightcube.vision.streaks.vibration import StreakResiduals
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky, turn_of
+from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.scenes import FIELD, RandomSlew
 
 _TURN = np.array([0.02, 0.03, 0.0])
@@ -436,3 +437,44 @@ def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -
     large = end_displacement(left, scene)
     assert large is not None
     assert large.shown == pytest.approx(found.shown)
+
+
+def _streaked(share: float, length: float, flux: float) -> tuple[FitProblem, StreakScene]:
+    """Return a frame with the streak of a motion that reverses, and the fitted motion from rest.
+
+    The star is at the point of rest `share` times as long before the end of the exposure as after its start.
+    """
+    pinhole = replace(CAMERA.pinhole, columns=160, rows=90)
+    image = np.random.default_rng(3).normal(100.0, 3.0, (90, 160))
+    rest = np.array([30.0, 44.6])
+    time = np.linspace(-share, 1.0, 600)
+    where = rest + np.outer(length * time**2, [1.0, 0.05] / np.hypot(1.0, 0.05))
+    image += integrated_by_brute_force((90, 160), where, flux, 1.0)
+    frame = reduce_frame(np.rint(image).astype(np.uint16), SATURATION, 1.0)
+    camera = FitProblem(frame, pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    # A star at rest at the start of the exposure moves by `length` px until its end.
+    turn = length / pinhole.focal_length * np.array([0.05, -1.0, 0.0]) / np.hypot(1.0, 0.05)
+    motion = CameraMotion(turn, 2.0 * turn)
+    middle = rest + 0.25 * length * np.array([1.0, 0.05]) / np.hypot(1.0, 0.05)
+    scene = StreakScene(motion, 1.04, middle[None], np.array([flux]), np.zeros(1), np.ones(1, dtype=np.bool_))
+    return camera, scene
+
+
+def test_the_intensity_along_a_streak_shows_a_reversal() -> None:
+    """A rotation that reverses improves the fit; one from rest, or one with equal parts, does not."""
+    assert uncertainty.reversal_improvement(*_streaked(0.0, 60.0, 40_000.0)) < 20.0
+    camera, scene = _streaked(0.45, 60.0, 40_000.0)
+    found = uncertainty.reversal_improvement(camera, scene)
+    assert 60.0 < found <= uncertainty._MOST_IMPROVEMENT
+    # Only bright, trusted stars near rest are tested, and no motion from the navigation filter.
+    half = replace(scene.motion, acceleration=0.7 * scene.motion.acceleration)
+    assert uncertainty.reversal_improvement(camera, replace(scene, motion=half)) == 0.0
+    known = replace(scene.motion, higher_terms=np.full((1, 3), 1e-9))
+    assert uncertainty.reversal_improvement(camera, replace(scene, motion=known)) == 0.0
+    nobody = replace(scene, trusted=np.zeros(1, dtype=np.bool_))
+    assert uncertainty.reversal_improvement(camera, nobody) == 0.0
+    # The time-reversed motion comes to rest at the end.
+    back = CameraMotion(-scene.motion.rate, scene.motion.acceleration)
+    assert uncertainty.reversal_improvement(camera, replace(scene, motion=back)) == pytest.approx(
+        found, rel=0.2
+    )

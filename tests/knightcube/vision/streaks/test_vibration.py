@@ -283,3 +283,58 @@ def test_residuals_at_equal_times_are_a_common_motion(across: float, along: floa
     assert found.along == pytest.approx(along / np.sqrt(2.0), rel=0.2)
     none = StreakResiduals(star[:0], time[:0], images[:0], weight[:0], left.residual[:0])
     assert find_common_motion(camera, scene, none) == CommonMotion(0.0, 0.0)
+
+
+def test_the_normal_equations_of_a_rotation_are_sums_over_the_lines_of_each_bin() -> None:
+    """Each pixel of a streak changes with displacement, speed and ends of the streak, by the image flow.
+
+    Across the path, a rotation displaces the streak by its image flow. Along the path, the speed changes the
+    brightness, and the rotations at start and end move the ends. The weight of a star is limited by the
+    scatter of its residuals.
+    """
+    rng = np.random.default_rng(4)
+    pinhole = Pinhole(400, 300, 1200.0)
+    motion = CameraMotion.steady(np.array([0.02, 0.06, 0.1]))
+    stars, light = np.array([[120.0, 80.0], [260.0, 200.0]]), np.array([4e3, 7e3])
+    scene = StreakScene(motion, 1.1, stars, light, np.zeros(2), np.ones(2, dtype=np.bool_))
+    star = np.array([0, 1, 1])
+    time = np.stack(
+        [np.linspace(-0.4, -0.1, LINES), np.linspace(-0.2, 0.1, LINES), np.linspace(0.1, 0.5, LINES)]
+    )
+    images = rng.normal(size=(3, 7, LINES, 4)).astype(np.float32) * np.float32(0.01)
+    weight = rng.uniform(0.5, 2.0, (3, LINES, 4)).astype(np.float32)
+    residual = rng.normal(size=(3, LINES, 4)).astype(np.float32)
+    residual[0] *= 4.0
+    left = StreakResiduals(star, time, images, weight, residual)
+    frame = reduce_frame(np.full((300, 400), 100, np.uint16), 60000.0, 1.0)
+    camera = FitProblem(frame, pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    found = vibration._rotation_sums(camera, scene, left)
+    information, score = np.zeros((12, 12)), np.zeros(12)
+    by_bin: dict[int, FloatArray] = {}
+    for b, line in np.ndindex(3, LINES):
+        own = star == star[b]
+        scatter = np.sum((weight * residual**2)[own]) / weight[own].size
+        trust = 1.0 / max(float(scatter), 1.0)
+        path = paths(pinhole, motion, stars[star[b]][None], time[b, line][None])
+        (x, y), (vx, vy) = (path.position[0] - pinhole.centre) / 1200.0, path.velocity[0]
+        speed = float(np.hypot(vx, vy))
+        flow = 1200.0 * np.array([[x * y, -1.0 - x * x, y], [1.0 + y * y, -x * y, -x]])
+        tangent = np.array([vx, vy]) / speed
+        across, along = np.array([-tangent[1], tangent[0]]) @ flow, tangent @ flow
+        changes = [across, -along / speed, -along, along]
+        design = np.zeros((4, 12))
+        for part, (image, change) in enumerate(zip((1, 0, 3, 4), changes, strict=True)):
+            design[:, 3 * part : 3 * part + 3] = light[star[b]] * np.outer(images[b, image, line], change)
+        own_information = trust * (design.T * weight[b, line]) @ design
+        information += own_information
+        score += trust * (design.T * weight[b, line]) @ residual[b, line]
+        place = int(np.argmin(np.abs(found.time - time[b, line])))
+        by_bin[place] = by_bin.get(place, 0.0) + own_information
+    whole = found.information.reshape(-1, 12, 12)
+    assert whole.sum(axis=0) == pytest.approx(information, rel=1e-3, abs=1e-4 * np.abs(information).max())
+    assert found.score.reshape(-1, 12).sum(axis=0) == pytest.approx(
+        score, rel=1e-3, abs=1e-3 * np.abs(score).max()
+    )
+    for place, expected in by_bin.items():
+        assert whole[place] == pytest.approx(expected, rel=1e-3, abs=1e-4 * np.abs(information).max())
+    assert found.focal_length == 1200.0
