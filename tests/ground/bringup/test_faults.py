@@ -252,10 +252,23 @@ COIL_SUPPLY = {
     "monitor stuck": Case(fault("monitor: stuck"), "coils", ["power_monitor no reading"]),
 }
 SEARCH = {
-    "monitor without supply": Case(fault("monitor: off"), "find", ["power_monitor no answer"]),
-    "PWM chip without supply": Case(fault("pwm: off"), "find coils", ["coils no answer"]),
+    "monitor without supply": Case(
+        fault("monitor: off"),
+        "find",
+        ["power_monitor no answer"],
+        says="no answer at 0x45; addresses that answer on its bus: 0x40",
+    ),
+    "PWM chip without supply": Case(
+        fault("pwm: off"),
+        "find coils",
+        ["coils no answer"],
+        says="no answer at 0x40; addresses that answer on its bus: 0x45",
+    ),
     "I2C bus without pull-ups": Case(
-        fault("bus: off"), "find", ["coils no answer", "power_monitor no answer"]
+        fault("bus: off"),
+        "find",
+        ["coils no answer", "power_monitor no answer"],
+        says="addresses that answer on its bus: no address",
     ),
     "PWM chip at another address": Case(
         {"coils": {"address": 0x43}}, "find", ["coils wrong address"], says="set `address: 0x43`"
@@ -267,6 +280,7 @@ SEARCH = {
         {"coils": {"address": 0x45}, "power_monitor": {"address": 0x40}},
         "find",
         ["coils exchanged", "power_monitor exchanged"],
+        says="a chip of type ina219 answers at 0x40: swap the addresses: a pca9685",
     ),
     "inertial unit without power": Case(fault("imu: off"), "find axes", ["inertial_unit no answer"]),
     "inertial unit at another baud rate": Case(
@@ -280,13 +294,19 @@ SEARCH = {
         "find",
         ["inertial_unit exchanged", "gps exchanged"],
         base="orbit",
+        says="/dev/knightcube-gps is the line of the VN-100",
     ),
     "loose plug of the inertial unit": Case(
         fault("imu: intermittent"), "find", ["inertial_unit intermittent"], says="stops for up to 0.2"
     ),
 }
 REST = {
-    "inertial unit too slow": Case(fault("imu: slow (n=2)"), "rest", ["inertial_unit wrong rate"]),
+    "inertial unit too slow": Case(
+        fault("imu: slow (n=2)"),
+        "rest",
+        ["inertial_unit wrong rate"],
+        says="20.0 valid samples per second arrive instead of 40",
+    ),
     "short interruptions of the inertial unit": Case(
         fault("imu: intermittent (period=3, share=0.1)"), "rest", ["inertial_unit intermittent"], says="0.3"
     ),
@@ -294,7 +314,11 @@ REST = {
         {}, "rest", ["inertial_unit.gyro wrong rate"], repeated("rate"), says="20 are new per second"
     ),
     "magnetometer at half of the rate": Case(
-        {}, "rest", ["inertial_unit.magnetometer wrong rate"], repeated("mag")
+        {},
+        "rest",
+        ["inertial_unit.magnetometer wrong rate"],
+        repeated("mag"),
+        says="50 % of its values repeat",
     ),
     "noise on the line": Case(
         fault("imu: cut (chance=0.1)"), "rest", ["inertial_unit corrupted packets"], says="wrong checksum"
@@ -302,7 +326,9 @@ REST = {
     "noisy gyro": Case(
         {"simulation": {"imu": {"rate_noise": 0.01}}}, "rest", ["inertial_unit.gyro noisy"], says="0.00027"
     ),
-    "unit stuck": Case(fault("imu: stuck"), "rest", ["inertial_unit stuck"]),
+    "unit stuck": Case(
+        fault("imu: stuck"), "rest", ["inertial_unit stuck"], says="samples in a row are identical"
+    ),
     "magnetometer at its limit": Case(
         fault("magnetometer: saturated"),
         "rest coils",
@@ -373,8 +399,10 @@ SENSOR_AXES = {
 }
 FRAMES = {
     "lens cap on": Case(fault("camera: black"), "dark light", ["camera lens cap on"]),
-    "camera frozen": Case(fault("camera: frozen"), "light", ["camera frozen"]),
-    "camera without trigger": Case(fault("camera: off"), "light", ["camera no frame"]),
+    "camera frozen": Case(fault("camera: frozen"), "light", ["camera frozen"], says="frame 1 arrives again"),
+    "camera without trigger": Case(
+        fault("camera: off"), "light", ["camera no frame"], says="no frame arrives within 12 s of the trigger"
+    ),
     "camera with loose contact": Case(
         fault("camera: intermittent (period=7)"), "dark", ["camera intermittent"]
     ),
@@ -395,6 +423,7 @@ PIXELS = {
         "dark",
         ["camera dead lines"],
         spoil=pictured(lambda pixels: pixels * (np.indices(pixels.shape)[0] < 200)),
+        says="824 rows and 0 columns",
     ),
     "camera without its lowest bits": Case(
         {}, "dark", ["camera wrong gain"], spoil=pictured(lambda pixels: pixels >> 4)
@@ -408,7 +437,9 @@ PIXELS = {
     ),
 }
 GPS = {
-    "GPS antenna unplugged": Case(fault("gps: no-fix"), "gps", ["gps no fix"], base="orbit"),
+    "GPS antenna unplugged": Case(
+        fault("gps: no-fix"), "gps", ["gps no fix"], base="orbit", says="with 0 satellites"
+    ),
     "GPS receiver stuck": Case(fault("gps: stuck"), "gps", ["gps stuck"], base="orbit"),
     "GPS receiver with a loose plug": Case(
         fault("gps: intermittent (period=8, share=0.5)"), "gps", ["gps intermittent"], base="orbit"
@@ -416,7 +447,9 @@ GPS = {
     "GPS receiver with a wrong time": Case(
         fault("gps: clock"), "gps", ["gps wrong time"], says="180 s", base="orbit"
     ),
-    "GPS receiver with late messages": Case(fault("gps: delayed"), "gps", ["gps late"], base="orbit"),
+    "GPS receiver with late messages": Case(
+        fault("gps: delayed"), "gps", ["gps late"], base="orbit", says="a fix arrives 2."
+    ),
     "noise on the line of the GPS receiver": Case(
         fault("gps: bits"), "gps", ["gps corrupted messages"], base="orbit"
     ),
@@ -427,6 +460,7 @@ STRINGS = {
         "strings",
         ["solar_strings.strings[0] exchanged", "solar_strings.strings[1] exchanged"],
         base="orbit",
+        says="a current in string 1",
     ),
     "solar string dead": Case(
         fault("strings: dead (string=3)"), "strings", ["solar_strings.strings[2] dead"], base="orbit"
