@@ -6,6 +6,7 @@ import pickle
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from flight.bodies.streak_methods import CornerEstimator
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
 from knightcube.reference.corner_streaks import StreakResult, StreakSettings
+from knightcube.vision import frame_job
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.solve import (
@@ -24,6 +27,7 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
+from knightcube.vision.startracker.survey import FrameKind
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.flight.loop.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
@@ -173,3 +177,137 @@ def test_an_index_that_is_missing_is_reported_with_its_cure_and_the_motion_is_es
     assert found.solution is None
     assert found.motion.status is run(replace(job, tracker=None)).motion.status
     assert found.field is None, "no objects are searched for"
+
+
+def _small_job(**changed: Any) -> FrameJob:
+    """Return a job of a camera with a focal length of 1,000 px and an exposure of 0.2 s."""
+    usual = FrameJob(
+        np.zeros((40, 50), np.uint16),
+        Pinhole(50, 40, 1000.0),
+        0.2,
+        LikelihoodSettings(line_time=2e-5),
+        _TRACKER,
+        RatePrior(np.array([0.0, 0.004, 0.003]), 1e-3),
+        AttitudePrior(np.array([0.0, 0.0, 0.0, 1.0]), 1e-3),
+    )
+    return replace(usual, **changed)
+
+
+def test_short_streaks_are_predicted_with_the_uncertainty_of_the_rate() -> None:
+    """The longest predicted streak is that of the rate plus its standard deviations."""
+    longest = (0.005 + frame_job.PRIOR_SIGMAS * 1e-3) * 0.2 * 1000.0
+    assert frame_job._predicted_within(_small_job(), 1.01 * longest)
+    assert not frame_job._predicted_within(_small_job(), 0.99 * longest)
+    assert frame_job._predicted_within(_small_job(rate_prior=None), 0.1)
+    assert not frame_job._predicted_within(_small_job(attitude_prior=None), 100.0)
+
+
+def test_short_trails_need_a_precise_prediction() -> None:
+    found = frame_job._short_trails(_small_job())
+    assert found is not None
+    assert found.turn == pytest.approx([0.0, 0.0008, 0.0006])
+    assert (found.delay, found.delay_sigma) == pytest.approx((1e-4, 0.0))
+    for share, known in ((0.98, True), (1.02, False)):
+        sigma = share * frame_job._KNOWN_PX / (0.2 * 1000.0)
+        job = _small_job(rate_prior=RatePrior(np.zeros(3), sigma))
+        assert (frame_job._short_trails(job) is not None) == known
+    assert frame_job._short_trails(_small_job(rate_prior=None)) is None
+    unstated = frame_job._short_trails(_small_job(estimator=LikelihoodSettings()))
+    assert unstated is not None
+    assert (unstated.delay, unstated.delay_sigma) == pytest.approx(
+        (0.0, LikelihoodSettings().line_time_sigma / 0.2)
+    )
+    other = frame_job._short_trails(_small_job(estimator=CornerEstimator(StreakSettings())))
+    assert other is not None
+    assert (other.delay, other.delay_sigma) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("status", "rate", "rests"),
+    [
+        (StreakStatus.TOO_SHORT, 9.0, True),
+        (StreakStatus.TOO_FEW, 9.0, True),
+        (StreakStatus.FAILED, 0.004, True),
+        (StreakStatus.FAILED, 9.0, False),
+        (StreakStatus.RATE, 0.004, False),
+        (StreakStatus.FAILED, None, False),
+    ],
+)
+def test_stars_are_at_rest_by_the_pixels_or_by_the_prediction(
+    status: StreakStatus, rate: float | None, rests: bool
+) -> None:
+    prior = None if rate is None else RatePrior(np.array([0.0, rate, 0.0]), 1e-5)
+    motion = MotionResult(status, 1, 0.2)
+    assert frame_job._shows_no_motion(_small_job(rate_prior=prior), motion) == rests
+
+
+class _Lens:
+    """A stand-in for an estimate of the lens that counts updates and contradictions."""
+
+    def __init__(self, contradicted: bool, updates: tuple[float, ...] = ()) -> None:
+        self.contradicted, self.updates = contradicted, updates
+        self.contradictions = 1 if contradicted and updates else 0
+        self.usable, self.turn = False, np.array([0.0, 0.0, 0.0, 1.0])
+
+    def update(self, *arguments: Any) -> _Lens:
+        elapsed = arguments[3] if len(arguments) > 3 else 0.0
+        return _Lens(self.contradicted, (*self.updates, elapsed))
+
+
+@pytest.mark.parametrize("contradicted", [False, True])
+def test_a_frame_that_contradicts_the_lens_is_solved_again(
+    contradicted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved: list[FrameJob] = []
+    solution = FrameSolution(SolveStatus.SOLVED, "", FrameKind.POINTS, Pinhole(50, 40, 1000.0))
+
+    def attitude_and_rate(job: FrameJob, *_: object) -> FrameFound:
+        solved.append(job)
+        return FrameFound(MotionResult(StreakStatus.TOO_SHORT, 1, 0.2), solution)
+
+    monkeypatch.setattr(frame_job, "attitude_and_rate", attitude_and_rate)
+    lens: Any = _Lens(contradicted)
+    job = _small_job(lens=(lens, 7.0))
+    found: Any = frame_job.run_with_lens(job, _TRACKER, sky())
+    assert found.lens.updates == ((7.0, 0.0) if contradicted else (7.0,))
+    assert len(solved) == (2 if contradicted else 1)
+    plain = frame_job.run_with_lens(_small_job(), _TRACKER, sky())
+    assert plain.lens is None
+    monkeypatch.setattr(
+        frame_job, "attitude_and_rate", lambda *_: FrameFound(MotionResult(StreakStatus.FAILED, 1, 0.2), None)
+    )
+    assert frame_job.run_with_lens(job, _TRACKER, sky()).lens is lens
+
+
+def test_the_facts_of_a_frame_are_plain_values() -> None:
+    rate = np.array([0.01, -0.02, 0.03])
+    motion = MotionResult(StreakStatus.RATE, 1, 0.2, rate=rate, covariance=np.eye(3))
+    camera = Pinhole(50, 40, 1000.0)
+    solution = FrameSolution(
+        SolveStatus.NO_MATCH,
+        "",
+        FrameKind.POINTS,
+        camera,
+        points=np.array([[1.26, 3.44], [5.0, 6.0]]),
+        star=np.array([4, -1]),
+    )
+    facts = frame_job._facts(_small_job(), FrameFound(motion, solution))
+    assert facts == {
+        "exposure_s": 0.2,
+        "streaks": "rate",
+        "rate_rad_s": rate.tolist(),
+        "stars": "no-match",
+        "identified": 1,
+        "attitude": None,
+        "objects": None,
+        "star_points": [[1.3, 3.4]],
+        "object_points": [],
+    }
+    ambiguous = replace(motion, status=StreakStatus.AMBIGUOUS)
+    facts = frame_job._facts(_small_job(), FrameFound(ambiguous, None))
+    assert (facts["rate_rad_s"], facts["stars"], facts["identified"], facts["star_points"]) == (
+        None,
+        None,
+        0,
+        [],
+    )
