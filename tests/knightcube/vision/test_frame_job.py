@@ -28,6 +28,7 @@ from knightcube.vision.startracker.solve import (
     solve_motion,
 )
 from knightcube.vision.startracker.survey import FrameKind
+from knightcube.vision.startracker.verification import PRIOR_SIGMAS
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.flight.loop.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
@@ -195,7 +196,7 @@ def _small_job(**changed: Any) -> FrameJob:
 
 def test_short_streaks_are_predicted_with_the_uncertainty_of_the_rate() -> None:
     """The longest predicted streak is that of the rate plus its standard deviations."""
-    longest = (0.005 + frame_job.PRIOR_SIGMAS * 1e-3) * 0.2 * 1000.0
+    longest = (0.005 + PRIOR_SIGMAS * 1e-3) * 0.2 * 1000.0
     assert frame_job._predicted_within(_small_job(), 1.01 * longest)
     assert not frame_job._predicted_within(_small_job(), 0.99 * longest)
     assert frame_job._predicted_within(_small_job(rate_prior=None), 0.1)

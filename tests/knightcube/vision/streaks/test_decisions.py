@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -360,3 +362,107 @@ def test_a_scan_confirms_the_angle_of_a_motion() -> None:
     assert not estimate._has_angle(rotation, [0.106, 0.1])
     assert not estimate._has_angle(rotation, [0.094])
     assert not estimate._has_angle(rotation, [])
+
+
+def _guessed(angle: float) -> Any:
+    """Return a stand-in for a preliminary fit with the rotation angle `angle` about z."""
+    motion = CameraMotion.steady(np.array([0.0, 0.0, angle]))
+    return SimpleNamespace(scene=SimpleNamespace(motion=motion), evaluation=None)
+
+
+def _searched(
+    monkeypatch: pytest.MonkeyPatch,
+    tried: list[tuple[float, bool, float] | None],
+    rescanned: list[tuple[float, bool, float]],
+    lit: float = 0.0,
+    misfit: float = 1.0,
+) -> list[float]:
+    """Return the angles of the preliminary fits for guesses with given chi-square, conviction and angle."""
+    results = iter([None if one is None else (one[0], one[1], _guessed(one[2])) for one in tried])
+    monkeypatch.setattr(estimate, "_guesses", lambda *_: iter(range(len(tried))))
+    monkeypatch.setattr(estimate, "_tried", lambda *_: next(results))
+    monkeypatch.setattr(estimate, "misfit", lambda *_: misfit)
+    monkeypatch.setattr(estimate, "_frame_angles", lambda *_: [one[2] for one in rescanned])
+    fits = [(light, convincing, _guessed(angle)) for light, convincing, angle in rescanned]
+    monkeypatch.setattr(estimate, "_rescanned", lambda *_: iter(fits))
+    regions: Any = SimpleNamespace(lit=lit)
+    found = estimate.first_fits(_problem(), regions, None)
+    return [float(fit.scene.motion.rotation[2]) for fit in found]
+
+
+def test_convincing_guesses_come_before_the_others_in_the_order_of_their_evidence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    doubtful, sure, other = (2e3, False, 0.1), (9e3, True, 0.2), (5e3, False, 0.3)
+    assert _searched(monkeypatch, [doubtful, sure, None, other], []) == [0.2, 0.3, 0.1]
+    # A convincing fit that explains less than an earlier fit is not accepted without comparison.
+    assert _searched(monkeypatch, [(9.5e3, False, 0.1), sure], [(8e3, False, 0.5)]) == [0.1, 0.2, 0.5]
+    # Equal motions are fitted once, and poor fits are dropped.
+    assert _searched(monkeypatch, [sure, (8e3, True, 0.2005), other], []) == [0.2, 0.3]
+    assert _searched(monkeypatch, [doubtful, other], [], misfit=12.1) == []
+    # If no guess is convincing, the whole frame is scanned until a fit is convincing.
+    scans = [(1e3, False, 0.6), (7e3, True, 0.7), (9e3, True, 0.8)]
+    assert _searched(monkeypatch, [doubtful, other], scans) == [0.7, 0.3, 0.1, 0.6]
+    assert _searched(monkeypatch, [], scans) == []
+    assert _searched(monkeypatch, [None], scans) == []
+
+
+@pytest.mark.parametrize(
+    ("lit", "explained", "scans", "chosen"),
+    [
+        (0.06, 9e3, [(9.1e3, True, 0.3)], 0.3),
+        (0.05, 9e3, [(9.1e3, True, 0.3)], 0.2),
+        (0.06, 1.1e5, [(2e5, True, 0.3)], 0.2),
+        (0.06, 9e3, [(8.9e3, True, 0.3)], 0.2),
+        (0.06, 9e3, [(9.1e3, True, 0.2095)], 0.2),
+        (0.06, 9e3, [(9.1e3, True, 0.2105)], 0.2105),
+        (0.06, 9e3, [(9.1e3, False, 0.3), (9.5e3, False, 0.4)], 0.4),
+        (0.06, 9e3, [(9.1e3, True, 0.3), (9.5e3, False, 0.4)], 0.3),
+    ],
+)
+def test_a_crowded_frame_is_scanned_for_a_likelier_angle(
+    lit: float,
+    explained: float,
+    scans: list[tuple[float, bool, float]],
+    chosen: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A scan of the whole frame replaces a fit if many pixels are bright and another angle explains more."""
+    assert _searched(monkeypatch, [(explained, True, 0.2)], scans, lit)[0] == chosen
+
+
+def test_the_first_confirmed_motion_is_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A doubtful motion is accepted if a scan or another fit gives the same motion."""
+    names = StreakVerdict.CONFIRMED, StreakVerdict.DOUBTFUL, StreakVerdict.REJECTED
+
+    def best(fits: list[tuple[int, float]], scanned: list[tuple[int, float]], angles: list[float]) -> Any:
+        verdicts = {angle: names[which] for which, angle in [*fits, *scanned]}
+
+        def fitted(_: object, seen: MotionResult, fit: Any) -> estimate._Candidate:
+            angle = float(fit.scene.motion.rotation[2])
+            result = replace(seen, status=StreakStatus.AMBIGUOUS, rate=fit.scene.motion.rotation)
+            rotation = np.array([0.0, 0.0, round(angle, 2)])
+            return estimate._Candidate(result, rotation, verdicts[angle], np.empty((0, 2)), np.empty(0))
+
+        monkeypatch.setattr(estimate, "_fitted", fitted)
+        monkeypatch.setattr(estimate, "first_fits", lambda *_: iter([_guessed(angle) for _, angle in fits]))
+        monkeypatch.setattr(estimate, "_frame_angles", lambda *_: angles)
+        monkeypatch.setattr(
+            estimate, "_rescanned", lambda *_: iter([(1.0, True, _guessed(a)) for _, a in scanned])
+        )
+        regions: Any = None
+        return estimate._best_motion(_problem(), MotionResult(StreakStatus.FAILED, 1, 0.2), regions, None)
+
+    assert best([], [], []) is None
+    assert best([(0, 0.1), (0, 0.2)], [], []).rotation[2] == 0.1
+    assert best([(1, 0.1), (0, 0.2)], [], [0.1]).rotation[2] == 0.1
+    assert best([(1, 0.1), (0, 0.2)], [], [0.3]).rotation[2] == 0.2
+    assert best([(2, 0.1), (0, 0.2)], [], [0.1]).rotation[2] == 0.2
+    assert best([(1, 0.1), (0, 0.2)], [(0, 0.3)], [0.3]).rotation[2] == 0.3
+    assert best([(2, 0.1)], [(1, 0.3)], [0.3]).rotation[2] == 0.3
+    assert best([(1, 0.1)], [(1, 0.1001)], [0.4]).rotation[2] == 0.1
+    failed = best([(1, 0.1)], [(1, 0.2)], [0.4])
+    assert failed.result.status is StreakStatus.FAILED
+    assert failed.result.rate is None
+    assert failed.result.reason == "no motion is consistent with the brightness and the ends of the streaks"
+    assert best([(1, 0.1), (2, 0.2), (0, 0.3)], [], [0.4]).result.status is StreakStatus.FAILED
