@@ -15,6 +15,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import estimate
 from knightcube.vision.streaks.estimate import StreakVerdict, alike, check_streaks, with_rate, with_stars
 from knightcube.vision.streaks.faint_stars import FaintStars
+from knightcube.vision.streaks.first_guess import MotionGuess
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, path_lengths, positions
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
@@ -466,3 +467,77 @@ def test_the_first_confirmed_motion_is_the_best(monkeypatch: pytest.MonkeyPatch)
     assert failed.result.rate is None
     assert failed.result.reason == "no motion is consistent with the brightness and the ends of the streaks"
     assert best([(1, 0.1), (2, 0.2), (0, 0.3)], [], [0.4]).result.status is StreakStatus.FAILED
+
+
+def _attempt(
+    monkeypatch: pytest.MonkeyPatch,
+    ends: float = 1.0,
+    last_step: float = 0.0,
+    contradicted: float = 0.0,
+    misfit: float = 1.0,
+    chi2: float = 120.0,
+    count: int = 4,
+    shaken: Any = None,
+) -> tuple[float, bool, Any]:
+    """Return the evidence for a guess of four stars, of which the first is badly fitted."""
+    joint = np.zeros((4, 11, 11))
+    joint[:, 9, 9] = [1.0, 4.0, 1.0, 25.0]
+    done = SimpleNamespace(
+        scene=SimpleNamespace(light=np.array([900.0, 90.0, 300.0, 500.0])),
+        solution=SimpleNamespace(joint=joint),
+        evaluation=SimpleNamespace(chi2=np.array([1e5, chi2, chi2, chi2]), pixels=np.full(4, 110.0)),
+        last_step=last_step,
+    )
+    correct = np.full((10, 2), np.nan)
+    correct[:, 0] = np.arange(10) < 10.0 * ends
+    monkeypatch.setattr(estimate, "iterate", lambda *_: done)
+    monkeypatch.setattr(estimate, "true_ends", lambda *_: correct)
+    monkeypatch.setattr(estimate, "unbroken", lambda *_: np.empty(0))
+    monkeypatch.setattr(estimate, "misfit", lambda *_: misfit)
+    monkeypatch.setattr(estimate, "_vibrating", lambda *_: shaken)
+    stars, light = np.full((count, 2), 60.0), np.full(count, 900.0)
+    found = estimate._tried(_problem(), MotionGuess(_MOTION, stars, light, contradicted))
+    assert found is not None
+    return found
+
+
+def test_the_evidence_for_a_guess_is_its_explained_chi_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The evidence sums the squared significances of well-fitted stars, each at most 200 squared.
+
+    Streak ends above 40 %, which a wrong angle may reach by chance, multiply the evidence.
+    """
+    squares = 45.0**2 + 200.0**2 + 100.0**2
+    explained, convincing, _ = _attempt(monkeypatch)
+    assert explained == pytest.approx(squares * 0.6)
+    assert convincing
+    half = _attempt(monkeypatch, ends=0.7)
+    assert half[0] == pytest.approx(squares * 0.3)
+    assert half[1]
+    wrong = _attempt(monkeypatch, ends=0.6)
+    assert wrong[0] == pytest.approx(squares * 0.2)
+    assert not wrong[1]
+    assert _attempt(monkeypatch, ends=0.2)[0] == pytest.approx(squares * 0.02)
+    assert _attempt(monkeypatch, last_step=2.1)[0] == pytest.approx(0.3 * squares * 0.6)
+    assert _attempt(monkeypatch, last_step=1.9)[0] == pytest.approx(squares * 0.6)
+    assert _attempt(monkeypatch, contradicted=0.5)[0] == pytest.approx(squares * 0.6 * 0.7)
+    # A star is well fitted if its excess chi-square is at most its pixels plus 1 % of its evidence.
+    assert _attempt(monkeypatch, chi2=110.0 + 110.0 + 19.0)[0] == pytest.approx(squares * 0.6)
+    assert _attempt(monkeypatch, chi2=110.0 + 110.0 + 22.0)[0] == pytest.approx((squares - 45.0**2) * 0.6)
+    assert not _attempt(monkeypatch, count=2)[1]
+    assert _attempt(monkeypatch, count=3)[1]
+
+
+def test_a_poor_fit_with_correct_ends_may_be_a_vibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    light = SimpleNamespace(light=np.array([100.0]))
+    joint = np.zeros((1, 11, 11))
+    joint[:, 9, 9] = 1.0
+    shaken = SimpleNamespace(
+        scene=light,
+        solution=SimpleNamespace(joint=joint),
+        evaluation=SimpleNamespace(chi2=np.array([110.0]), pixels=np.array([110.0])),
+        last_step=0.0,
+    )
+    assert _attempt(monkeypatch, misfit=2.6, shaken=shaken)[2] is shaken
+    assert _attempt(monkeypatch, misfit=2.4, shaken=shaken)[2] is not shaken
+    assert _attempt(monkeypatch, ends=0.5, misfit=2.6, shaken=shaken)[2] is not shaken
+    assert _attempt(monkeypatch, misfit=2.6)[2] is not None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -382,3 +384,64 @@ def test_the_brightness_along_a_path_is_the_mean_of_three_rows_of_pixels() -> No
     assert_forms_agree(
         joint_fit._band_means, *arguments, pixels, (120, 100), 11, relative=1e-5, compiled=False
     )
+
+
+@pytest.mark.parametrize(
+    ("fits", "stretches", "far", "exhausted", "expected"),
+    [
+        ([True], [False], [False], False, 1),
+        ([True, True], [True, False], [False, False], False, 2),
+        ([True, True], [False, False], [True, False], False, 2),
+        ([True, True], [False, False], [True, True], False, 2),
+        ([True, True], [True, True], [False, False], False, None),
+        ([False], [False], [False], False, None),
+        ([True], [True], [False], True, None),
+    ],
+)
+def test_the_search_for_faint_stars_is_repeated_once(
+    fits: list[bool],
+    stretches: list[bool],
+    far: list[bool],
+    exhausted: bool,
+    expected: int | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The search is repeated if the streak ends are wrong or moved far, and rejected if they stay wrong."""
+    scene, made = _small_scene(), []
+
+    def fitted(_: FitProblem, first: StreakFit) -> tuple[Any, str]:
+        made.append(first)
+        works = fits[len(made) - 1]
+        return (replace(first, last_step=float(len(made))) if works else None), f"faint {len(made)}"
+
+    monkeypatch.setattr(joint_fit, "_fit_from", fitted)
+    monkeypatch.setattr(joint_fit, "stretched", lambda _, one: one if stretches[len(made) - 1] else None)
+    monkeypatch.setattr(joint_fit, "_far", lambda *_: far[len(made) - 1])
+    camera = _small_problem()
+    if exhausted:
+        camera.work.passed(10_000_000_000)
+    windows = camera.windows(scene)
+    evaluation = _evaluation(3, np.zeros((3, SHARED)))
+    start = StreakFit(scene, _solution([0.0] * 7, np.zeros((3, 4))), evaluation, 0.0, windows, camera.free)
+    done, faint = joint_fit.final_fit(camera, start)
+    assert (None if done is None else int(done.last_step)) == expected
+    assert len(made) == len(fits)
+    found: Any = faint
+    assert found == f"faint {len(fits)}"
+    if len(made) > 1:
+        # The second search starts from the trusted stars, the brightest first.
+        assert made[1].scene.light.tolist() == [4000.0, 3000.0]
+
+
+def test_a_repeated_fit_includes_all_bright_stars(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[StreakScene] = []
+    monkeypatch.setattr(joint_fit, "joint_fit", lambda _, scene: asked.append(scene))
+    scene = replace(_small_scene(), trusted=np.array([False, False, True]))
+    camera = _small_problem(most_stars=1)
+    hidden = scene.select(np.array([0]))
+    last: Any = SimpleNamespace(scene=scene, hidden=None)
+    joint_fit.refit(camera, last)
+    joint_fit.refit(camera, SimpleNamespace(**(vars(last) | {"hidden": hidden})))  # type: ignore[arg-type]  # a stand-in
+    assert asked[0].trusted.tolist() == [True, False, True]
+    assert asked[1].trusted.tolist() == [True, False, True, False]
+    assert asked[1].light.tolist() == [4000.0, 3000.0, 2000.0, 4000.0]
