@@ -272,6 +272,9 @@ def test_the_best_box_explains_most_of_the_samples() -> None:
     rng = np.random.default_rng(4)
     values, exist = rng.normal(1.0, 2.0, (3, 40)), rng.uniform(size=(3, 40)) > 0.2
     values[1, 12:19] += 5.0
+    values[2, 36:] += 6.0
+    values[0, :4] += 6.0
+    exist[2, 36:] = exist[0, :4] = True
     values *= exist
     variance, middle, widths = np.array([2.0, 4.0, 1.0]), np.array([3, 15, 38]), np.array([4, 7, 12])
     total, number = (

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -338,3 +340,88 @@ def test_the_normal_equations_of_a_rotation_are_sums_over_the_lines_of_each_bin(
     for place, expected in by_bin.items():
         assert whole[place] == pytest.approx(expected, rel=1e-3, abs=1e-4 * np.abs(information).max())
     assert found.focal_length == 1200.0
+
+
+def _plain_camera() -> tuple[FitProblem, StreakScene]:
+    frame = reduce_frame(np.full((300, 400), 100, np.uint16), 60000.0, 1.0)
+    camera = FitProblem(frame, Pinhole(400, 300, 1200.0), Shutter(), LikelihoodSettings(), 1.0)
+    motion = CameraMotion.steady(np.array([0.0, 0.06, 0.0]))
+    stars = np.array([[120.0, 80.0], [260.0, 200.0]])
+    trusted = np.array([True, True])
+    return camera, StreakScene(motion, 1.1, stars, np.array([4e3, 7e3]), np.zeros(2), trusted)
+
+
+def _fitted_vibration(
+    monkeypatch: pytest.MonkeyPatch, frequencies: list[float | None], sizes: list[float], fails: int = 99
+) -> tuple[Any, int]:
+    """Return the fit for trial frequencies and steps to given amplitudes (px), and the number of fits."""
+    camera, scene = _plain_camera()
+    trials, steps, made = iter(frequencies), iter(sizes), []
+
+    def improved(_: object, one: Vibration) -> tuple[Vibration, None]:
+        size = next(steps) / 1200.0
+        sine = np.zeros((len(one.frequency), 3))
+        sine[:, 0] = size
+        return Vibration(one.frequency, sine, 0.0 * sine), None
+
+    def again(changed: StreakScene) -> Any:
+        made.append(changed)
+        return None if len(made) >= fails else _SimpleFit(changed)
+
+    monkeypatch.setattr(vibration, "residuals_of_fit", lambda *_: None)
+    times = SimpleNamespace(time=np.linspace(-0.5, 0.5, 201))
+    monkeypatch.setattr(vibration, "_rotation_sums", lambda *_: times)
+    monkeypatch.setattr(vibration, "_improved", improved)
+    monkeypatch.setattr(vibration, "_strongest_frequency", lambda *_: next(trials))
+    first: Any = _SimpleFit(scene)
+    found = vibration.fit_vibration(camera, first, again)
+    return found, len(made)
+
+
+@dataclass(frozen=True)
+class _SimpleFit:
+    """A stand-in for a fit with only its scene."""
+
+    scene: StreakScene
+
+
+def test_a_vibration_is_fitted_until_its_steps_are_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each sinusoid is improved at most four times, and until a step is below 0.02 px."""
+    assert _fitted_vibration(monkeypatch, [None], []) == (None, 0)
+    found, made = _fitted_vibration(monkeypatch, [2.0, None], [0.5, 0.51, 9.0])
+    assert made == 2
+    assert found.scene.motion.vibration.frequency.tolist() == [2.0]
+    assert found.scene.motion.vibration.amplitude * 1200.0 == pytest.approx([0.51])
+    found, made = _fitted_vibration(monkeypatch, [2.0, None], [0.5, 0.9, 0.5, 0.9, 9.0])
+    assert made == vibration._MOST_STEPS
+    two, made = _fitted_vibration(monkeypatch, [2.0, 5.0], [0.5, 0.51, 0.6, 0.61])
+    assert made == 4
+    assert two.scene.motion.vibration.frequency.tolist() == [2.0, 5.0]
+    # A vibration that is too large, or that cannot be fitted, is not accepted.
+    assert _fitted_vibration(monkeypatch, [2.0, None], [2.55, 2.56])[0] is None
+    assert _fitted_vibration(monkeypatch, [2.0, None], [2.44, 2.45])[0] is not None
+    assert _fitted_vibration(monkeypatch, [2.0, None], [0.5, 0.51], fails=2) == (None, 2)
+
+
+def test_a_fast_vibration_adds_the_amplitude_lost_in_the_point_spread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A point spread of the width s reduces a wave of the length L by the factor exp(-(2 pi s/L)^2/2)."""
+    camera, scene = _plain_camera()
+    star, nothing = np.zeros(1, np.int64), np.zeros((1, 7, LINES, 3), np.float32)
+    left = StreakResiduals(star, np.zeros((1, LINES)), nothing, nothing[:, 0], nothing[:, 0])
+    assert not vibration.vibration_covariance(camera, scene, left).any()
+    shaking = Vibration(np.array([3.0, 7.0]), 1e-4 * np.eye(3)[:2], 2e-4 * np.eye(3)[1:])
+    shaken = replace(scene, motion=replace(scene.motion, vibration=shaking))
+    added = np.diag([1e-9, 2e-9, 3e-9])
+    monkeypatch.setattr(vibration, "_rotation_sums", lambda *_: None)
+    monkeypatch.setattr(vibration, "_improved", lambda *_: (shaking, added))
+    found = vibration.vibration_covariance(camera, shaken, left)
+    length = 0.06 * 1200.0  # of streaks along a row, in px
+    lost = 1.0 - np.exp(-0.5 * (2.0 * np.pi * 1.1 * np.array([3.0, 7.0]) / length) ** 2)
+    amplitude = np.sqrt(5.0) * 1e-4
+    expected = np.sum((vibration._LOST_SHARE * lost * amplitude) ** 2)
+    assert found == pytest.approx(added + expected * np.eye(3), rel=0.1)
+    assert found[0, 1] == 0.0
+    none = StreakResiduals(star[:0], left.time[:0], nothing[:0], nothing[:0, 0], nothing[:0, 0])
+    assert not vibration.vibration_covariance(camera, shaken, none).any()
