@@ -8,7 +8,20 @@ import pytest
 from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
+from knightcube.gnc.control.sun_acquisition import (
+    DIPOLE_GAIN,
+    DRIFT,
+    JUMP,
+    LARGEST_BIAS,
+    LONGEST_GAP,
+    LONGEST_INTERVAL,
+    MEMORY,
+    SMOOTHED,
+    PropagatedSun,
+    ResidualDipole,
+    SunAcquisition,
+    SunAcquisitionSettings,
+)
 from tests.support.recorded_results import check
 
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
@@ -117,3 +130,115 @@ def test_the_bandwidth_is_that_of_the_largest_principal_moment() -> None:
     )
     assert plain == pytest.approx((0.6 * 1e-3 * 3e-5 / 3.05e-2) ** 0.5)
     assert rotated == pytest.approx(plain)
+
+
+SECOND = 1_000_000_000
+
+
+def turned_by(angle: float) -> FloatArray:
+    """Return the direction z, rotated by an angle about x."""
+    return np.array([0.0, np.sin(angle), np.cos(angle)])
+
+
+def test_a_measured_sun_is_mixed_with_the_propagated_one_and_corrects_the_bias() -> None:
+    """The weight of a measurement is the time since the last one, divided by the smoothing time."""
+    sun = PropagatedSun()
+    sun.measure(0, Z)
+    assert sun.direction is not None
+    np.testing.assert_array_equal(sun.direction, Z)
+    since = 0.25 * SMOOTHED
+    angle = 0.5 * np.arcsin(JUMP)
+    sun.propagate(round(since * SECOND), np.eye(3))
+    sun.measure(round(since * SECOND), turned_by(angle))
+    mixed = 0.75 * Z + 0.25 * turned_by(angle)
+    np.testing.assert_allclose(sun.direction, mixed / np.linalg.norm(mixed))
+    expected = -DRIFT * since * np.cross(turned_by(angle), Z)
+    np.testing.assert_allclose(sun.bias, np.clip(expected, -LARGEST_BIAS, LARGEST_BIAS))
+    assert sun.bias.any()
+    sun.propagate(round(9.0 * SMOOTHED * SECOND), np.eye(3))
+    for _ in range(3):
+        sun.measure(round(9.0 * SMOOTHED * SECOND), np.array([0.0, 0.0, 1.0]))
+        assert np.abs(sun.bias).max() <= LARGEST_BIAS
+
+
+@pytest.mark.parametrize(("share", "jumps"), [(0.99, False), (1.01, True)])
+def test_a_sun_that_jumps_replaces_the_propagated_one(share: float, jumps: bool) -> None:
+    sun = PropagatedSun()
+    sun.measure(0, Z)
+    sun.propagate(SECOND // 10, np.eye(3))
+    seen = turned_by(float(np.arcsin(share * JUMP)))
+    sun.measure(SECOND // 10, seen)
+    assert np.array_equal(np.asarray(sun.direction), seen) is jumps
+    assert sun.bias.any() is not np.bool_(jumps)
+    sun.measure(SECOND // 10, -np.asarray(sun.direction))
+    assert float(np.asarray(sun.direction) @ Z) < 0.0, "the opposite direction is a jump, too"
+
+
+@pytest.mark.parametrize(("late", "known"), [(0.0, True), (0.01, False)])
+def test_a_sun_is_forgotten_after_a_gap_of_the_gyro(late: float, known: bool) -> None:
+    sun = PropagatedSun()
+    sun.measure(0, Z)
+    turn = attitude_matrix(from_rotation_vector(np.array([0.1, 0.0, 0.0])))
+    sun.propagate(round((LONGEST_GAP + late) * SECOND), turn)
+    assert (sun.direction is not None) is known
+    if sun.direction is not None:
+        np.testing.assert_allclose(sun.direction, turn @ Z)
+
+
+def test_a_residual_dipole_is_learned_from_the_difference_of_the_rates() -> None:
+    """One step of the observer, by hand: the first rate is taken, the second one is compared."""
+    inertia, field = np.diag([1e-3, 2e-3, 3e-3]), np.array([0.0, 0.0, 3e-5])
+    observer = ResidualDipole(inertia, 1.0)
+    observer.follow(0.5, np.array([0.01, 0.0, 0.0]), field, np.zeros(3))
+    assert not observer.dipole.any()
+    error = np.array([1e-4, -2e-4, 3e-4])
+    observer.follow(0.5, np.array([0.01, 0.0, 0.0]) + error, field, np.zeros(3))
+    torque = inertia @ error
+    expected = DIPOLE_GAIN * 0.5 * np.cross(field, torque) / (3e-5) ** 2
+    np.testing.assert_allclose(observer.dipole, expected)
+    assert np.cross(observer.dipole, field)[:2] @ torque[:2] > 0.0
+    before = observer.dipole
+    observer.follow(LONGEST_INTERVAL + 0.01, np.ones(3), field, np.zeros(3))
+    np.testing.assert_array_equal(observer.dipole, before)
+    observer.restart()
+    observer.follow(0.5, np.zeros(3), field, np.zeros(3))
+    np.testing.assert_array_equal(observer.dipole, before)
+    small = ResidualDipole(inertia, 1e-9)
+    for rate in (np.zeros(3), error):
+        small.follow(0.5, rate, field, np.zeros(3))
+    assert np.abs(small.dipole).max() == 1e-9
+
+
+def test_coils_that_cause_the_measured_acceleration_leave_no_residual_dipole() -> None:
+    inertia, field = np.diag([1e-3, 2e-3, 3e-3]), np.array([1e-5, -2e-5, 3e-5])
+    observer, rate, coils = (
+        ResidualDipole(inertia, 1.0),
+        np.array([0.02, -0.01, 0.03]),
+        np.array([0.05, 0.02, -0.04]),
+    )
+    for _ in range(100):
+        observer.follow(0.025, rate, field, coils)
+        torque = np.cross(coils, field) - np.cross(rate, inertia @ rate)
+        rate = rate + 0.025 * np.linalg.solve(inertia, torque)
+    assert np.abs(observer.dipole).max() < 1e-4
+
+
+@pytest.mark.parametrize("sunny", [True, False])
+def test_the_dipole_makes_the_commanded_torque_across_the_field(sunny: bool) -> None:
+    """Without a Sun the torque damps the rotation; with a Sun it also turns the axis to the Sun."""
+    law, field = seeker(), np.array([1e-5, -2e-5, 3e-5])
+    rate = np.array([1e-3, -2e-3, 1.5e-3]) if not sunny else np.zeros(3)
+    if sunny:
+        law.update_sun(0, turned_by(0.4))
+    for k in range(1, 100):
+        law.sample(k * 25_000_000, attitude_matrix(from_rotation_vector(0.025 * k * rate)) @ field, rate)
+        dipole = law.dipole(k * 25_000_000)
+    here = law.field
+    assert here is not None
+    torque = np.cross(dipole, here)
+    assert torque.any()
+    if sunny:
+        assert torque @ np.cross(Z, turned_by(0.4)) > 0.0, "towards the Sun"
+    else:
+        assert torque @ rate < 0.0
+    assert abs(dipole @ here) < 1e-9 * np.linalg.norm(here)
