@@ -16,6 +16,7 @@ from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPa
 from knightcube.gnc.guidance.slew_search import (
     LAST_BARRIER,
     HorizonContinuation,
+    SlewSearch,
     SlewSolver,
     SolvedPath,
     guesses,
@@ -302,3 +303,122 @@ def test_a_similar_path_leads_to_the_path_of_the_task() -> None:
     assert solver.steps - before <= 12
     assert solver.energy(again) == pytest.approx(solver.energy(found), rel=1e-3)
     np.testing.assert_allclose(again.at.states, states, atol=2e-3)
+
+
+class Guesses:
+    """A solver whose guesses converge after given numbers of Newton steps."""
+
+    def __init__(self, needed: dict[str, int], lacks: dict[str, float]) -> None:
+        self.needed, self.lacks = needed, lacks
+        self.steps, self.work, self.share, self.extra = 0, 0.0, 1.0, np.zeros((0, 20))
+        self.asked: list[tuple[str, float, int]] = []
+
+    def equations(self, scale: float, count: int) -> Any:
+        return SimpleNamespace(scale=scale, count=count)
+
+    def kept(self, equations: Any) -> None:
+        return None
+
+    def descent(self, equations: Any, guess: str) -> Any:
+        return SimpleNamespace(
+            guess=guess,
+            scale=equations.scale,
+            lack=self.lacks.get(guess, 0.0),
+            is_over=guess == "over",
+            done=0,
+        )
+
+    def found(self, descent: Any, maximum: int, enough: float = 0.0) -> Any:
+        self.asked.append((descent.guess, descent.scale, maximum))
+        self.steps += maximum
+        descent.done += maximum
+        if descent.done < self.needed[descent.guess]:
+            return None
+        return SimpleNamespace(guess=descent.guess, horizon=descent.scale)
+
+    def energy(self, found: Any) -> float:
+        return {"a": 1.0, "b": 2.0, "c": 3.0, "late": 0.5}[found.guess]
+
+
+def searched(
+    solver: Guesses, names: list[str], monkeypatch: pytest.MonkeyPatch, **changes: Any
+) -> tuple[SlewSearch, list[tuple[str, float]]]:
+    """Return a search and the guesses and durations of the paths that it yields, without limits."""
+    search = SlewSearch(small_slew(horizon=240.0, longest=240.0, **changes), 10, 5000)
+    search.solver = cast(Any, solver)
+    search._walker = cast(
+        Any,
+        SimpleNamespace(
+            distinct=lambda paths: sorted(paths, key=solver.energy),
+            within=lambda start: start,
+            shortened=lambda *_: None,
+        ),
+    )
+    monkeypatch.setattr(slew_search, "guesses", lambda *_: names)
+    return search, [(cast(Any, path).guess, path.horizon) for path in search.paths()]
+
+
+def test_a_guess_with_large_violations_is_tried_after_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    solver = Guesses({"late": 20, "a": 8}, {"late": 1.6})
+    search, found = searched(solver, ["late", "a"], monkeypatch)
+    assert found == [("a", 240.0), ("late", 240.0)]
+    assert search.tried == 2
+    assert [guess for guess, *_ in solver.asked] == ["late", "a", "late"]
+
+
+def test_a_guess_with_small_violations_is_continued_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    solver = Guesses({"a": 20}, {"a": 1.4})
+    _, found = searched(solver, ["a"], monkeypatch)
+    assert found == [("a", 240.0)]
+    assert len(solver.asked) == 2
+
+
+def test_a_guess_that_ends_without_a_path_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    solver = Guesses({"over": 999}, {"over": 9.0})
+    search, found = searched(solver, ["over"], monkeypatch)
+    assert (found, search.tried, len(solver.asked)) == ([], 1, 1)
+
+
+def test_of_three_paths_the_cheapest_is_tried_and_the_next_ones_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    solver = Guesses({"a": 8, "b": 8, "c": 8}, {})
+    search, found = searched(solver, ["c", "a", "b", "b"], monkeypatch)
+    assert found == [("a", 240.0), ("b", 240.0)]
+    assert search.tried == 4
+
+
+def test_after_many_steps_without_a_path_the_remaining_guesses_are_deferred(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    solver = Guesses({"c": 8, "over": 999}, {"over": 9.0})
+    solver.lacks["c"] = 0.1
+    search, found = searched(solver, ["over"] * 16 + ["c"] * 3, monkeypatch)
+    assert search.tried == 16, "at most sixteen guesses are tried"
+    assert found == []
+    other = Guesses({"c": 8, "over": 999}, {"over": 9.0})
+    other.steps = 0
+    _, found = searched(other, ["over"] * 15 + ["c"], monkeypatch)
+    assert found == [("c", 240.0)]
+
+
+def test_corrections_of_one_path_are_limited_and_reset_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    solver = Guesses({"a": 8}, {})
+    search, _ = searched(solver, [], monkeypatch)
+    path, depths = cast(Any, object()), np.zeros((0, 20))
+    search._walker = cast(
+        Any, SimpleNamespace(eased=lambda found, peak: found, widened=lambda found, inside: found)
+    )
+    made = [
+        search.eased(path, 1.1),
+        search.widened(path, depths),
+        search.eased(path, 1.1),
+        search.widened(path, depths),
+    ]
+    assert made == [path] * 4
+    assert search.eased(path, 1.1) is None
+    assert search.widened(path, depths) is None
+    solver.share = 0.5
+    assert list(search._tried([path])) == [path]
+    assert solver.share == 1.0
+    assert search.eased(path, 1.1) is path
