@@ -592,6 +592,22 @@ def test_the_positions_of_the_coils_give_their_fields(
     assert [f"{one.part} {one.kind}" for one in found.findings] == expected
 
 
+@pytest.mark.parametrize("base", ["step_demo", "orbit"])
+def test_each_device_is_found_at_its_place(base: str, tmp_path: Path) -> None:
+    (found,) = outcomes(session(Case({}, "", [], base=base), tmp_path), "find")
+    answers = {
+        "inertial_unit": "/dev/knightcube-imu: answers: VN-100T-CR",
+        "coils": "/dev/i2c-1, 0x40: 0x40 answers",
+        "power_monitor": "/dev/i2c-1, 0x45: 0x45 answers",
+        "camera": "emulated optics: opens",
+    }
+    if base == "orbit":
+        answers |= {"gps": "/dev/knightcube-gps: sends", "solar_strings": "/dev/i2c-1: 0x48, 0x49 answer"}
+        answers |= {f"wide_cameras[{number}]": "emulated optics: opens" for number in range(6)}
+    assert found.values["answers"] == answers
+    assert found.findings == []
+
+
 def test_a_sound_bench_has_no_finding(tmp_path: Path) -> None:
     found = outcomes(session(Case({}, "", []), tmp_path), "find rest axes coils dark light focus")
     assert [one.line() for outcome in found for one in outcome.findings] == []
