@@ -21,6 +21,7 @@ from knightcube.vision.objects.measure import (
 )
 from knightcube.vision.objects.settings import FLOOR_PX, ObjectMeasurementSettings
 from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.survey import DetectionSettings, survey
 from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 from tests.knightcube.vision.satellite_frames import CAMERA, HELD, Shot
@@ -305,3 +306,35 @@ def test_points_of_light_are_measured_without_a_motion() -> None:
     assert found.directions == pytest.approx(camera.unit_vectors(found.points))
     assert np.all(found.sigma >= FLOOR_PX / 900.0)
     assert np.all(found.sigma < 1.5 * FLOOR_PX / 900.0)
+
+
+def test_catalogue_stars_have_the_trails_of_the_rotation() -> None:
+    """A star moves as v' = -omega x v, by half of the rotation before and after mid-exposure."""
+    camera = Pinhole(400, 300, 900.0)
+    sky = SkyMap(camera, HELD)
+    rotation = np.array([0.004, -0.01, 0.02])
+    found = measure._stars_in(sky, 2026.0, (300, 400), rotation)
+    still = measure._stars_in(sky, 2026.0, (300, 400), np.zeros(3))
+    assert not still.half.any()
+    assert np.array_equal(still.middle, found.middle)
+    stars = catalogue.load()
+    places = camera.project(stars.directions_at(2026.0) @ attitude_matrix(HELD).T)
+    inside = camera.contains(places)
+    assert np.count_nonzero(inside) > 20
+    for place, magnitude in zip(places[inside], stars.magnitude[inside], strict=True):
+        nearest = int(np.argmin(np.linalg.norm(found.middle - place, axis=1)))
+        assert found.middle[nearest] == pytest.approx(place, abs=1e-6)
+        assert np.any(found.magnitude[np.linalg.norm(found.middle - place, axis=1) < 1e-6] == magnitude)
+        ray = camera.unit_vectors(place[None])
+        step = 0.5 * np.cross(rotation, ray)
+        moved = camera.project(ray - step) - camera.project(ray + step)
+        assert found.half[nearest] == pytest.approx(0.5 * moved[0], abs=0.02)
+
+
+def test_areas_have_a_significance_relative_to_the_noise_of_their_pixels() -> None:
+    seen = survey(_seen(_POINTS).astype(np.uint16), DetectionSettings(psf_sigma=_PSF, gain=1.0))
+    noise = float(np.median(seen.sky.noise.values))
+    expected = seen.areas.flux / (noise * np.sqrt(seen.areas.pixels))
+    assert measure._significances(seen) == pytest.approx(expected)
+    assert noise == pytest.approx(4.0, rel=0.1)
+    assert measure._faintness(np.array([100.0, 0.0])) == pytest.approx([5.0, -22.5])

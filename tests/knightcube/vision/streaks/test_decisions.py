@@ -541,3 +541,37 @@ def test_a_poor_fit_with_correct_ends_may_be_a_vibration(monkeypatch: pytest.Mon
     assert _attempt(monkeypatch, misfit=2.4, shaken=shaken)[2] is not shaken
     assert _attempt(monkeypatch, ends=0.5, misfit=2.6, shaken=shaken)[2] is not shaken
     assert _attempt(monkeypatch, misfit=2.6)[2] is not None
+
+
+def test_a_rejected_motion_is_fitted_again_with_a_vibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The vibration is searched in the fit of the brightest trusted stars, and must confirm the motion."""
+    rejected = replace(_candidate([0.1, 0.0, 0.0], [0.0]), verdict=StreakVerdict.REJECTED)
+    confirmed, shaken = _candidate([0.1, 0.0, 0.0], [0.0]), _candidate([0.2, 0.0, 0.0], [0.0])
+    first = replace(_fit(), scene=_fit().scene.select(np.arange(1)))
+    searched: list[StreakFit] = []
+
+    def fitted(
+        last: StreakFit | None, found: estimate._Candidate, after: estimate._Candidate, shows: bool = True
+    ) -> estimate._Candidate:
+        results = iter([(last, found), (last, after)])
+        monkeypatch.setattr(estimate, "_candidate", lambda *_: next(results))
+
+        def vibrating(_: FitProblem, start: StreakFit) -> StreakFit | None:
+            searched.append(start)
+            return start if shows else None
+
+        monkeypatch.setattr(estimate, "_vibrating", vibrating)
+        return estimate._fitted(_problem(), MotionResult(StreakStatus.FAILED, 1, 0.2), first)
+
+    whole = _fit()
+    assert fitted(whole, confirmed, shaken) is confirmed
+    assert not searched
+    assert fitted(whole, rejected, shaken) is shaken
+    # Of the two trusted stars of the joint fit, as many are used as in the preliminary fit.
+    assert searched[0].scene.light.tolist() == [6000.0]
+    assert searched[0].hidden is None
+    assert fitted(None, rejected, shaken) is shaken
+    assert searched[1] is first
+    again = replace(rejected, rotation=np.ones(3))
+    assert fitted(whole, rejected, again) is rejected
+    assert fitted(whole, rejected, shaken, shows=False) is rejected
