@@ -550,8 +550,7 @@ def plan_step(
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
         time_cost: cost of the duration, W, which is added to the energy; None for a fixed duration.
-        minimise: "heat" for the integral of R I^2, or "supply" for the integral of V |I|, the energy from the
-            supply.
+        minimise: "heat" for the integral of R I^2, or "supply" for the supply energy, the integral of V |I|.
         nodes: number of nodes of the path, 8 to 40.
         max_stretch: largest ratio of the duration to `horizon`.
 
