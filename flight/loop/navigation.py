@@ -623,10 +623,10 @@ class HorizonCameraTask:
             frames=job[1],
             sun=_NONE if sun is None else sun.direction.tolist(),
             sun_sigma=float("nan") if sun is None else sun.sigma,
-            sun_cameras=0 if sun is None else sum(1 << number for number in sun.cameras),
+            sun_cameras=0 if sun is None else sun.mask,
             sun_used=int(used[0]),
             nadir=_NONE if nadir is None else nadir.direction.tolist(),
             nadir_sigma=float("nan") if nadir is None else nadir.sigma,
-            nadir_cameras=0 if nadir is None else sum(1 << number for number in nadir.cameras),
+            nadir_cameras=0 if nadir is None else nadir.mask,
             nadir_used=int(used[1]),
         )

@@ -177,6 +177,11 @@ class MeasuredDirection:
     cameras: tuple[int, ...]
 
     @property
+    def mask(self) -> int:
+        """Bit mask of the cameras; 0 without cameras."""
+        return sum(1 << number for number in self.cameras)
+
+    @property
     def sigma(self) -> float:
         """The standard deviation per axis, rad, computed from the mean variance over both axes."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))

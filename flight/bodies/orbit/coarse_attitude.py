@@ -251,8 +251,10 @@ class HorizonCameraFeed:
         elif any(one is not None for one in mine):
             self._against = self._against + 1 if any(refused) else 0
         sun_used, nadir_used = (
-            one is not None and not against and _says_more(one, claim) and self._use(time_ns, one)
-            for one, against in zip(mine, refused, strict=True)
+            one is not None and not against and _says_more(one, claim) and self._use(time_ns, one, cameras)
+            for one, against, cameras in zip(
+                mine, refused, (0 if found.sun is None else found.sun.mask, 0), strict=True
+            )
         )
         return sun_used, nadir_used
 
@@ -274,8 +276,9 @@ class HorizonCameraFeed:
         attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
         return self._filter.begin(attitude, doubted=doubted)
 
-    def _use(self, time_ns: int, sight: VectorObservation) -> bool:
-        measured = DirectionMeasurement(time_ns, sight.observed, sight.reference, sight.covariance)
+    def _use(self, time_ns: int, sight: VectorObservation, sun_cameras: int) -> bool:
+        seen = sight.observed, sight.reference, sight.covariance
+        measured = DirectionMeasurement(time_ns, *seen, sun_cameras)
         taken: list[bool] = []
         self._filter.measure_late([measured], taken.extend)
         return any(taken)

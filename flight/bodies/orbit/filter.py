@@ -451,7 +451,8 @@ class StepReplay:
             change = self._rate_change(step, since, uneven)
             return free.mean_rate(measurement.rate, measurement.covariance, change, since)
         if isinstance(measurement, DirectionMeasurement):
-            return free.direction(measurement.observed, measurement.reference, measurement.covariance)
+            seen, cameras = measurement.observed, measurement.sun_cameras
+            return free.direction(seen, measurement.reference, measurement.covariance, cameras)
         if isinstance(measurement, FieldMeasurement):
             return free.field(measurement.field, measurement.reference, measurement.covariance)
         return free.gyro(measurement.rate, measurement.covariance)

@@ -11,16 +11,16 @@ error state (see `error_state`) contains these blocks:
   tumble about more than one axis, the ratios of the moments of inertia and the principal axes are observable
   (Psiaki 2005, JGCD 28(4)). The common scale is observable only relative to the dipole moment of the coils.
 
-- `coils`: matrix of gain errors and misalignments of the coils. The estimated dipole is the commanded dipole
-  plus this matrix times the commanded dipole.
+- `coils`: matrix of gain errors and misalignments, which converts the commanded dipole to the dipole's error.
 
 - `gyro_matrix`, `field_matrix`: scale errors and misalignments of both sensors (Pittelkau 2001, JGCD 24(6)).
 
-- `camera`: misalignment of the star camera, whose attitude is known more accurately than the attitude of the
-  body.
+- `camera`: misalignment of the star camera, whose attitude is known better than the attitude of the body.
 
-- `horizon`: misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
-  cameras are used, so this block is a Gauss-Markov process with a long correlation time.
+- `horizon`: misalignment of the horizon cameras that measure nadir. When the body rotates, other cameras are
+  used, so this block is a Gauss-Markov process with a long correlation time.
+
+- `sun_camera`: misalignment of the horizon camera that measures the Sun, reset if another camera measures it.
 
 - `coil_variation`: relative variation of the dipole along each body axis, for example because the supply
   voltage varies, as a Gauss-Markov process with a correlation time of tens of seconds.
@@ -93,6 +93,7 @@ BLOCKS = {
     "horizon": 3,
     "field_error": 3,
     "coil_variation": 3,
+    "sun_camera": 3,
 }
 """Number of elements of each block of the error state, in order. Matrices (3, 3) are stored row by row."""
 (
@@ -111,11 +112,12 @@ BLOCKS = {
     HORIZON,
     FIELD,
     VARIATION,
+    SUN_CAMERA,
 ) = slices(BLOCKS)
 """Indices of the blocks of the error state."""
 SLOW = slice(GYRO.start, CAMERA.stop)
 """Indices of the slowly varying states, which are stored for the next boot."""
-STATES = VARIATION.stop
+STATES = SUN_CAMERA.stop
 """Number of elements of the error state."""
 
 
@@ -309,6 +311,7 @@ class FreeFilterSettings:
             StateBlock("horizon", _UNIFORM * errors.horizon * ones),
             StateBlock("field_error", self.field * ones),
             StateBlock("coil_variation", self.coil_error * ones),
+            StateBlock("sun_camera", _UNIFORM * errors.horizon * ones),
         ]
         return ErrorState(with_role(blocks, self.roles))
 
@@ -363,6 +366,7 @@ class FreeMemory:
     constants: FloatArray
     covariance: FloatArray
     field_error: float
+    sun_cameras: int
 
 
 class FreeFilter:
@@ -378,6 +382,7 @@ class FreeFilter:
         driven: commanded dipole (3,) of the coils in body axes during the last step, A m^2.
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
+        sun_cameras: bit mask of the cameras that measured the Sun most recently; 0 before the first.
         changes: number of changes of the estimate until now. refused: number of measurements that did not
             pass the gate. newest_square: normalised square of the newest innovation.
     """
@@ -387,7 +392,7 @@ class FreeFilter:
     ) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        The prior of the slowly varying states is `slow`, or by default the prior of the settings.
+        The prior of the slowly varying states is `slow`, or by default that of the settings.
         """
         self.motion = FreeMotion(inertia)
         self.layout = settings.error_state(inertia)
@@ -409,7 +414,7 @@ class FreeFilter:
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         self.rate: FloatArray = np.zeros(3)
         self.covariance: FloatArray = self.layout.prior.copy()
-        self.field_error = settings.field
+        self.field_error, self.sun_cameras = settings.field, 0
         self._reset_field()
         if slow is not None:
             self._constants[SLOW], self.covariance[SLOW, SLOW] = slow.values, slow.covariance
@@ -482,7 +487,8 @@ class FreeFilter:
         """Return a copy of the estimate, for `recall`."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
         rates = self.rate, self.acceleration
-        return FreeMemory(self.quaternion, *rates, self.driven, constants, covariance, self.field_error)
+        others = self.field_error, self.sun_cameras
+        return FreeMemory(self.quaternion, *rates, self.driven, constants, covariance, *others)
 
     def recall(self, then: FreeMemory) -> None:
         """Restore an earlier estimate from its copy `then`."""
@@ -490,7 +496,7 @@ class FreeFilter:
         self.quaternion, self.rate = then.quaternion, then.rate
         self.acceleration, self.driven = then.acceleration, then.driven
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
-        self.field_error = then.field_error
+        self.field_error, self.sun_cameras = then.field_error, then.sun_cameras
 
     def renew_coil(
         self, direction: FloatArray, dual: FloatArray, deviation: float, memories: Sequence[FreeMemory] = ()
@@ -709,17 +715,19 @@ class FreeFilter:
         error = multiply(multiply(since, quaternion), conjugate(expected))
         return self._update(to_rotation_vector(error), rows, covariance)
 
-    def direction(self, observed: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply an observed direction.
-
-        The unit vector `observed` (3,) is given in body axes with a covariance (3, 3), rad^2. The unit vector
-        `reference` (3,) is the true direction in ICRS.
-        """
+    def direction(
+        self, observed: FloatArray, reference: FloatArray, covariance: FloatArray, sun_cameras: int = 0
+    ) -> bool:
+        """Apply an observed direction; the arguments are attributes of `DirectionMeasurement`."""
+        if sun_cameras and sun_cameras != self.sun_cameras:
+            self.renew(SUN_CAMERA, self.layout.prior[SUN_CAMERA, SUN_CAMERA])
+            self.sun_cameras = sun_cameras
         expected = attitude_matrix(self.quaternion) @ reference
         across = tangent_basis(expected)
         rows = np.zeros((2, STATES))
-        rows[:, ATTITUDE] = rows[:, HORIZON] = across @ cross_matrix(expected)
-        offset = rows[:, HORIZON] @ self._constants[HORIZON]
+        misaligned = SUN_CAMERA if sun_cameras else HORIZON
+        rows[:, ATTITUDE] = rows[:, misaligned] = across @ cross_matrix(expected)
+        offset = rows[:, misaligned] @ self._constants[misaligned]
         return self._update(across @ observed - offset, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:

@@ -25,6 +25,7 @@ from knightcube.gnc.estimation.free_filter import (
     MAGNET,
     RATE,
     STATES,
+    SUN_CAMERA,
     FilterEnvironment,
     FreeFilter,
     FreeFilterSettings,
@@ -102,6 +103,31 @@ def test_late_attitudes_serve_as_well_as_timely_ones() -> None:
     assert angle_between(late[0].quaternion, late[1]) < 4.0 * STAR
     sigmas = [np.sqrt(np.diag(found.covariance)[ATTITUDE]).max() for found, _, _ in (timely, late)]
     assert sigmas[1] == pytest.approx(sigmas[0], rel=0.2)
+
+
+def test_sun_and_nadir_by_differently_misaligned_cameras_give_an_honest_attitude() -> None:
+    """The camera of the Sun is misaligned by 0.1 deg, those of nadir are not, and both are 20 deg apart.
+
+    The misalignment causes an error of 0.1 deg / sin 20 deg = 0.29 deg about nadir. The misalignment of
+    another camera that measures the Sun is unknown again.
+    """
+    settings = FreeFilterSettings()
+    found = FreeFilter(INERTIA, settings)
+    found.start(IDENTITY, np.radians(1.0) ** 2 * np.eye(3), np.zeros(3))
+    down, noise = np.array([0.0, 0.0, 1.0]), np.radians(0.02) ** 2 * np.eye(3)
+    sun = np.array([np.sin(np.radians(20.0)), 0.0, np.cos(np.radians(20.0))])
+    misaligned = attitude_matrix(from_rotation_vector(np.radians([0.1, 0.0, 0.0]))) @ sun
+    for _ in range(20):
+        assert found.direction(misaligned, sun, noise, 0b1000)
+        assert found.direction(down, down, noise)
+    error = to_rotation_vector(found.quaternion)
+    sigma = np.sqrt(found.covariance.diagonal())
+    assert np.degrees(abs(error[2])) > 0.1
+    assert np.all(np.abs(error) < 3.0 * sigma[ATTITUDE])
+    assert sigma[SUN_CAMERA].min() < 0.9 * sigma[SUN_CAMERA].max()
+    found.direction(sun, sun, 1e6 * noise, 0b0001)
+    fresh = np.sqrt(found.covariance.diagonal())[SUN_CAMERA]
+    np.testing.assert_allclose(fresh, settings.errors.horizon / np.sqrt(3.0), rtol=1e-3)
 
 
 def test_two_directions_make_a_coarse_attitude_fine_and_a_false_one_is_refused() -> None:
