@@ -420,18 +420,18 @@ def test_the_estimation_gets_each_change_of_coils_once() -> None:
 
 def test_past_estimates_and_late_measurements_need_a_started_filter() -> None:
     bench = Bench()
-    told: list[list[bool]] = []
+    reported: list[list[bool]] = []
     assert cast(Any, bench.task.past(5)) == ("past", 5)
     assert cast(Any, bench.task.rates(5, 9)) == ("rates", 5, 9)
     assert not bench.task.begin_from(cast(Any, "good")), "there is an estimate"
-    bench.task.ingest_late(cast(Any, [1, 2]), told.append)
+    bench.task.ingest_late(cast(Any, [1, 2]), reported.append)
     bench.filter.started = False
     assert bench.task.past(5) is None
     assert bench.task.rates(5, 9) is None
     assert bench.task.begin_from(cast(Any, "good"))
     assert not bench.task.begin_from(cast(Any, "bad"))
-    bench.task.ingest_late(cast(Any, [1, 2]), told.append)
-    assert told == [[True, True], [False, False]]
+    bench.task.ingest_late(cast(Any, [1, 2]), reported.append)
+    assert reported == [[True, True], [False, False]]
 
 
 class Cells:
