@@ -299,13 +299,15 @@ class EarthIntersection:
 
     hits: BoolArray
     heights: Float32Array
-    places: FloatArray
+    places: FloatArray | Float32Array
 
 
-def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
-    """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth."""
-    axes = semi_axes()
-    origin, into_earth = scene.on_unit_sphere()
+def look(scene: EarthScene, rays: FloatArray | Float32Array) -> EarthIntersection:
+    """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth.
+
+    The precision is that of `rays`. From a low orbit, 32-bit numbers place the intersections within 10 m.
+    """
+    axes, origin, into_earth = (array.astype(rays.dtype) for array in (semi_axes(), *scene.on_unit_sphere()))
     # Computing with contiguous rows of coordinates is several times faster than with rows of vectors.
     scaled = into_earth @ rays.T
     squares, along = np.sum(scaled * scaled, axis=0), origin @ scaled
@@ -319,7 +321,7 @@ def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
     places = nearest - np.where(hits, back, 0.0) * scaled
     length = np.sqrt(distance)
     local = np.sqrt(axes**2 @ nearest_squares) / length
-    heights = np.where(ahead, np.maximum(length - 1.0, 0.0) * local, np.inf).astype(np.float32)
+    heights = np.where(ahead, np.maximum(length - 1.0, 0.0) * local, np.inf).astype(np.float32, copy=False)
     return EarthIntersection(np.asarray(hits), heights, places.T)
 
 
@@ -339,7 +341,7 @@ def near_earth(scene: EarthScene, rays: Float32Array) -> IntArray:
     return np.flatnonzero((along < 0.0) & (along * along > np.float32(reach * (1.0 - 1e-5)) * squares))
 
 
-def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> Float32Array:
+def radiance(scene: EarthScene, rays: FloatArray | Float32Array, sight: EarthIntersection) -> Float32Array:
     """Return the radiance (n,) along unit `rays` (n, 3) in camera axes, without the Sun's disc.
 
     The argument `sight` contains the intersections of the rays with the Earth.
@@ -373,10 +375,10 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> F
     return result
 
 
-def _chosen(vectors: FloatArray, at: IntArray) -> Float32Array:
+def _chosen(vectors: FloatArray | Float32Array, at: IntArray) -> Float32Array:
     """Return the columns with the indices `at` of vectors (3, n) as 32-bit numbers."""
-    coarse = vectors.astype(np.float32)
-    return coarse if len(at) == vectors.shape[1] else coarse[:, at]
+    coarse = vectors.astype(np.float32, copy=False)
+    return coarse if len(at) == vectors.shape[1] else coarse.take(at, axis=1)
 
 
 def _unit(vectors: Float32Array) -> Float32Array:
@@ -792,12 +794,12 @@ def _light(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
 
 def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
     """Return the Earth's radiance (rows, columns), averaged within the pixels that the limb crosses."""
-    rays = pixel_rays(model.lens)
+    rays = _coarse_rays(Lens.of(model.lens))
     light = np.zeros(len(rays), dtype=np.float32)
-    near = near_earth(scene, _coarse_rays(Lens.of(model.lens)))
+    near = near_earth(scene, rays)
     if not len(near):
         return light.reshape(model.rows, model.columns)
-    rays = rays.T[:, near].T
+    rays = rays.T.take(near, axis=1).T
     sight = look(scene, rays)
     found = radiance(scene, rays, sight)
     light[near] = found
@@ -810,6 +812,7 @@ def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
             wide[down + step // 3, across + step % 3] = True
         at_limb = np.flatnonzero(wide[1:-1, 1:-1])
         pixels = np.stack([at_limb % model.columns, at_limb // model.columns], axis=1)
-        fine = np.asfortranarray(model.lens.unit_vectors((pixels[:, None, :] + _WITHIN).reshape(-1, 2)))
+        points = (pixels[:, None, :] + _WITHIN).reshape(-1, 2)
+        fine = model.lens.unit_vectors(points).astype(np.float32, order="F")
         light[at_limb] = radiance(scene, fine, look(scene, fine)).reshape(-1, len(_WITHIN)).mean(axis=1)
     return light.reshape(model.rows, model.columns)
