@@ -299,15 +299,18 @@ class EarthIntersection:
 
     hits: BoolArray
     heights: Float32Array
-    places: FloatArray | Float32Array
+    places: npt.NDArray[np.floating[Any]]
 
 
-def look(scene: EarthScene, rays: FloatArray | Float32Array) -> EarthIntersection:
+def look(scene: EarthScene, rays: npt.NDArray[np.floating[Any]]) -> EarthIntersection:
     """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth.
 
-    The precision is that of `rays`. From a low orbit, 32-bit numbers place the intersections within 10 m.
+    The precision is that of `rays`. For 32-bit rays from altitudes up to 2,000 km, the errors of all heights
+    are below 2 m, and the errors of 99.9 % of the places are below 20 m. Places near the limb have larger
+    errors along the line of sight.
     """
-    axes, origin, into_earth = (array.astype(rays.dtype) for array in (semi_axes(), *scene.on_unit_sphere()))
+    origin, into_earth = (array.astype(rays.dtype) for array in scene.on_unit_sphere())
+    axes: npt.NDArray[np.floating[Any]] = semi_axes().astype(rays.dtype)
     # Computing with contiguous rows of coordinates is several times faster than with rows of vectors.
     scaled = into_earth @ rays.T
     squares, along = np.sum(scaled * scaled, axis=0), origin @ scaled
@@ -375,7 +378,7 @@ def radiance(scene: EarthScene, rays: FloatArray | Float32Array, sight: EarthInt
     return result
 
 
-def _chosen(vectors: FloatArray | Float32Array, at: IntArray) -> Float32Array:
+def _chosen(vectors: npt.NDArray[np.floating[Any]], at: IntArray) -> Float32Array:
     """Return the columns with the indices `at` of vectors (3, n) as 32-bit numbers."""
     coarse = vectors.astype(np.float32, copy=False)
     return coarse if len(at) == vectors.shape[1] else coarse.take(at, axis=1)

@@ -174,13 +174,16 @@ class SelfTest:
 
     def _begin(self, usable: BoolArray, now_ns: int) -> None:
         """Begin the test of the next coil that is due."""
-        interval_ns, strength = self._settings.interval_ns, self._response.strength
+        interval_ns = self._settings.interval_ns
+        due = [
+            axis
+            for axis, shown_ns in enumerate(self._shown_ns)
+            if usable[axis] and shown_ns is not None and now_ns - shown_ns >= interval_ns
+        ]
+        strength = self._response.strength if due else None
         if strength is None:
             return
-        for axis in np.flatnonzero(usable).tolist():
-            shown_ns = self._shown_ns[axis]
-            if shown_ns is None or now_ns - shown_ns < interval_ns:
-                continue
+        for axis in due:
             current, limit = self._least / float(strength[axis]), float(self._settings.limits[axis])
             quarter = max(_SHORTEST_QUARTER, (current / limit) ** (2.0 / 3.0))
             if quarter > _LONGEST_QUARTER:

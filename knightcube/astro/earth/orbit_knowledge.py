@@ -112,7 +112,8 @@ class GpsFix:
         if not abs(age) <= self.longest_age:
             raise OrbitError(f"the last fix is {age:.0f} s old: fixes are used for {self.longest_age:g} s")
         to_ground = celestial_to_terrestrial(self.julian_date)
-        with_ground = self.velocity + np.cross([0.0, 0.0, ROTATION_RATE], self.position)
+        x, y, _ = self.position.tolist()
+        with_ground = self.velocity + np.array([-ROTATION_RATE * y, ROTATION_RATE * x, 0.0])
         state = np.concatenate([self.position @ to_ground, with_ground @ to_ground])
         later = propagated(state, age)
         # In orbit, an along-track velocity error causes three times the position error of free space.
