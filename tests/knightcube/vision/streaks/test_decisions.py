@@ -567,7 +567,7 @@ def test_a_rejected_motion_is_fitted_again_with_a_vibration(monkeypatch: pytest.
     assert fitted(whole, confirmed, shaken) is confirmed
     assert not searched
     assert fitted(whole, rejected, shaken) is shaken
-    # Of the two trusted stars of the joint fit, as many are used as in the preliminary fit.
+    # The preliminary fit had one star, so only the brightest trusted star of the joint fit is used.
     assert searched[0].scene.light.tolist() == [6000.0]
     assert searched[0].hidden is None
     assert fitted(None, rejected, shaken) is shaken
