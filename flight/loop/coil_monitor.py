@@ -59,10 +59,10 @@ from flight.loop.coil_currents import (
     Bounds,
     BrakeProof,
     CoilFault,
-    Predicted,
     Sampling,
     StuckLeg,
     fits,
+    is_healthy_current,
     predict,
 )
 from flight.loop.coil_response import (
@@ -548,11 +548,10 @@ class CoilMonitor:
             self._reset()
             self._unmixed_ns = reading.time_ns
             return
-        predictions = self._predictions(reading)
         if self._suspected_ns is None:
-            self._check_healthy(predictions, reading)
+            self._check_healthy(reading)
         elif reading.time_ns - self._suspected_ns > _SETTLE_NS:
-            self._evidence.add(predictions)
+            self._evidence.add([predict(*window) for window in self._windows(reading)])
             self._judge(reading.time_ns)
 
     @property
@@ -608,22 +607,29 @@ class CoilMonitor:
             self._give(found, CoilFault.HIGH, reading.time_ns, text)
             self.interrupted(reading.time_ns)
 
-    def _predictions(self, reading: PowerReading) -> list[Predicted]:
-        """Predict the newest ADC sample, and the window's mean unless the circuit changed in the window."""
-        windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
-        begin_ns, commands = reading.time_ns - _WINDOW_NS, self._commands
-        if begin_ns >= self._unmixed_ns:
-            windows.append((reading.current, begin_ns, MEAN))
-        return [
-            predict(
-                current, commands.window(since_ns, reading.time_ns), self._bounds, sampling, reading.clipped
-            )
-            for current, since_ns, sampling in windows
-        ]
+    def _windows(self, reading: PowerReading) -> list[tuple[float, FloatArray, Bounds, Sampling, bool]]:
+        """Return the newest ADC sample, and the window's mean unless the circuit changed in the window.
 
-    def _check_healthy(self, predictions: list[Predicted], reading: PowerReading) -> None:
-        asked = float(predictions[0].mean[:, 0].sum())
-        if all(fits([one], self._bounds, self._known) for one in predictions):
+        Each tuple contains the arguments of `predict`.
+        """
+        commands, bounds, clipped = self._commands, self._bounds, reading.clipped
+        newest = commands.window(reading.newest_since_ns, reading.time_ns)
+        windows = [(reading.newest, newest, bounds, NEWEST, clipped)]
+        begin_ns = reading.time_ns - _WINDOW_NS
+        if begin_ns >= self._unmixed_ns:
+            windows.append(
+                (reading.current, commands.window(begin_ns, reading.time_ns), bounds, MEAN, clipped)
+            )
+        return windows
+
+    def _check_healthy(self, reading: PowerReading) -> None:
+        windows, known = self._windows(reading), self._known
+        asked = float(np.abs(windows[0][1]).sum(axis=1).mean())
+        if known:
+            healthy = all(fits([predict(*window)], self._bounds, known) for window in windows)
+        else:
+            healthy = all(is_healthy_current(*window) for window in windows)
+        if healthy:
             self._strange = 0
             self._witness.trust_monitor()
             if asked > self._bounds.uncertainty:

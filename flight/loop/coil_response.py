@@ -92,15 +92,14 @@ class CoilCommands:
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
         """Return the commands (k, n), A, that may be in force between two times, sampled in equal steps."""
-        later = iter(self._commands)
-        _, currents = next(later)
-        following = next(later, None)
+        earlier = reversed(self._commands)
+        since_ns, currents = next(earlier)
         sampled: list[tuple[float, ...]] = []
-        for time_ns in range(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS):
-            while following is not None and following[0] <= time_ns:
-                currents, following = following[1], next(later, None)
+        for time_ns in reversed(range(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS)):
+            while since_ns > time_ns:
+                since_ns, currents = next(earlier, (time_ns, currents))
             sampled.append(currents)
-        return np.array(sampled)
+        return np.array(sampled[::-1])
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
         """Return the newest ADC sample with the bounds for healthy coils besides `known` faults."""
@@ -178,6 +177,8 @@ _LEAST_CHANGE = 4.0e-3
 """Smallest detectable change of the angular acceleration, rad/s^2."""
 LARGEST_GAIN = 1.5
 """Largest absolute gain of a coil that is physically possible."""
+_DISTURBANCE_NS = 10_000_000_000
+"""Time (ns) for which the largest expected disturbance is assumed constant."""
 _SLOWEST_ROTATION = 1.1e-3
 """Rate (rad/s) at which the direction of the air flow rotates in a body that points to an inertial target."""
 _GAIN_PRIOR = 10.0
@@ -219,32 +220,35 @@ class CoilResponse:
         if dipoles.ndim == 0:
             dipoles = np.eye(3) * dipoles
         strongest = float(np.linalg.norm(dipoles, axis=0).max())
-        self._per_field = strongest * np.linalg.inv(settings.inertia).T
         # Row a is the axis of coil a, scaled by its dipole relative to the strongest coil's dipole.
-        self._directions: FloatArray = dipoles.T / strongest
-        self._count_of_coils = coils = len(self._directions)
+        directions = dipoles.T / strongest
+        self._count_of_coils = coils = len(directions)
+        # Accelerations per ampere (3, 3 n) of the n coils in a unit field along each body axis. The
+        # acceleration by coil a with the dipole d_a per ampere is J^-1 (d_a x B).
+        per_field = directions @ cross_matrices(np.eye(3)) @ (strongest * np.linalg.inv(settings.inertia).T)
+        self._per_field: FloatArray = per_field.reshape(3, 3 * coils)
         self._free = np.flatnonzero(settings.free)
-        self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
+        self._mask: FloatArray = np.array(settings.free, dtype=float)
         count = len(self._free)
-        # Coefficients (3, 6) of the gyroscopic acceleration, and their changes (k, 3, 6) by k inertia errors.
+        self._places = np.arange(count)
+        # Coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of its changes by k inertia errors.
         self._gyroscopic: FloatArray = np.zeros((3, 6))
-        self._modes: FloatArray = np.zeros((0, 3, 6))
         if count == 3:
-            self._gyroscopic = gyroscopic_coefficients(settings.inertia)
-            self._modes = coefficient_modes(settings.inertia, settings.errors)
-        # Fit parameters: the gains, torsion and damping of each free axis, and a weight of each error mode.
-        spreads = [_GAIN_PRIOR] * coils + [settings.torsion] * count + [settings.damping] * count
-        spreads += [1.0] * len(self._modes)
-        self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
-        self._prior_matrix: FloatArray = np.diag(self._prior)
+            modes = coefficient_modes(settings.inertia, settings.errors)
+            self._gyroscopic = np.vstack([gyroscopic_coefficients(settings.inertia), *modes])
+        errors = len(self._gyroscopic) // 3 - 1
+        # Fit parameters: torsion and damping of each free axis, a weight of each error mode, and the gains.
+        spreads = [settings.torsion] * count + [settings.damping] * count + [1.0] * errors
+        self._others = len(spreads)
+        self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
         # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniform within a bound.
         healthy = np.full(coils, 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2)
         # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
         each = np.eye(coils, dtype=bool)
         self._prior_weights: FloatArray = np.concatenate(
             [
-                self._prior[None, :coils],
-                np.where(each, self._prior[:coils], healthy),
+                np.full((1, coils), _GAIN_PRIOR**-2),
+                np.where(each, _GAIN_PRIOR**-2, healthy),
                 np.tile(healthy, (coils + 1, 1)),
             ]
         )
@@ -252,6 +256,7 @@ class CoilResponse:
         self._expected[coils + 2 :][each] = -1.0
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0,) * coils)])
         self._known_ns = self._last_ns = 0
+        self._disturbed_ns, self._disturbance = -_DISTURBANCE_NS, 0.0
         self.gain: FloatArray = np.ones(coils)
         self.largest: FloatArray = np.full(coils, LARGEST_GAIN)
         self.sigma: FloatArray = np.full(coils, np.inf)
@@ -260,23 +265,22 @@ class CoilResponse:
     def reset(self) -> None:
         """Discard all samples."""
         coils = self._count_of_coils
-        self._asked: FloatArray = np.zeros((coils, 3))
-        # Samples: time (ns), time since the previous sample (s), rate (3,), field (3,) and currents (n,).
-        self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
-        self._previous: tuple[float, FloatArray, FloatArray, FloatArray] | None = None
+        # Samples: time since the previous sample (s), rate (3,), field (3,) and currents (n,).
+        self._samples: list[tuple[float, ...]] = []
+        self._times: list[int] = []  # times (ns) of the samples
+        # Integrals of the n coil accelerations (3 n,), rad/s, and of the six rate products, rad^2/s.
+        self._integrals: FloatArray = np.zeros(3 * coils + 6)
+        self._previous: tuple[float, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
-        self._spun: FloatArray = np.zeros(6)  # integrals of the rate products, rad^2/s
-        self._quiet_field: FloatArray | None = None
-        # Row (f, n + 3 + k) of each bin, for f free axes, n coils and k inertia error modes.
-        # Columns of a row: n coil accelerations, observed acceleration, rate, angle, k error accelerations.
+        self._quiet_field: tuple[float, ...] | None = None
+        # Equations (f, p + 1) of each bin for f free axes: coefficients of p parameters, and acceleration.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = self._walk = 0.0
         # The newest fit determines the weights of the inertia error modes.
-        self._weights: FloatArray = np.zeros(len(self._modes))
-        # The tuple of a bin begins with the time (ns) and the commanded acceleration by each coil (3, n).
-        # The tuple ends with accelerations per ampere (3, n), residual (3,), and error accelerations (3, k).
-        self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
+        self._weights: FloatArray = np.zeros(len(self._gyroscopic) // 3 - 1)
+        # The tuple of a bin: time (ns), equations (3, p + 1), and accelerations per ampere (3, n).
+        self._remainders: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._in_a_row = {finding: [0] * coils for finding in Finding}
         self.sigma = np.full(coils, np.inf)
 
@@ -302,26 +306,28 @@ class CoilResponse:
         if not 0 < since_ns < _STALE_NS:
             self.reset()
             return False
+        rates: list[float] = rate.tolist()
+        fields: Sequence[float] = field.tolist()
         if self._settings.settle_ns is not None:
-            quiet_field = self._field_without_coils(time_ns, since_ns * 1e-9, rate, field)
+            quiet_field = self._field_without_coils(time_ns, since_ns * 1e-9, rates, fields)
             if quiet_field is None:
                 return False
-            field = quiet_field
-        self._samples.append((time_ns, since_ns * 1e-9, rate, field, self._command_at(time_ns)))
+            fields = quiet_field
+        self._times.append(time_ns)
+        self._samples.append((since_ns * 1e-9, *rates, *fields, *self._command_at(time_ns)))
         return len(self._samples) >= self._settings.bin_samples and self._close_bin()
 
     def _field_without_coils(
-        self, time_ns: int, span: float, rate: FloatArray, field: FloatArray
-    ) -> FloatArray | None:
+        self, time_ns: int, span: float, rate: list[float], field: Sequence[float]
+    ) -> tuple[float, ...] | None:
         """Return the field of the last pause of the coils, rotated with the body, or None before a pause."""
         since_ns, currents = self._commands[-1]
         settle_ns = self._settings.settle_ns or 0
         if not any(currents) and time_ns - since_ns >= settle_ns:
-            self._quiet_field = field
+            self._quiet_field = tuple(field)
         elif self._quiet_field is not None:
-            (x, y, z), (wx, wy, wz) = self._quiet_field.tolist(), (span * rate).tolist()
-            turned = (x + y * wz - z * wy, y + z * wx - x * wz, z + x * wy - y * wx)
-            self._quiet_field = np.array(turned)
+            (x, y, z), (wx, wy, wz) = self._quiet_field, (span * speed for speed in rate)
+            self._quiet_field = x + y * wz - z * wy, y + z * wx - x * wz, z + x * wy - y * wx
         return self._quiet_field
 
     def _command_at(self, time_ns: int) -> tuple[float, ...]:
@@ -346,66 +352,70 @@ class CoilResponse:
         `since_ns` are compared with those after `settled_ns`. The result is None if the change is too small
         to be observed, and NaN if there are too few residuals.
         """
-        before = [row[3] - row[4] @ self._weights for row in self._remainders if row[0] < since_ns]
-        after = [row for row in self._remainders if row[0] >= settled_ns]
+        before = [rows for time_ns, rows, _ in self._remainders if time_ns < since_ns]
+        after = [(rows, gains) for time_ns, rows, gains in self._remainders if time_ns >= settled_ns]
         if len(before) < 3 or len(after) < 3:
             return math.nan
-        expected = np.mean([constant * row[2][:, axis] - row[1][:, axis] for row in after], axis=0)
+        column = self._others + axis
+        expected = np.mean([constant * gains[:, axis] - rows[:, column] for rows, gains in after], axis=0)
+        expected = self._mask * expected
         size = float(expected @ expected)
         if size < _LEAST_CHANGE**2:
             return None
-        residuals = [row[3] - row[4] @ self._weights for row in after]
-        change = np.mean(residuals, axis=0) - np.mean(before[-10:], axis=0)
+        change = self._residual([rows for rows, _ in after]) - self._residual(before[-10:])
         return float(change @ expected) / size
+
+    def _residual(self, equations: list[FloatArray]) -> FloatArray:
+        """Return the mean residual acceleration (3,) of healthy coils in bins with equations (3, p + 1)."""
+        rows = np.mean(equations, axis=0)
+        modes, gains = rows[:, 2 * len(self._free) : self._others], rows[:, self._others : -1]
+        return np.asarray(rows[:, -1] - gains.sum(axis=1) - modes @ self._weights)
 
     @property
     def strength(self) -> FloatArray | None:
         """Angular acceleration (n,), rad/s^2/A, of the coils in the last pause's field, or None."""
         if self._quiet_field is None:
             return None
-        per_ampere = self._directions @ cross_matrices(self._quiet_field[None])[0] @ self._per_field
-        return np.asarray(np.linalg.norm(per_ampere, axis=1))
+        per_ampere = np.array(self._quiet_field) @ self._per_field
+        return np.asarray(np.linalg.norm(per_ampere.reshape(-1, 3), axis=1))
 
     def text(self, axis: int) -> str:
         """Return the gain of an axis as text."""
         return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its expected torque"
 
     def _close_bin(self) -> bool:
-        times, spans, rates, fields, currents = zip(*self._samples, strict=True)
+        samples, count, coils = np.array(self._samples), len(self._samples), self._count_of_coils
+        middle = sum(self._times) / count * 1e-9
         self._samples.clear()
-        count = len(times)
-        # Row a is the acceleration per ampere of coil a with the dipole d_a per ampere: J^-1 (d_a x B).
-        per_ampere = self._directions @ cross_matrices(np.array(fields)) @ self._per_field
-        steps = np.array(currents)[:, :, None] * per_ampere * np.array(spans)[:, None, None]
-        steps[0] += self._asked
-        integral = np.cumsum(steps, axis=0)
-        self._asked = integral[-1]
-        middle = sum(times) / count * 1e-9
-        turning = np.array(rates)
-        products = rate_products(turning) * np.array(spans)[:, None]
-        products[0] += self._spun
-        spinning = np.cumsum(products, axis=0)
-        self._spun = spinning[-1]
-        rate, asked, spun = (part.sum(axis=0) / count for part in (turning, integral, spinning))
-        before, self._previous = self._previous, (middle, rate, asked, spun)
+        self._times.clear()
+        spans, rates, fields, currents = samples[:, :1], samples[:, 1:4], samples[:, 4:7], samples[:, 7:]
+        per_ampere = fields @ self._per_field
+        products = rate_products(rates)
+        commanded = (currents[:, :, None] * per_ampere.reshape(count, coils, 3)).reshape(count, 3 * coils)
+        # The sum of all steps, and the mean of the sums after each sample.
+        steps = spans * np.concatenate([commanded, products], axis=1)
+        total, mean = _sums_and_means(count) @ steps
+        mean += self._integrals
+        self._integrals = self._integrals + total
+        rate = rates.sum(axis=0) / count
+        before, self._previous = self._previous, (middle, rate, mean)
         if before is None:
             return False
         span = middle - before[0]
         mean_rate = 0.5 * (rate + before[1])
         self._turned = self._turned + mean_rate * span
-        spin = (spun - before[3]) / span
-        coils = self._count_of_coils
-        row = np.empty((3, coils + 3 + len(self._modes)))
-        row[:, :coils] = (asked - before[2]).T / span
-        row[:, coils] = (rate - before[1]) / span - self._gyroscopic @ spin
-        row[:, coils + 1], row[:, coils + 2] = mean_rate, self._turned
-        row[:, coils + 3 :] = (self._modes @ spin).T
-        self._rows.append(row[self._free])
-        self._speeds.append(math.sqrt(float(np.square(turning).sum(axis=1).max())))
-        row *= self._mask
-        remainder = row[:, coils] - row[:, :coils].sum(axis=1)
-        per_ampere = per_ampere[-1].T * self._mask
-        self._remainders.append((self._last_ns, row[:, :coils], per_ampere, remainder, row[:, coils + 3 :]))
+        change = (mean - before[2]) / span
+        gyroscopic = (self._gyroscopic @ change[3 * coils :]).reshape(-1, 3)
+        free, others, number = self._free, self._others, len(self._free)
+        rows = np.zeros((3, others + coils + 1))
+        rows[free, self._places] = -self._turned[free]
+        rows[free, self._places + number] = -mean_rate[free]
+        rows[:, 2 * number : others] = gyroscopic[1:].T
+        rows[:, others:-1] = change[: 3 * coils].reshape(coils, 3).T
+        rows[:, -1] = (rate - before[1]) / span - gyroscopic[0]
+        self._rows.append(rows[free])
+        self._speeds.append(math.sqrt(float(products[:, :3].sum(axis=1).max())))
+        self._remainders.append((self._last_ns, rows, per_ampere[-1].reshape(coils, 3).T))
         while self._remainders[0][0] < self._last_ns - _MEMORY_NS:
             self._remainders.popleft()
         if len(self._rows) < self._settings.least_bins:
@@ -419,13 +429,13 @@ class CoilResponse:
         Bins from before a fault would hide the fault from a fit over all bins.
         """
         rows, self._walk = np.array(self._rows), self._disturbance_walk()
-        whole = self._solved(rows, span)
+        counts = [len(rows)]
+        while counts[-1] // 2 >= self._settings.least_bins:
+            counts.append(counts[-1] // 2)
+        fits = self._solved(rows, tuple(counts), span)
+        whole = fits[0]
         self.fastest = max(self._speeds)
-        self.gain, self.sigma, self._weights = whole.gain, whole.sigma, whole.weights
-        fits, count = [whole], len(rows) // 2
-        while count >= self._settings.least_bins:
-            fits.append(self._solved(rows[-count:], span))
-            count //= 2
+        self.gain, self.sigma, self._weights = whole.gain.copy(), whole.sigma.copy(), whole.weights
         # The gain of a coil that has just failed differs between the whole window and its newest half.
         newest = fits[min(1, len(fits) - 1)]
         steady = np.abs(newest.gain - whole.gain) < _STEADY * newest.sigma
@@ -437,57 +447,34 @@ class CoilResponse:
             alone, is_steady = bool(whole.alone[axis]), bool(steady[axis])
             self._count(axis, whole.possible, alone=alone, is_reversed=bool(shown), is_steady=is_steady)
 
-    def _solved(self, rows: FloatArray, span: float) -> MotionFit:
+    def _solved(self, rows: FloatArray, counts: tuple[int, ...], span: float) -> list[MotionFit]:
         """Fit all gains freely, and fit each gain under the assumption that the other coils are healthy.
 
-        `rows` (m, f, n + 3 + k) belong to m neighbouring bins, and `span` is the time (s) from bin to bin.
+        The equations `rows` (m, f, p + 1) belong to m neighbouring bins, and `span` is the time (s) from bin
+        to bin. Each fit uses as many of the newest bins as `counts` states.
         """
-        count, coils = len(self._free), self._count_of_coils
-        matrix, outputs = self._inputs_and_outputs(rows, span)
-        normal, right = matrix.T @ matrix + self._prior_matrix, matrix.T @ outputs
+        coils, others, free = self._count_of_coils, self._others, len(self._free)
+        equations = self._whitened(rows, counts, span)
+        normal = equations.transpose(0, 2, 1) @ equations
         # Eliminate the nuisance parameters, which leaves one equation for each gain.
-        rest = right[coils:]
-        others = np.linalg.inv(normal[coils:, coils:])
-        coupling = others @ normal[coils:, :coils]
-        reduced = normal[:coils, :coils] - self._prior_matrix[:coils, :coils]
-        reduced = reduced - normal[:coils, coils:] @ coupling
-        equations = reduced, right[:coils] - rest @ coupling, float(outputs @ outputs - rest @ others @ rest)
-        gains, variances, gain_costs = _solved_gains(*equations, self._prior_weights, self._expected)
-        free_cost = float(gain_costs[0])
-        spread = max(1.0, free_cost / max(len(outputs) - count - coils, 1))
+        mixed = normal[:, :others, others:]
+        coupling = np.linalg.solve(normal[:, :others, :others] + self._prior, mixed)
+        reduced = normal[:, others:, others:] - mixed.transpose(0, 2, 1) @ coupling
+        gains, variances, gain_costs = _solved_gains(reduced, self._prior_weights, self._expected)
+        freedom = free * np.array(counts) - free - coils
+        spread = np.maximum(1.0, gain_costs[:, 0] / np.maximum(freedom, 1))[:, None]
         # If a gain is impossible even within its uncertainty, the model is wrong.
-        sigmas = np.sqrt(spread * variances[0])
-        possible = bool((np.abs(gains[0]) - 3.0 * sigmas < self.largest).all())
-        free_cost, *costs = (gain_costs / spread).tolist()
-        sound_cost, reversed_costs = costs[coils], costs[coils + 1 :]
-        alone, is_reversed = [], []
-        for axis in range(coils):
-            # The hypothesis that only this axis is broken is accepted if its cost is below this limit.
-            limit = min(costs[other] for other in range(coils) if other != axis) - _CLEARLY
-            limit = min(limit, free_cost + _WORSE)
-            alone.append(costs[axis] < limit)
-            is_reversed.append(reversed_costs[axis] < min(limit, sound_cost - _CERTAINLY))
-        one_free = slice(1, coils + 1)
-        return MotionFit(
-            gains[one_free].diagonal().copy(),
-            np.sqrt(spread * variances[one_free].diagonal()),
-            (others @ rest - coupling @ gains[0])[2 * count :],
-            possible,
-            tuple(alone),
-            tuple(is_reversed),
+        sigmas = np.sqrt(spread * variances[:, 0])
+        possible = (np.abs(gains[:, 0]) - 3.0 * sigmas < self.largest).all(axis=1).tolist()
+        weights = (
+            coupling[:, 2 * free :, coils] - (coupling[:, 2 * free :, :coils] @ gains[:, 0, :, None])[..., 0]
         )
-
-    def _inputs_and_outputs(self, rows: FloatArray, span: float) -> tuple[FloatArray, FloatArray]:
-        """Return the whitened equations of the fit: matrix (m f, p), and right side (m f,), accelerations."""
-        count, coils = len(self._free), self._count_of_coils
-        white = self._whitened(rows, span)
-        inputs = np.zeros((len(white), count, len(self._prior)))
-        inputs[:, :, :coils] = white[:, :, :coils]
-        inputs[:, :, coils + 2 * count :] = white[:, :, coils + 3 :]
-        for place in range(count):
-            inputs[:, place, coils + place] = -white[:, place, coils + 2]
-            inputs[:, place, coils + count + place] = -white[:, place, coils + 1]
-        return inputs.reshape(-1, len(self._prior)), white[:, :, coils].reshape(-1)
+        single = gains[:, 1 : coils + 1].diagonal(axis1=1, axis2=2)
+        deviations = np.sqrt(spread * variances[:, 1 : coils + 1].diagonal(axis1=1, axis2=2))
+        return [
+            MotionFit(single[place], deviations[place], weights[place], possible[place], *_judged(costs))
+            for place, costs in enumerate((gain_costs / spread).tolist())
+        ]
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
         """Count the consecutive fits that agree on an axis.
@@ -519,17 +506,20 @@ class CoilResponse:
             counts = self._in_a_row[finding]
             counts[axis] = counts[axis] + 1 if holds else 0
 
-    def _whitened(self, rows: FloatArray, span: float) -> FloatArray:
-        """Return the rows (m, f, n + 3 + k) of m bins, whitened and without the effect of a constant.
+    def _whitened(self, rows: FloatArray, counts: tuple[int, ...], span: float) -> FloatArray:
+        """Return the equations (w, m f, p + 1) of w fits, whitened and without the effect of a constant.
 
-        Whitening is needed, because the noise of a bin enters two differences of bins with opposite signs.
+        The equations `rows` (m, f, p + 1) belong to m bins. In each fit, the equations of bins before the
+        newest `counts` bins are zero. Whitening is needed, because the noise of a bin enters two differences
+        of bins with opposite signs.
         """
         settings = self._settings
         # The span is rounded to ns, so that equal spans use the stored matrix.
         span = round(span, 9)
         variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
-        whitening = _whitening(len(rows), settings.model_error**2, variance, self._walk * span)
-        return np.asarray((whitening @ rows.reshape(len(rows), -1)).reshape(rows.shape))
+        whitening = _whitenings(counts, settings.model_error**2, variance, self._walk * span)
+        white = whitening @ rows.reshape(len(rows), -1)
+        return np.asarray(white.reshape(len(counts), -1, rows.shape[2]))
 
     def _disturbance_walk(self) -> float:
         """Return the variance per second, (rad/s^2)^2/s, of the random walk of the disturbance.
@@ -537,14 +527,35 @@ class CoilResponse:
         Within the time in which the body rotates by 1 rad, the disturbance changes by its own magnitude. The
         result is rounded to a power of two, so that few whitening matrices are needed.
         """
-        largest = 0.0 if self._settings.disturbance is None else self._settings.disturbance(self._last_ns)
+        disturbance = self._settings.disturbance
+        if disturbance is not None and not 0 <= self._last_ns - self._disturbed_ns < _DISTURBANCE_NS:
+            self._disturbed_ns, self._disturbance = self._last_ns, disturbance(self._last_ns)
+        largest = self._disturbance
         if largest <= 0.0:
             return 0.0
         walk = 2.0 * largest**2 * max(self._speeds[-1], _SLOWEST_ROTATION)
         return float(2.0 ** round(math.log2(walk)))
 
 
+@functools.cache
+def _sums_and_means(count: int) -> FloatArray:
+    """Return the matrix (2, m) that yields the sum of m steps, and the mean of their m cumulative sums."""
+    return np.stack([np.ones(count), np.arange(count, 0, -1) / count])
+
+
 @functools.lru_cache(maxsize=256)
+def _whitenings(counts: tuple[int, ...], independent: float, variance: float, walk: float) -> FloatArray:
+    """Return matrices (w, m, m), each of which whitens the newest differences of bins, as `_whitening` does.
+
+    The number of differences is m for the first matrix, and `counts` contains the numbers for all matrices.
+    The elements for earlier differences are zero.
+    """
+    matrices = np.zeros((len(counts), counts[0], counts[0]))
+    for matrix, count in zip(matrices, counts, strict=True):
+        matrix[-count:, -count:] = _whitening(count, independent, variance, walk)
+    return matrices
+
+
 def _whitening(count: int, independent: float, variance: float, walk: float) -> FloatArray:
     """Return the matrix (m, m) that whitens the differences of bins and removes their constant part.
 
@@ -596,23 +607,43 @@ class MotionFit(NamedTuple):
 
 
 def _solved_gains(
-    matrix: FloatArray, right: FloatArray, constant: float, weights: FloatArray, expected: FloatArray
+    equations: FloatArray, weights: FloatArray, expected: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fit n gains under k hypotheses with the prior weights (k, n) of the expected gains (k, n), 1 or -1.
 
-    The weighted sum of squares at gains g is g S g - 2 t g + c; S is `matrix` (n, n), the vector t is `right`
-    (n,), and c is `constant`. The result is gains (k, n), their variances (k, n), and costs (k,), which are
-    the sums of squares of all residuals, including the deviations from the expected values.
+    The weighted sum of squares at gains g is g S g - 2 t g + c. The matrices `equations` (w, n + 1, n + 1) of
+    w fits contain S, the vector t as last row and column, and c as last element. The result is gains (w, k,
+    n), their variances (w, k, n), and costs (w, k), which are the sums of squares of all residuals, including
+    the deviations from the expected values.
     """
-    normal = np.repeat(matrix[None], len(weights), axis=0)
-    normal.reshape(len(weights), -1)[:, :: weights.shape[1] + 1] += weights
+    coils = weights.shape[1]
+    normal = np.repeat(equations[:, None, :coils, :coils], len(weights), axis=1)
+    normal.reshape(*normal.shape[:2], -1)[:, :, :: coils + 1] += weights
     covariance = np.linalg.inv(normal)
-    rights = right + weights * expected
-    gains = (covariance @ rights[:, :, None])[:, :, 0]
+    rights = equations[:, None, coils, :coils] + weights * expected
+    gains = (covariance @ rights[..., None])[..., 0]
     # The prior adds weight * (gain - expected)^2 to the cost for each gain.
     # Expected gains are 1 or -1, so the term weight * expected^2 equals the weight.
-    costs = constant + weights.sum(axis=1) - (rights * gains).sum(axis=1)
-    return gains, np.asarray(covariance.diagonal(axis1=1, axis2=2), dtype=np.float64), costs
+    costs = equations[:, coils, coils, None] + weights.sum(axis=1) - (rights * gains).sum(axis=2)
+    return gains, np.asarray(covariance.diagonal(axis1=2, axis2=3), dtype=np.float64), costs
+
+
+def _judged(costs: list[float]) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+    """Return for each of n coils whether only its fault explains the motion, and whether it is reversed.
+
+    The 2 n + 2 `costs` belong to the hypotheses that all gains are free, that one is free, that none is free,
+    and that one coil is reversed.
+    """
+    coils = len(costs) // 2 - 1
+    free, sound = costs[0], costs[coils + 1]
+    alone, is_reversed = [], []
+    for axis, (single, turned) in enumerate(zip(costs[1 : coils + 1], costs[coils + 2 :], strict=True)):
+        # The hypothesis that only this axis is broken is accepted if its cost is below this limit.
+        limit = min(costs[other] for other in range(1, coils + 1) if other != axis + 1) - _CLEARLY
+        limit = min(limit, free + _WORSE)
+        alone.append(single < limit)
+        is_reversed.append(turned < min(limit, sound - _CERTAINLY))
+    return tuple(alone), tuple(is_reversed)
 
 
 LONGEST_REST_NS = 600_000_000_000

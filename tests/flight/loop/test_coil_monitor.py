@@ -18,9 +18,11 @@ from flight.loop.coil_currents import (
     BrakeProof,
     CoilFault,
     Predicted,
+    Sampling,
     StuckLeg,
     Supplied,
     fits,
+    is_healthy_current,
     predict,
     supply_currents,
 )
@@ -477,6 +479,22 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
             readings += 1
     assert readings == 2_388
     assert suspected == 0
+
+
+@pytest.mark.parametrize("sampling", [NEWEST, MEAN])
+def test_the_fast_check_of_healthy_coils_agrees_with_the_hypothesis_of_healthy_coils(
+    sampling: Sampling,
+) -> None:
+    rng = np.random.default_rng(5)
+    answers = []
+    for _ in range(400):
+        commands = FULL * rng.uniform(-1.2, 1.2, 3) * (rng.random((rng.integers(1, 46), 3)) < 0.98)
+        current = float(np.abs(commands).sum(axis=1).mean() * rng.uniform(0.3, 1.9))
+        clipped = bool(rng.integers(0, 2))
+        fast = is_healthy_current(current, commands, BOUNDS, sampling, clipped)
+        assert fast == fits([predict(current, commands, BOUNDS, sampling, clipped)], BOUNDS, {})
+        answers.append(fast)
+    assert 40 < sum(answers) < 360
 
 
 def test_a_gap_in_the_readings_restarts_the_watch() -> None:

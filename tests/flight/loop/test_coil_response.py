@@ -244,7 +244,7 @@ def test_an_impossible_or_unclear_fit_of_few_bins_changes_no_sign(
     whole = MotionFit(np.ones(3), np.full(3, 0.1), np.zeros(0), True, never, never)
     response._rows.extend([np.zeros((3, 6))] * 15)
     response._speeds.append(0.1)
-    monkeypatch.setattr(response, "_solved", lambda rows, _: whole if len(rows) == 15 else short)
+    monkeypatch.setattr(response, "_solved", lambda *_: [whole, short])
     for _ in range(3):
         response._fit(0.2)
     assert response.axes(Finding.REVERSED) == found
@@ -341,7 +341,7 @@ def test_a_gain_that_changed_within_the_bins_is_not_used(
     }
     response._rows = deque([np.zeros((3, 6))] * 16)
     response._speeds.append(0.1)
-    monkeypatch.setattr(response, "_solved", lambda rows, _: fits[len(rows)])
+    monkeypatch.setattr(response, "_solved", lambda rows, counts, span: [fits[count] for count in counts])
     for _ in range(3):
         response._fit(0.2)
     assert response.axes(Finding.WEAK) == found
