@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.compiled import loop_helper
 
 IDENTITY: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -166,6 +167,7 @@ Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
 
+@loop_helper
 def compose(p: Quaternion, q: Quaternion) -> Quaternion:
     """Return the unit quaternion of the rotation q followed by the rotation p."""
     p1, p2, p3, p4 = p
@@ -183,6 +185,7 @@ def inverse(q: Quaternion) -> Quaternion:
     return -q[0], -q[1], -q[2], q[3]
 
 
+@loop_helper
 def exponential(x: float, y: float, z: float) -> Quaternion:
     """Return the quaternion of a rotation vector (x, y, z), rad."""
     square = 0.25 * (x * x + y * y + z * z)
@@ -200,11 +203,13 @@ def logarithm(q: Quaternion) -> Vector:
     return scale * x, scale * y, scale * z
 
 
+@loop_helper
 def twist(q: Quaternion) -> float:
     """Return the angle of q about the y axis, rad, in [-pi, pi]."""
     return 2.0 * math.atan2(q[1], q[3]) if q[3] >= 0.0 else 2.0 * math.atan2(-q[1], -q[3])
 
 
+@loop_helper
 def matrix(q: Quaternion) -> Matrix:
     """Return the rows of the attitude matrix A(q) (Sease, eq. (4.8), corrected)."""
     x, y, z, w = q
@@ -218,6 +223,7 @@ def matrix(q: Quaternion) -> Matrix:
     )
 
 
+@loop_helper
 def times(rows: Matrix, v: Vector) -> Vector:
     """Return the product of a matrix (3, 3) and a vector (3,)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
@@ -225,17 +231,20 @@ def times(rows: Matrix, v: Vector) -> Vector:
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
+@loop_helper
 def cross(a: Vector, b: Vector) -> Vector:
     """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+@loop_helper
 def skew(v: Vector) -> Matrix:
     """Return the rows of the cross-product matrix [v x], for which times(skew(v), u) = v x u."""
     x, y, z = v
     return (0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)
 
 
+@loop_helper
 def added(a: Vector, b: Sequence[float]) -> Vector:
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]

@@ -28,6 +28,7 @@ from knightcube.astro.quaternion import (
     Matrix,
     Quaternion,
     Vector,
+    added,
     attitude_matrix,
     compose,
     cross,
@@ -39,6 +40,7 @@ from knightcube.astro.quaternion import (
     times,
     twist,
 )
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.error_state import propagated
 from knightcube.gnc.estimation.estimate import (
@@ -91,6 +93,10 @@ class Linearised(NamedTuple):
     by_current: FloatArray
 
 
+BodyConstants = tuple[Matrix, Matrix, float, bool]
+"""Inertia tensor and its inverse as rows, dipole moment per ampere, and whether the body is suspended."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidBody:
     """The constants of the body, its coils, the magnetic field and the thread.
@@ -111,8 +117,7 @@ class RigidBody:
     stiffness: float = 0.0
     damping: float = 0.0
     response: FloatArray = dataclasses.field(init=False)
-    _response: Matrix = dataclasses.field(init=False)
-    _inertia: Matrix = dataclasses.field(init=False)
+    constants: BodyConstants = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
         """Raise UsageError for constants that are physically impossible."""
@@ -133,8 +138,8 @@ class RigidBody:
         if self.suspended:
             response = np.diag([0.0, 1.0 / inertia[1, 1], 0.0])
         object.__setattr__(self, "response", response)
-        object.__setattr__(self, "_response", rows_of(response))
-        object.__setattr__(self, "_inertia", rows_of(inertia))
+        constants = rows_of(inertia), rows_of(response), float(self.dipole_per_ampere), bool(self.suspended)
+        object.__setattr__(self, "constants", constants)
 
     def torquing(
         self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
@@ -153,7 +158,8 @@ class RigidBody:
     @property
     def parameters(self) -> Parameters:
         """The nominal parameters."""
-        return Parameters(self.stiffness * self._response[1][1], self.damping * self._response[1][1])
+        response = self.constants[1][1][1]
+        return Parameters(self.stiffness * response, self.damping * response)
 
     def linearise(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, ahead: float
@@ -163,53 +169,90 @@ class RigidBody:
         The gyroscopic torque is computed for the predicted rate `ahead` seconds later. With the predicted
         rate, the error of the midpoint rule for a tumbling body is of third order per step.
         """
-        x, y, z = times(self._response, self._gyroscopic(rate))
-        rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
-        acceleration, by_parameters = self.accelerate(q, rate, parameters, torquing)
-        field_body = times(matrix(q), torquing.field)
-        (mx, my, mz), (bx, by, bz) = torquing.dipole, field_body
-        dot = mx * bx + my * by + mz * bz
-        # A small rotation e of the body changes m x B by m x (B x e) = B m.e - e m.B.
-        by_rotation = (
-            (bx * mx - dot, bx * my, bx * mz),
-            (by * mx, by * my - dot, by * mz),
-            (bz * mx, bz * my, bz * mz - dot),
-        )
-        parts = zip(by_rotation, self._by_rate(rate), skew(field_body), strict=True)
-        derivatives = self.response @ np.array([(*turned, *spun, *field) for turned, spun, field in parts])
-        by_attitude, by_rate, by_field = derivatives[:, :3], derivatives[:, 3:6], derivatives[:, 6:]
-        torsion, damping, gain = parameters
-        by_attitude *= gain
-        by_attitude[1, 1] -= torsion
-        by_rate[1, 1] -= damping
-        by_current = -gain * self.dipole_per_ampere * by_field
-        return Linearised(acceleration, by_parameters, by_attitude, by_rate, by_current)
+        return _linearised(self.constants, q, rate, parameters, torquing.dipole, torquing.field, ahead)
 
     def accelerate(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing
     ) -> Accelerated:
         """Return the angular acceleration at the attitude `q` for the coil state `torquing`."""
-        torsion, damping, gain = parameters
-        cx, cy, cz = times(self._response, cross(torquing.dipole, times(matrix(q), torquing.field)))
-        fx, fy, fz = times(self._response, self._gyroscopic(rate))
-        angle = twist(q) if self.suspended else 0.0
-        thread = -torsion * angle - damping * rate[1]
-        acceleration = (gain * cx + fx, gain * cy + fy + thread, gain * cz + fz)
-        return Accelerated(acceleration, ((0.0, 0.0, cx), (-angle, -rate[1], cy), (0.0, 0.0, cz)))
-
-    def _gyroscopic(self, rate: Vector) -> Vector:
-        return cross(times(self._inertia, rate), rate)
-
-    def _by_rate(self, rate: Vector) -> Matrix:
-        """Return the derivative of -w x J w with respect to w, which is [J w x] - [w x] J."""
-        (a, b, c), (d, e, f), (g, h, i) = self._inertia
-        x, y, z = rate
-        jx, jy, jz = times(self._inertia, rate)
-        return (
-            (z * d - y * g, -jz + z * e - y * h, jy + z * f - y * i),
-            (jz + x * g - z * a, x * h - z * b, -jx + x * i - z * c),
-            (-jy + y * a - x * d, jx + y * b - x * e, y * c - x * f),
+        return Accelerated(
+            *_accelerated(self.constants, q, rate, parameters, torquing.dipole, torquing.field)
         )
+
+
+@loop_helper
+def _accelerated(
+    body: BodyConstants, q: Quaternion, rate: Vector, parameters: Vector, dipole: Vector, field: Vector
+) -> tuple[Vector, Matrix]:
+    """Return the elements of `Accelerated`. The arguments are those of `RigidBody.accelerate` as tuples."""
+    inertia, response, _, suspended = body
+    torsion, damping, gain = parameters
+    cx, cy, cz = times(response, cross(dipole, times(matrix(q), field)))
+    fx, fy, fz = times(response, cross(times(inertia, rate), rate))
+    angle = twist(q) if suspended else 0.0
+    thread = -torsion * angle - damping * rate[1]
+    acceleration = (gain * cx + fx, gain * cy + fy + thread, gain * cz + fz)
+    return acceleration, ((0.0, 0.0, cx), (-angle, -rate[1], cy), (0.0, 0.0, cz))
+
+
+@loop_helper
+def _ahead(body: BodyConstants, rate: Vector, seconds: float) -> Vector:
+    """Return the rate `seconds` later, predicted from the gyroscopic torque."""
+    x, y, z = times(body[1], cross(times(body[0], rate), rate))
+    return rate[0] + seconds * x, rate[1] + seconds * y, rate[2] + seconds * z
+
+
+@loop_helper
+def _torque_by_attitude(dipole: Vector, field: Vector) -> Matrix:
+    """Return the derivative of the coils' torque with respect to a small rotation of the body.
+
+    A rotation e of the body changes m x B by m x (B x e) = B m.e - e m.B, with the field B in body axes.
+    """
+    (mx, my, mz), (bx, by, bz) = dipole, field
+    dot = mx * bx + my * by + mz * bz
+    return (
+        (bx * mx - dot, bx * my, bx * mz),
+        (by * mx, by * my - dot, by * mz),
+        (bz * mx, bz * my, bz * mz - dot),
+    )
+
+
+@loop_helper
+def _torque_by_rate(inertia: Matrix, rate: Vector) -> Matrix:
+    """Return the derivative of -w x J w with respect to w, which is [J w x] - [w x] J."""
+    (a, b, c), (d, e, f), (g, h, i) = inertia
+    x, y, z = rate
+    jx, jy, jz = times(inertia, rate)
+    return (
+        (z * d - y * g, -jz + z * e - y * h, jy + z * f - y * i),
+        (jz + x * g - z * a, x * h - z * b, -jx + x * i - z * c),
+        (-jy + y * a - x * d, jx + y * b - x * e, y * c - x * f),
+    )
+
+
+def _linearised(
+    body: BodyConstants,
+    q: Quaternion,
+    rate: Vector,
+    parameters: Vector,
+    dipole: Vector,
+    field: Vector,
+    ahead: float,
+) -> Linearised:
+    """Return the result of `RigidBody.linearise`, whose arguments are passed as tuples."""
+    inertia, response, dipole_per_ampere, _ = body
+    rate = _ahead(body, rate, ahead)
+    acceleration, by_parameters = _accelerated(body, q, rate, parameters, dipole, field)
+    field = times(matrix(q), field)
+    parts = zip(_torque_by_attitude(dipole, field), _torque_by_rate(inertia, rate), skew(field), strict=True)
+    derivatives = np.array(response).dot(np.array([(*turned, *spun, *coil) for turned, spun, coil in parts]))
+    by_attitude, by_rate, by_field = derivatives[:, :3], derivatives[:, 3:6], derivatives[:, 6:]
+    torsion, damping, gain = parameters
+    by_attitude *= gain
+    by_attitude[1, 1] -= torsion
+    by_rate[1, 1] -= damping
+    by_current = -gain * dipole_per_ampere * by_field
+    return Linearised(acceleration, by_parameters, by_attitude, by_rate, by_current)
 
 
 LONGEST_STEP = 0.025
@@ -246,13 +289,54 @@ def propagate(
 ) -> tuple[FilterState, FloatArray]:
     """Propagate over `duration` s under one coil command, in steps of at most `longest_step` s."""
     steps = max(1, math.ceil(duration / longest_step - 1e-9))
-    dt = duration / steps
+    steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
+    x, y, z = torquing.driven
+    quaternion, rate, covariance = _propagated(
+        body.constants,
+        state.quaternion,
+        state.rate,
+        state.disturbance,
+        state.parameters[:],  # numba accepts a tuple faster than a NamedTuple
+        torquing.dipole,
+        torquing.field,
+        (noise.current * x + steady, noise.current * y + steady, noise.current * z + steady),
+        noise.rate,
+        noise.walks,
+        covariance,
+        duration / steps,
+        steps,
+    )
+    # The attitudes stored for exposures do not change.
+    return state._replace(quaternion=quaternion, rate=rate), covariance
+
+
+def _propagated_numpy(
+    body: BodyConstants,
+    quaternion: Quaternion,
+    rate: Vector,
+    disturbance: Vector,
+    parameters: Vector,
+    dipole: Vector,
+    field: Vector,
+    currents: Vector,
+    density: FloatArray,
+    walks: FloatArray,
+    covariance: FloatArray,
+    dt: float,
+    steps: int,
+) -> tuple[Quaternion, Vector, FloatArray]:
+    """Return quaternion, rate and covariance (n, n) after `steps` steps of `dt` s.
+
+    The spectral density of the angular acceleration is the sum of `density` (3, 3), rad^2/s^3, and the effect
+    of the coil currents, which have the spectral densities `currents`, A^2 s. The states have the random
+    walks `walks` (19,). The other arguments are those of `propagate` as tuples.
+    """
     half = 0.5 * dt
-    for _ in range(steps):  # midpoint rule; the attitudes stored for exposures do not change
-        wx, wy, wz = state.rate
-        middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
-        model = body.linearise(middle, state.rate, state.parameters, torquing, half)
-        ax, ay, az = (a + d for a, d in zip(model.acceleration, state.disturbance, strict=True))
+    for _ in range(steps):  # midpoint rule
+        wx, wy, wz = rate
+        middle = compose(exponential(half * wx, half * wy, half * wz), quaternion)
+        model = _linearised(body, middle, rate, parameters, dipole, field, half)
+        ax, ay, az = added(model.acceleration, disturbance)
         moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
         # For the attitude error e, the dynamics are e' = -w x e + rate error.
         flow = _FLOW.copy()
@@ -260,26 +344,106 @@ def propagate(
         flow[RATE, ATTITUDE] = model.by_attitude
         flow[RATE, RATE] = model.by_rate
         flow[RATE, PARAMETERS] = model.by_parameters
-        density = _density(noise, model, torquing)
-        covariance = propagated(covariance, flow, dt, density, noise.walks)
-        state = state._replace(
-            quaternion=compose(moved, state.quaternion), rate=(wx + dt * ax, wy + dt * ay, wz + dt * az)
-        )
-    return state, covariance
-
-
-def _density(noise: ProcessNoise, model: Linearised, torquing: Torquing) -> FloatArray:
-    """Return the spectral density (3, 3) of the angular acceleration, rad^2/s^3."""
-    steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
-    weights = [noise.current * driven + steady for driven in torquing.driven]
-    if not any(weights):
-        return noise.rate
-    return np.asarray(noise.rate + (model.by_current * np.array(weights)).dot(model.by_current.T))
+        noise = density
+        if any(currents):
+            noise = density + (model.by_current * np.array(currents)).dot(model.by_current.T)
+        covariance = propagated(covariance, flow, dt, noise, walks)
+        quaternion, rate = compose(moved, quaternion), (wx + dt * ax, wy + dt * ay, wz + dt * az)
+    return quaternion, rate, covariance
 
 
 _FLOW: FloatArray = np.zeros((6, SIZE))
 _FLOW[ATTITUDE, RATE] = np.eye(3)
 _FLOW[RATE, DISTURBANCE] = np.eye(3)
+
+
+@compiled_form_of(_propagated_numpy)
+def _propagated(
+    body: BodyConstants,
+    quaternion: Quaternion,
+    rate: Vector,
+    disturbance: Vector,
+    parameters: Vector,
+    dipole: Vector,
+    field: Vector,
+    currents: Vector,
+    density: FloatArray,
+    walks: FloatArray,
+    covariance: FloatArray,
+    dt: float,
+    steps: int,
+) -> tuple[Quaternion, Vector, FloatArray]:
+    """See `_propagated_numpy`."""
+    inertia, response, dipole_per_ampere, _ = body
+    torsion, damping, gain = parameters
+    half = 0.5 * dt
+    # The first columns of `flow` are attitude, rate, gyro bias, disturbance and parameters.
+    flow, by_current, noise = np.zeros((6, 15)), np.empty((3, 3)), np.empty((3, 3))
+    for _ in range(steps):
+        wx, wy, wz = rate
+        middle = compose(exponential(half * wx, half * wy, half * wz), quaternion)
+        later, coils = _ahead(body, rate, half), times(matrix(middle), field)
+        acceleration, by_parameters = _accelerated(body, middle, later, parameters, dipole, field)
+        ax, ay, az = added(acceleration, disturbance)
+        by_attitude, by_rate = _torque_by_attitude(dipole, coils), _torque_by_rate(inertia, later)
+        across, by_field = skew(rate), skew(coils)
+        for i in range(3):
+            for j in range(3):
+                of_attitude, of_rate, of_field = 0.0, 0.0, 0.0
+                for k in range(3):
+                    of_attitude += response[i][k] * by_attitude[k][j]
+                    of_rate += response[i][k] * by_rate[k][j]
+                    of_field += response[i][k] * by_field[k][j]
+                flow[i, j] = -across[i][j]
+                flow[3 + i, j], flow[3 + i, 3 + j] = gain * of_attitude, of_rate
+                flow[3 + i, 12 + j] = by_parameters[i][j]
+                by_current[i, j] = -gain * dipole_per_ampere * of_field
+            flow[i, 3 + i] = flow[3 + i, 9 + i] = 1.0
+        flow[4, 1] -= torsion
+        flow[4, 4] -= damping
+        for i in range(3):
+            for j in range(3):
+                noise[i, j] = density[i, j]
+                for k in range(3):
+                    noise[i, j] += currents[k] * by_current[i, k] * by_current[j, k]
+        covariance = _propagated_covariance(covariance, flow, dt, noise, walks)
+        moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
+        quaternion, rate = compose(moved, quaternion), (wx + dt * ax, wy + dt * ay, wz + dt * az)
+    return quaternion, rate, covariance
+
+
+@loop_helper
+def _propagated_covariance(
+    covariance: FloatArray, flow: FloatArray, dt: float, noise: FloatArray, walks: FloatArray
+) -> FloatArray:
+    """Return the result of `error_state.propagated`, computed with loops."""
+    rows, size = flow.shape
+    transition, moved = dt * flow, np.zeros((rows, len(covariance)))
+    for i in range(rows):
+        for j in range(size):
+            for k in range(rows):
+                transition[i, j] += 0.5 * dt * dt * flow[i, k] * flow[k, j]
+        transition[i, i] += 1.0
+        for k in range(size):
+            for j in range(len(covariance)):
+                moved[i, j] += transition[i, k] * covariance[k, j]
+    after = covariance.copy()
+    after[:rows], after[:, :rows] = moved, moved.T
+    for i in range(rows):
+        for j in range(rows):
+            among = 0.0
+            for k in range(size):
+                among += moved[i, k] * transition[j, k]
+            after[i, j] = among
+    for i in range(3):
+        for j in range(3):
+            after[i, j] += dt**3 / 3.0 * noise[i, j]
+            after[i, 3 + j] += 0.5 * dt * dt * noise[i, j]
+            after[3 + i, j] += 0.5 * dt * dt * noise[i, j]
+            after[3 + i, 3 + j] += dt * noise[i, j]
+    for i in range(len(walks)):
+        after[i, i] += dt * walks[i]
+    return after
 
 
 _FIRST, _SECOND = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
