@@ -40,10 +40,8 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.estimation.error_state import Weighed, reset, updated, weigh
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
-    DISTURBANCE,
     FIELD_BIAS,
     LATENCY,
-    PARAMETERS,
     SIZE,
     AttitudeMeasurement,
     DirectionMeasurement,
@@ -54,48 +52,12 @@ from knightcube.gnc.estimation.estimate import (
     Parameters,
     RateMeasurement,
 )
-from knightcube.gnc.estimation.rigid_body import Accelerated
+from knightcube.gnc.estimation.rigid_body import RateChange
 
 LONGEST_LATENCY = 0.25
 """Largest plausible age (s) of an inertial unit's sample at its time stamp."""
 
-_ACCELERATIONS = slice(DISTURBANCE.start, PARAMETERS.stop)
-_BY_ACCELERATIONS: FloatArray = np.eye(3, 6)
 _EYE: FloatArray = np.eye(3)
-
-
-class RateChange(NamedTuple):
-    """The angular acceleration (rad/s^2) at the time of a sample, and its uncertainty.
-
-    `uncertainty` (3, 3) rad^2/s^2 is the covariance of the sampled rate due to effects not linear in the age.
-    """
-
-    acceleration: Vector
-    uncertainty: FloatArray
-
-
-def rate_change(
-    before: Accelerated, after: Accelerated, disturbance: Vector, covariance: FloatArray
-) -> RateChange:
-    """Return the angular acceleration at a sample from modelled accelerations before and after the sample.
-
-    The arguments `before` and `after` are the accelerations at two times, which precede and follow the sample
-    by the standard deviation of its age. The two accelerations differ if a coil command begins or ends
-    between their times. Half the difference of the two accelerations, and the product of the errors of age
-    and acceleration, are treated as noise.
-    """
-    pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
-    x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
-    rows = _BY_ACCELERATIONS.copy()
-    rows[:, 3:] = before.by_parameters
-    if after is not before:
-        rows[:, 3:] = 0.5 * (rows[:, 3:] + after.by_parameters)
-    spread = rows.dot(covariance[_ACCELERATIONS, _ACCELERATIONS]).dot(rows.T)
-    if after is not before:
-        bend = 0.5 * (np.array(after.acceleration) - before.acceleration)
-        spread += bend[:, np.newaxis] * bend
-    spread *= covariance[LATENCY, LATENCY]
-    return RateChange((x, y, z), spread)
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:

@@ -30,15 +30,20 @@ from knightcube.gnc.estimation.estimate import (
     RateMeasurement,
 )
 from knightcube.gnc.estimation.mekf import (
-    RateChange,
     correct,
     innovation,
     keep_attitude,
-    rate_change,
     release_attitude,
     weigh_innovation,
 )
-from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
+from knightcube.gnc.estimation.rigid_body import (
+    ProcessNoise,
+    RateChange,
+    RigidBody,
+    Torquing,
+    propagate,
+    rate_change,
+)
 
 
 class CommandHistory:
@@ -198,11 +203,7 @@ class PropagationModel:
         """Return the change of the rate at the time of a gyro sample whose age is estimated."""
         half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
         first, last = self.commands.at(time_ns - half_ns), self.commands.at(time_ns + half_ns)
-        before = self.body.accelerate(state.quaternion, state.rate, state.parameters, first)
-        after = before
-        if last is not first:
-            after = self.body.accelerate(state.quaternion, state.rate, state.parameters, last)
-        return rate_change(before, after, state.disturbance, covariance)
+        return rate_change(self.body, state, covariance, first, last)
 
 
 class Replay:

@@ -46,6 +46,7 @@ from knightcube.gnc.estimation.error_state import propagated
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,
+    LATENCY,
     PARAMETERS,
     RATE,
     SIZE,
@@ -444,6 +445,96 @@ def _propagated_covariance(
     for i in range(len(walks)):
         after[i, i] += dt * walks[i]
     return after
+
+
+class RateChange(NamedTuple):
+    """The angular acceleration (rad/s^2) at the time of a sample, and its uncertainty.
+
+    `uncertainty` (3, 3) rad^2/s^2 is the covariance of the sampled rate due to effects not linear in the age.
+    """
+
+    acceleration: Vector
+    uncertainty: FloatArray
+
+
+def rate_change(
+    body: RigidBody, state: FilterState, covariance: FloatArray, before: Torquing, after: Torquing
+) -> RateChange:
+    """Return the angular acceleration at a gyro sample whose age is uncertain.
+
+    The arguments `before` and `after` are the coil states at two times, which precede and follow the sample
+    by the standard deviation of its age. The two accelerations differ if a coil command begins or ends
+    between their times. Half the difference of the two accelerations, and the product of the errors of age
+    and acceleration, are treated as noise.
+    """
+    coils = before.dipole, before.field, after.dipole, after.field
+    motion = state.quaternion, state.rate, state.disturbance, state.parameters[:]
+    return RateChange(*_rate_change(body.constants, *motion, *coils, covariance))
+
+
+def _rate_change_numpy(
+    body: BodyConstants,
+    quaternion: Quaternion,
+    rate: Vector,
+    disturbance: Vector,
+    parameters: Vector,
+    dipole: Vector,
+    field: Vector,
+    later_dipole: Vector,
+    later_field: Vector,
+    covariance: FloatArray,
+) -> tuple[Vector, FloatArray]:
+    """Return the elements of `RateChange`. The arguments are those of `rate_change` as tuples."""
+    before, by_before = _accelerated(body, quaternion, rate, parameters, dipole, field)
+    after, by_after = before, by_before
+    if (later_dipole, later_field) != (dipole, field):
+        after, by_after = _accelerated(body, quaternion, rate, parameters, later_dipole, later_field)
+    x, y, z = (0.5 * (a + b) + d for a, b, d in zip(before, after, disturbance, strict=True))
+    rows = _BY_ACCELERATIONS.copy()
+    rows[:, 3:] = by_before
+    if after is not before:
+        rows[:, 3:] = 0.5 * (rows[:, 3:] + by_after)
+    spread = rows.dot(covariance[_ACCELERATIONS, _ACCELERATIONS]).dot(rows.T)
+    if after is not before:
+        bend = 0.5 * (np.array(after) - before)
+        spread += bend[:, np.newaxis] * bend
+    spread *= covariance[LATENCY, LATENCY]
+    return (x, y, z), spread
+
+
+_ACCELERATIONS = slice(DISTURBANCE.start, PARAMETERS.stop)
+_BY_ACCELERATIONS: FloatArray = np.eye(3, 6)
+
+
+@compiled_form_of(_rate_change_numpy)
+def _rate_change(
+    body: BodyConstants,
+    quaternion: Quaternion,
+    rate: Vector,
+    disturbance: Vector,
+    parameters: Vector,
+    dipole: Vector,
+    field: Vector,
+    later_dipole: Vector,
+    later_field: Vector,
+    covariance: FloatArray,
+) -> tuple[Vector, FloatArray]:
+    """See `_rate_change_numpy`. The states 9 to 15 are disturbance, parameters and age."""
+    before, by_before = _accelerated(body, quaternion, rate, parameters, dipole, field)
+    after, by_after = _accelerated(body, quaternion, rate, parameters, later_dipole, later_field)
+    rows, spread = np.eye(3, 6), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            rows[i, 3 + j] = 0.5 * (by_before[i][j] + by_after[i][j])
+    for i in range(3):
+        for j in range(3):
+            total = 0.25 * (after[i] - before[i]) * (after[j] - before[j])
+            for k in range(6):
+                for m in range(6):
+                    total += rows[i, k] * covariance[9 + k, 9 + m] * rows[j, m]
+            spread[i, j] = covariance[15, 15] * total
+    x, y, z = added(before, after)
+    return added((0.5 * x, 0.5 * y, 0.5 * z), disturbance), spread
 
 
 _FIRST, _SECOND = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)

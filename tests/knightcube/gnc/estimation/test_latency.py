@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from knightcube.astro.quaternion import angle_about_axis_y
+from knightcube.astro.quaternion import angle_about_axis_y, exponential
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
-from knightcube.gnc.estimation.estimate import LATENCY, Estimate, RateMeasurement
-from knightcube.gnc.estimation.mekf import LONGEST_LATENCY, rate_change
+from knightcube.gnc.estimation.estimate import LATENCY, Estimate, FilterState, Parameters, RateMeasurement
+from knightcube.gnc.estimation.mekf import LONGEST_LATENCY
+from knightcube.gnc.estimation.rigid_body import rate_change
 from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, SUSPENDED, Flight, fly
 from tests.support.consistency_worlds import CYCLE_NS
 
@@ -96,19 +97,13 @@ def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
 
     The noise is half the step of the acceleration per sigma of the age, and zero without a step.
     """
-    state = AttitudeFilter(SUSPENDED, ESTIMATING)
-    flight = fly(14, 1, True)
-    state.start(*flight.samples[0])
-    now = state.at(0)
-    quaternion = tuple(now.quaternion.tolist())
-    off, on = (
-        SUSPENDED.accelerate(quaternion, (0.0, 0.0, 0.0), now.parameters, SUSPENDED.torquing(currents))
-        for currents in (np.zeros(3), np.array([0.1, 0.0, 0.0]))
-    )
+    none = (0.0, 0.0, 0.0)
+    now = FilterState(exponential(0.0, 0.4, 0.0), none, none, none, Parameters())
+    off, on = (SUSPENDED.torquing(currents) for currents in (np.zeros(3), np.array([0.1, 0.0, 0.0])))
+    step = SUSPENDED.accelerate(now.quaternion, now.rate, now.parameters, on).acceleration[1]
     covariance = np.zeros((16, 16))
     covariance[LATENCY, LATENCY] = 0.01**2
-    found = rate_change(off, on, (0.0, 0.0, 0.0), covariance)
-    step = on.acceleration[1]
+    found = rate_change(SUSPENDED, now, covariance, off, on)
     assert found.acceleration[1] == pytest.approx(0.5 * step)
     assert found.uncertainty[1, 1] == pytest.approx((0.01 * 0.5 * step) ** 2)
-    assert not rate_change(on, on, (0.0, 0.0, 0.0), covariance).uncertainty.any()
+    assert not rate_change(SUSPENDED, now, covariance, on, on).uncertainty.any()

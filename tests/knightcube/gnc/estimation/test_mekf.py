@@ -25,14 +25,13 @@ from knightcube.gnc.estimation.estimate import (
     RateMeasurement,
 )
 from knightcube.gnc.estimation.mekf import (
-    RateChange,
     correct,
     innovation,
     keep_attitude,
     release_attitude,
     weigh_innovation,
 )
-from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
+from knightcube.gnc.estimation.rigid_body import ProcessNoise, RateChange, RigidBody, Torquing, propagate
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 
