@@ -34,8 +34,8 @@ _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 """LLVM options for functions that loop forms call: any order of sums, which permits vector instructions."""
 _COMPILING = (
-    "numba compiles the star tracker and the streak fit for this machine; this takes up to a minute, once "
-    f"({_SWITCH}=0 avoids it)"
+    "numba compiles the star tracker, the streak fit and the attitude filter for this machine; this takes up "
+    f"to a minute, once ({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []
 """Functions that loop forms call and that are not yet registered for compilation by numba."""
@@ -93,16 +93,18 @@ def compiled_form_of(
 ) -> Callable[[Callable[Parameters, Result]], HotFunction[Parameters, Result]]:
     """Return the decorator that combines a loop form with its numpy form.
 
-    The loop form has only positional arguments, which are arrays and numbers. The loop form may call only
-    numpy functions that numba supports, and functions of the same module that `loop_helper` decorates. The
-    loop form must not use constants of other modules: numba compiles a cached function again only if the
-    function's own module changes, so the cached function would keep an outdated constant.
+    The loop form has only positional arguments, which are arrays, numbers and tuples of numbers. The loop
+    form may call only numpy functions that numba supports, functions of the same module that `loop_helper`
+    decorates, and the quaternion algebra of `knightcube.astro.quaternion`. The loop form must not use
+    constants or functions of other modules: numba compiles a cached function again only if the function's own
+    module changes, so the cached function would keep an outdated constant. The quaternion algebra is exempt
+    because its formulas do not change.
     """
     return lambda loop_form: HotFunction(numpy_form, loop_form)
 
 
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Return `function` unchanged, after marking it for compilation with the loop forms of the same module.
+    """Return `function` unchanged, after marking it for compilation with the loop forms that call it.
 
     A loop form is a function with plain Python loops that numba compiles, and may call marked functions. The
     compiled form of a marked function may compute sums in any order.

@@ -37,11 +37,13 @@ from knightcube.astro.quaternion import (
     times,
     twist,
 )
-from knightcube.gnc.estimation.error_state import Weighed, reset, updated, weigh
+from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.gnc.estimation.error_state import reset, updated, weigh
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     FIELD_BIAS,
     LATENCY,
+    RATE,
     SIZE,
     AttitudeMeasurement,
     DirectionMeasurement,
@@ -176,33 +178,181 @@ def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
     return rows
 
 
-def weigh_innovation(found: Innovation, covariance: FloatArray) -> Weighed:
-    """Return the optimal gain for an innovation and the covariance of the state."""
-    return weigh(covariance, np.array(found.value), found.rows, found.noise)
+class Correction(NamedTuple):
+    """The result of a correction, without changes of state and covariance if the measurement is rejected.
+
+    `square` is the normalised squared innovation, `spread` (k, k) is the covariance of the innovation, and
+    the flag `used` is whether the measurement passed the gate.
+    """
+
+    state: FilterState
+    covariance: FloatArray
+    square: float
+    spread: FloatArray
+    used: bool
 
 
 def correct(
-    state: FilterState, covariance: FloatArray, found: Innovation, weighed: Weighed
-) -> tuple[FilterState, FloatArray]:
-    """Return corrected state and covariance. The gain `weighed.gain` need not be optimal."""
-    error = weighed.gain.dot(found.value).tolist()
-    covariance = updated(covariance, weighed.gain, weighed.cross, weighed.spread)
-    for first in (0, *range(SIZE, len(covariance), 3)):
-        reset(covariance, slice(first, first + 3), error[first : first + 3])
-    corrected = FilterState(
-        compose(exponential(*error[0:3]), state.quaternion),
-        added(state.rate, error[3:6]),
-        added(state.bias, error[6:9]),
-        added(state.disturbance, error[9:12]),
-        Parameters(*added(state.parameters, error[12:15])),
+    state: FilterState,
+    covariance: FloatArray,
+    found: Innovation,
+    gate: float = math.inf,
+    rate_gate: float = math.inf,
+    *,
+    considers_age: bool = False,
+) -> Correction:
+    """Correct a state by an innovation whose normalised square is at most `gate`.
+
+    Above `rate_gate`, only the rate is corrected. If `considers_age` is true, the age of the inertial unit's
+    samples is not corrected. The gain may then differ from the optimal gain, because the covariance update is
+    valid for any gain.
+    """
+    value, rows, noise = found
+    used, square, error, covariance, spread = _corrected(
+        covariance, np.array(value), rows, noise, gate, rate_gate, considers_age
+    )
+    if used:
+        state = _moved(state, error.tolist())
+    return Correction(state, covariance, square, spread, used)
+
+
+def _moved(state: FilterState, error: list[float]) -> FilterState:
+    """Return the state corrected by an estimated error (n,)."""
+    a, b, c, wx, wy, wz, bx, by, bz, dx, dy, dz, torsion, damping, gain, age, fx, fy, fz = error[:SIZE]
+    return FilterState(
+        compose(exponential(a, b, c), state.quaternion),
+        added(state.rate, (wx, wy, wz)),
+        added(state.bias, (bx, by, bz)),
+        added(state.disturbance, (dx, dy, dz)),
+        Parameters(*added(state.parameters, (torsion, damping, gain))),
         tuple(
             (measurement, compose(exponential(*error[first : first + 3]), quaternion))
             for first, (measurement, quaternion) in zip(range(SIZE, len(error), 3), state.kept, strict=True)
         ),
-        state.latency + error[LATENCY],
-        added(state.field_bias, error[FIELD_BIAS]),
+        state.latency + age,
+        added(state.field_bias, (fx, fy, fz)),
     )
-    return corrected, covariance
+
+
+def _corrected_numpy(
+    covariance: FloatArray,
+    value: FloatArray,
+    rows: FloatArray,
+    noise: FloatArray,
+    gate: float,
+    rate_gate: float,
+    considers_age: bool,
+) -> tuple[bool, float, FloatArray, FloatArray, FloatArray]:
+    """Return whether the innovation passed the gate, its normalised square, the error, and two covariances.
+
+    The error (n,) and the covariance (n, n) are those of the states; the other covariance (k, k) is that of
+    the innovation. The error is zero if the innovation did not pass. The arguments are those of `correct`.
+    """
+    square, gain, cross, spread = weigh(covariance, value, rows, noise)
+    if not 0.0 <= square <= gate:  # a NaN does not pass
+        return False, square, np.zeros(len(covariance)), covariance, spread
+    if square > rate_gate:
+        rate_gain = np.zeros_like(gain)
+        rate_gain[RATE] = gain[RATE]
+        gain = rate_gain
+    elif considers_age:
+        gain[LATENCY] = 0.0
+    error = gain.dot(value)
+    covariance = updated(covariance, gain, cross, spread)
+    for first in (0, *range(SIZE, len(covariance), 3)):
+        reset(covariance, slice(first, first + 3), error[first : first + 3].tolist())
+    return True, square, error, covariance, spread
+
+
+@compiled_form_of(_corrected_numpy)
+def _corrected(
+    covariance: FloatArray,
+    value: FloatArray,
+    rows: FloatArray,
+    noise: FloatArray,
+    gate: float,
+    rate_gate: float,
+    considers_age: bool,
+) -> tuple[bool, float, FloatArray, FloatArray, FloatArray]:
+    """See `_corrected_numpy`. The states 3 to 5 are the rate, and state 15 is the age."""
+    size, count = len(covariance), len(value)
+    cross, spread = _weighed(covariance, rows, noise)
+    gain, error = np.zeros((size, count)), np.zeros(size)
+    weight = _inverse(spread)
+    square = 0.0
+    for k in range(count):
+        for m in range(count):
+            square += value[k] * weight[k, m] * value[m]
+    if not 0.0 <= square <= gate:
+        return False, square, error, covariance.copy(), spread
+    for i in range(size):
+        if (i != 15 or not considers_age) if square <= rate_gate else 3 <= i < 6:
+            for k in range(count):
+                for m in range(count):
+                    gain[i, k] += cross[i, m] * weight[m, k]
+                error[i] += gain[i, k] * value[k]
+    return True, square, error, _updated(covariance, gain, cross, spread, error), spread
+
+
+@loop_helper
+def _weighed(covariance: FloatArray, rows: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the elements `cross` and `spread` of the result of `error_state.weigh`."""
+    count, size = rows.shape
+    cross, spread = np.zeros((size, count)), noise.copy()
+    for k in range(count):
+        for j in range(size):
+            if rows[k, j] != 0.0:
+                for i in range(size):
+                    cross[i, k] += covariance[i, j] * rows[k, j]
+    for k in range(count):
+        for m in range(count):
+            for j in range(size):
+                spread[k, m] += rows[k, j] * cross[j, m]
+    return cross, spread
+
+
+@loop_helper
+def _inverse(spread: FloatArray) -> FloatArray:
+    """Return the inverse of a symmetric matrix (k, k), where k is at most 3, padded to (3, 3)."""
+    s = np.eye(3)
+    s[: len(spread), : len(spread)] = spread
+    a, b, c, d, e, f = s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2]
+    ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    cd, ce, cf = a * f - c * c, b * c - a * e, a * d - b * b
+    return np.asarray(np.array(((ca, cb, cc), (cb, cd, ce), (cc, ce, cf))) / (a * ca + b * cb + c * cc))
+
+
+@loop_helper
+def _updated(
+    covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread: FloatArray, error: FloatArray
+) -> FloatArray:
+    """Return the result of `error_state.updated`, and of `error_state.reset` for each attitude error."""
+    size, count = gain.shape
+    reduced, after = cross.copy(), np.empty((size, size))
+    for i in range(size):
+        for k in range(count):
+            for m in range(count):
+                reduced[i, k] -= 0.5 * gain[i, m] * spread[m, k]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.5 * (covariance[i, j] + covariance[j, i])
+            for k in range(count):
+                total -= gain[i, k] * reduced[j, k] + gain[j, k] * reduced[i, k]
+            after[i, j] = after[j, i] = total
+    for place in range(16, size, 3):  # the present attitude, then the attitudes stored for exposures
+        first = place if place >= 19 else 0
+        _rotate(after[first : first + 3], error[first : first + 3])
+        _rotate(after[:, first : first + 3].T, error[first : first + 3])
+    return after
+
+
+@loop_helper
+def _rotate(rows: FloatArray, correction: FloatArray) -> None:
+    """Rotate attitude errors `rows` (3, n) in place by half the rotation vector `correction` (3,)."""
+    x, y, z = 0.5 * correction[0], 0.5 * correction[1], 0.5 * correction[2]
+    for j in range(rows.shape[1]):
+        a, b, c = rows[0, j], rows[1, j], rows[2, j]
+        rows[0, j], rows[1, j], rows[2, j] = a + z * b - y * c, b - z * a + x * c, c + y * a - x * b
 
 
 def keep_attitude(

@@ -21,7 +21,6 @@ from knightcube.astro import chi_square
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.gnc.estimation.estimate import (
     LATENCY,
-    RATE,
     SIZE,
     Estimate,
     FilterState,
@@ -34,7 +33,6 @@ from knightcube.gnc.estimation.mekf import (
     innovation,
     keep_attitude,
     release_attitude,
-    weigh_innovation,
 )
 from knightcube.gnc.estimation.rigid_body import (
     ProcessNoise,
@@ -242,36 +240,23 @@ class Replay:
             self._state, self._covariance = keep_attitude(self._state, self._covariance, exposure)
         self._propagate_to(measurement.time_ns)
         state, covariance = self._state, self._covariance
-        is_rate = isinstance(measurement, RateMeasurement)
-        change = None
-        if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
-            change = model.rate_change(state, covariance, measurement.time_ns)
+        change, rate_gate = None, math.inf
+        if isinstance(measurement, RateMeasurement):
+            if measurement.latency is not None:
+                change = model.rate_change(state, covariance, measurement.time_ns)
+            if model.noise.unknown_current:
+                rate_gate = _RATE_ONLY[1 if model.body.suspended else 3]
         found = innovation(state, measurement, model.body.suspended, change)
-        weighed = weigh_innovation(found, covariance)
-        used = 0.0 <= weighed.square <= model.gate[len(found.value)]  # a NaN does not pass
-        # The gain may differ from the optimal gain, because the covariance update is valid for any gain.
-        if is_rate and model.noise.unknown_current and weighed.square > _RATE_ONLY[len(found.value)]:
-            rate_gain = np.zeros_like(weighed.gain)
-            rate_gain[RATE] = weighed.gain[RATE]
-            weighed = weighed._replace(gain=rate_gain)
-        elif change is not None:
-            weighed.gain[LATENCY] = 0.0  # considered, not estimated
-        if used:
-            state, covariance = correct(state, covariance, found, weighed)
+        gate, is_aged = model.gate[len(found.value)], change is not None
+        done = correct(state, covariance, found, gate, rate_gate, considers_age=is_aged)
+        state, covariance = done.state, done.covariance
         if isinstance(measurement, MeanRateMeasurement):
             state, covariance = release_attitude(state, covariance, measurement)
         self._state, self._covariance = state, covariance
         alone = state._replace(kept=()) if state.kept else state
+        own = covariance[:SIZE, :SIZE].copy() if state.kept else covariance
         self.checkpoints.append(
-            Checkpoint(
-                measurement,
-                used,
-                alone,
-                covariance[:SIZE, :SIZE],
-                weighed.square,
-                found.value,
-                weighed.spread,
-            )
+            Checkpoint(measurement, done.used, alone, own, done.square, found.value, done.spread)
         )
 
     def _propagate_to(self, time_ns: int) -> None:

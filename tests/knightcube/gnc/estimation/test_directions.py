@@ -21,7 +21,7 @@ from knightcube.gnc.estimation.estimate import (
     FilterState,
     Measurement,
 )
-from knightcube.gnc.estimation.mekf import correct, innovation, weigh_innovation
+from knightcube.gnc.estimation.mekf import correct, innovation
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow
 from tests.support.consistency_worlds import CYCLE_NS
@@ -80,7 +80,7 @@ def test_a_direction_says_nothing_of_the_turn_about_itself() -> None:
     seen = direction(as_array(STATE), off=1e-4)
     found = innovation(STATE, seen, False)
     covariance = np.eye(SIZE)
-    state, narrowed = correct(STATE, covariance, found, weigh_innovation(found, covariance))
+    state, narrowed = correct(STATE, covariance, found)[:2]
     along = attitude_matrix(as_array(state)) @ REFERENCE
     np.testing.assert_allclose(along, seen.observed, atol=1e-6)
     assert along @ narrowed[ATTITUDE, ATTITUDE] @ along == pytest.approx(1.0, abs=1e-3)
@@ -93,7 +93,7 @@ def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
     wide = replace(seen, covariance=seen.covariance + np.outer(seen.observed, seen.observed))
     covariance = 1e-4 * np.eye(SIZE)
     squares = [
-        weigh_innovation(innovation(STATE, measurement, False), covariance).square
+        correct(STATE, covariance, innovation(STATE, measurement, False)).square
         for measurement in (seen, wide)
     ]
     assert squares[0] > 0.01
@@ -116,7 +116,7 @@ def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
         covariance = np.eye(SIZE)
         for measurement in seen:
             found = innovation(state, measurement, False)
-            state, covariance = correct(state, covariance, found, weigh_innovation(found, covariance))
+            state, covariance = correct(state, covariance, found)[:2]
     fix = weighted_fit([VectorObservation(m.observed, m.reference, m.covariance) for m in seen])
     assert float(angle_between(as_array(state), fix.quaternion)) < 2e-2 * SIGMA
     np.testing.assert_allclose(covariance[ATTITUDE, ATTITUDE], fix.covariance, atol=0.02 * SIGMA**2)

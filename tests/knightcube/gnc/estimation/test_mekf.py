@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +18,7 @@ from knightcube.astro.quaternion import (
     skew,
 )
 from knightcube.gnc.estimation.estimate import (
+    LATENCY,
     SIZE,
     AttitudeMeasurement,
     FilterState,
@@ -25,15 +27,16 @@ from knightcube.gnc.estimation.estimate import (
     RateMeasurement,
 )
 from knightcube.gnc.estimation.mekf import (
+    _corrected,
     correct,
     innovation,
     keep_attitude,
     release_attitude,
-    weigh_innovation,
 )
 from knightcube.gnc.estimation.rigid_body import ProcessNoise, RateChange, RigidBody, Torquing, propagate
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
+from tests.support.compiled_forms import assert_forms_agree
 
 STILL = ProcessNoise(0.0, np.zeros((3, 3)), np.zeros(SIZE))
 TORQUING = FREE.torquing(np.array([0.1, -0.08, 0.05]))
@@ -176,7 +179,7 @@ def test_correcting_by_an_exact_attitude_gives_that_attitude() -> None:
     exact = AttitudeMeasurement(0, np.array(target), 1e-20 * np.eye(3))
     found = innovation(STATE, exact, False)
     covariance = 1e-2 * np.eye(SIZE)
-    state, covariance = correct(STATE, covariance, found, weigh_innovation(found, covariance))
+    state, covariance = correct(STATE, covariance, found)[:2]
     np.testing.assert_allclose(difference(state, STATE)[:3], (0.02, -0.03, 0.01), atol=1e-12)
     assert np.all(np.diag(covariance)[:3] < 1e-19)
 
@@ -200,8 +203,31 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
         else:
             measured = np.array(state.rate) + np.array(state.bias)
             found = innovation(state, RateMeasurement(0, measured, size * np.eye(3)), False)
-        state, covariance = correct(state, covariance, found, weigh_innovation(found, covariance))
+        state, covariance = correct(state, covariance, found)[:2]
         state, covariance = propagate(FREE, noise, state, covariance, TORQUING, 0.025)
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-12 * covariance.max())
         scale = np.sqrt(np.diag(covariance))
         assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > -1e-9
+
+
+@pytest.mark.parametrize("components", [1, 2, 3])
+def test_a_correction_computed_with_loops_equals_the_correction_computed_with_numpy(components: int) -> None:
+    """All states, all states but the age, only the rate, or no state is corrected."""
+    rng = np.random.default_rng(62)
+    root = rng.normal(0.0, 0.1, (SIZE + 6, SIZE + 6))
+    value, noise = rng.normal(0.0, 0.1, components), 0.1 * np.eye(components) + 0.01
+    for size in (SIZE, SIZE + 3, SIZE + 6):
+        covariance, rows = (root @ root.T)[:size, :size].copy(), rng.normal(0.0, 1.0, (components, size))
+        seen = covariance, value, rows, noise
+        for gate, rate_gate, considers_age, first in (
+            (np.inf, np.inf, False, 0),
+            (np.inf, np.inf, True, 0),
+            (np.inf, 0.0, False, 3),
+            (0.0, np.inf, False, None),
+        ):
+            used, _, error, _, _ = _corrected.numpy_form(*seen, gate, rate_gate, considers_age)
+            changed = np.flatnonzero(error).tolist()
+            assert changed[:1] == ([] if first is None else [first])
+            assert used is (first is not None)
+            assert (LATENCY in changed) is (used and not considers_age and not first)
+            assert_forms_agree(_corrected, *seen, gate, rate_gate, considers_age, relative=1e-12)

@@ -19,9 +19,10 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import Parameters
-from knightcube.gnc.estimation.rigid_body import RigidBody
+from knightcube.gnc.estimation.rigid_body import RigidBody, _propagated, _rate_change
 from knightcube.gnc.guidance.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.flights import FREE
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
 
 SKEWED: FloatArray = np.array([[1.1, 0.05, -0.03], [0.05, 1.05, 0.02], [-0.03, 0.02, 0.99]]) * 1e-3
@@ -104,3 +105,20 @@ def test_it_refuses_what_no_body_has(inertia: FloatArray, changes: dict[str, flo
     arguments = {"dipole_per_ampere": DIPOLE, "field": TESTBED_FIELD} | changes
     with pytest.raises(UsageError):
         RigidBody(inertia, **arguments)  # type: ignore[arg-type]  # a table of mistakes
+
+
+@pytest.mark.parametrize("suspended", [False, True])
+def test_the_steps_of_the_loop_forms_equal_those_of_the_numpy_forms(suspended: bool) -> None:
+    """Two propagation steps with a stored attitude and the rate change between two commands are compared."""
+    rng = np.random.default_rng(61)
+    body = RigidBody(SKEWED, DIPOLE, FIELD, suspended)
+    q = exponential(0.0, 0.7, 0.0) if suspended else Q
+    root, (x, y, z) = rng.normal(0.0, 0.1, (22, 22)), rng.normal(0.0, 0.01, 3).tolist()
+    driven, idle = body.torquing(CURRENTS), body.torquing(np.zeros(3))
+    motion = body.constants, q, RATE, (x, y, z), (0.01, 0.002, 0.9)
+    covariance, density, walks = root @ root.T, np.diag([1e-6, 2e-6, 3e-6]), rng.uniform(0.0, 1e-6, 19)
+    for torquing, currents in ((driven, (1e-2, 2e-2, 3e-2)), (idle, (0.0, 0.0, 0.0))):
+        coils = torquing.dipole, torquing.field
+        noise = currents, density, walks
+        assert_forms_agree(_propagated, *motion, *coils, *noise, covariance, 0.02, 2, relative=1e-12)
+        assert_forms_agree(_rate_change, *motion, *coils, idle.dipole, idle.field, covariance, relative=1e-12)
