@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -37,8 +37,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.settings import PowerTruth
-from sim_hal.worlds.orbit import sun_position
-from sim_hal.worlds.world import OrbitingWorld, utc_date
+from sim_hal.worlds.world import OrbitingWorld
 
 PERIOD_NS = 250_000_000
 """Time step (ns) of the power system, less than the recording time of the coils' supply current."""
@@ -168,6 +167,9 @@ LAMP = 0.2
 """Irradiance of a halogen lamp at a short distance, relative to sunlight."""
 _RINGS, _SPOKES = 16, 32
 """Numbers of rings and of radial directions of the sampling points on the visible ground."""
+_DISTANCE_STEP = 100.0
+"""Step (m) to which the distance from the centre of the Earth is rounded for the visible ground. The rounding
+changes the reflected light by less than 0.02 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,13 +212,31 @@ class SolarCellsModel:
         """
         to_sun = sun - position
         distance = float(np.linalg.norm(to_sun))
-        share = float(sunlit_share(position, sun)) * (ASTRONOMICAL_UNIT / distance) ** 2
+        light = float(sunlit_share(position, sun)) * (ASTRONOMICAL_UNIT / distance) ** 2
+        return self.currents_in_light(position, to_sun / distance, light, body, generator)
+
+    def currents_in_light(
+        self,
+        position: FloatArray,
+        to_sun: FloatArray,
+        light: float,
+        body: FloatArray,
+        generator: np.random.Generator,
+    ) -> FloatArray:
+        """Return the currents (n,), A, as `currents` does, in sunlight of known direction and intensity.
+
+        `to_sun` (3,) is the direction to the Sun, ICRS, and `light` the intensity of the sunlight relative to
+        that at one astronomical unit, 0 in the umbra.
+        """
         normals = self.normals @ body
-        light = share * self._accepted(normals @ to_sun / distance)
-        rays, ground, solid = _ground_in_view(position)
-        lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
-        earthlight = self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit)
-        return self._produced(light + earthlight, generator)
+        sunlight = light * self._accepted(normals @ to_sun)
+        distance = math.hypot(*position.tolist())
+        rays, ground, solid = _ground_in_view(round(distance / _DISTANCE_STEP))
+        down = -position / distance
+        local = np.vstack([tangent_basis(down), down])
+        lit = np.maximum(ground @ (local @ to_sun), 0.0)
+        earthlight = self._accepted(normals @ local.T @ rays.T) @ (self.albedo / np.pi * solid * lit)
+        return self._produced(sunlight + earthlight, generator)
 
     def in_lamplight(self, lamp: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return the currents (n,), A, while a lamp shines onto the panel with the normal `lamp` (3,)."""
@@ -236,22 +256,24 @@ class SolarCellsModel:
         return np.asarray(np.maximum(dimmed, 0.0))
 
 
-def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+@lru_cache(maxsize=8)
+def _ground_in_view(steps: int) -> tuple[FloatArray, FloatArray, float]:
     """Return directions (m, 3) to ground points, unit verticals (m, 3) at these points, and a solid angle.
 
-    The directions sample the visible disc of the Earth in rings of equal solid angle. The returned solid
-    angle (sr) is the part of the disc that each direction represents.
+    The distance from the centre of the Earth is `steps` times `_DISTANCE_STEP`. The third axis of the vectors
+    points to the centre of the Earth. The directions sample the visible disc of the Earth in rings of equal
+    solid angle. The returned solid angle (sr) is the part of the disc that each direction represents.
     """
-    distance = float(np.linalg.norm(position))
-    down = -position / distance
+    distance = steps * _DISTANCE_STEP
     widest = math.sqrt(1.0 - (EARTH_RADIUS / distance) ** 2)
     cosine = 1.0 - (np.arange(_RINGS) + 0.5) / _RINGS * (1.0 - widest)
     sine = np.sqrt(1.0 - cosine**2)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
-    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(down)
-    rays = cosine[:, None, None] * down + sine[:, None, None] * spokes
+    rays = np.empty((_RINGS, _SPOKES, 3))
+    rays[..., 0], rays[..., 1] = np.outer(sine, np.cos(angle)), np.outer(sine, np.sin(angle))
+    rays[..., 2] = cosine[:, None]
     length = distance * cosine - np.sqrt(EARTH_RADIUS**2 - (distance * sine) ** 2)
-    ground = (position + length[:, None, None] * rays) / EARTH_RADIUS
+    ground = (length[:, None, None] * rays - [0.0, 0.0, distance]) / EARTH_RADIUS
     return rays.reshape(-1, 3), ground.reshape(-1, 3), 2.0 * np.pi * (1.0 - widest) / (_RINGS * _SPOKES)
 
 
@@ -373,5 +395,5 @@ class EmulatedSolarCells:
             return self._model.in_lamplight(self.lamp, self._generator)
         body = quaternion.attitude_matrix(self._world.motion(now_ns).quaternion)
         around = self._world.surroundings()
-        sun = sun_position(utc_date(self._world))
-        return self._model.currents(np.array(around.position), sun, body, self._generator)
+        position, to_sun = np.array(around.position), np.array(around.sun)
+        return self._model.currents_in_light(position, to_sun, around.light, body, self._generator)

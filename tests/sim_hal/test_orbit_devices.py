@@ -355,6 +355,20 @@ def test_the_noise_of_the_solar_strings_has_the_configured_standard_deviation(in
     assert np.std(lit) == pytest.approx(3e-3, rel=0.25)
 
 
+@pytest.mark.parametrize("altitude", [350e3, 550e3, 1200e3])
+def test_the_light_of_the_ground_changes_by_less_than_a_part_in_5000_over_100_m(altitude: float) -> None:
+    """The simulation rounds the distance to 100 m, so the rounding errs by half of this change."""
+    model = SolarCellsModel(np.concatenate([np.eye(3), -np.eye(3)]), np.ones(6), np.zeros(6), noise=0.0)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        up, sun = (quaternion.normalise(rng.standard_normal(3)) for _ in range(2))
+        low, high = (
+            model.currents_in_light((EARTH_RADIUS + altitude + step) * up, sun, 0.0, np.eye(3), rng)
+            for step in (0.0, 100.0)
+        )
+        np.testing.assert_allclose(low, high, rtol=2e-4, atol=1e-5)
+
+
 def test_a_scheduled_fault_unplugs_the_serial_port_so_that_the_driver_is_refused() -> None:
     section = reader.replace(demo_world(), faults=(FaultEntry(fault="imu: unplugged @ 0.1 for 0.2"),))
     lock = build_lockstep(demo_config(10.0, camera=False), section, None, SimClock())
