@@ -25,6 +25,7 @@ not raise an alarm.
 from __future__ import annotations
 
 import bisect
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -63,6 +64,8 @@ _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
 """Largest accepted mean innovation of the gyro, in standard deviations, by the number of averaged samples. A
 strong coil fault is detected in one gyro sample, a weak coil fault only in the mean of many samples. In
 flights without a fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
+_SUMS = {count: limit * math.sqrt(count) for count, limit in _DEPARTURES.items()}
+"""Largest accepted sum of innovations of the gyro, in standard deviations, by the number of samples."""
 _BEFORE_NS = 500_000_000
 """Time (ns), before the first contradictory sample, during which the currents are also treated as unknown. A
 weak fault affects the other states of the filter before it is detected. Treating the currents before the
@@ -118,18 +121,18 @@ class CommandCheck:
             self._test_recovery(newest.state, rate)
             return None
         assert newest.variance is not None  # only the first checkpoint has no variance
-        spreads = [math.sqrt(variance) for variance in newest.variance.diagonal().tolist()]
-        departure = [value / spread for value, spread in zip(newest.innovation, spreads, strict=True)]
+        variances = newest.variance.diagonal().tolist()
+        departure = [y / math.sqrt(s) for y, s in zip(newest.innovation, variances, strict=True)]
         largest = _DEPARTURES[1] * self._scale
         if not all(abs(value) <= largest for value in departure) and not self._explains(newest):
             return None
         self._departures.append((newest.time_ns, [value / self._scale for value in departure]))
         size = min(sum(value * value for value in departure) / len(departure), _DEPARTURES[1] ** 2)
         self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
-        recent = [value for _, value in reversed(self._departures)]
-        for count, limit in _DEPARTURES.items():
-            sums = map(sum, zip(*recent[:count], strict=True))
-            if count <= len(recent) and any(abs(total) > limit * math.sqrt(count) for total in sums):
+        newest_first = zip(*(value for _, value in reversed(self._departures)), strict=True)
+        totals = [list(itertools.accumulate(axis)) for axis in newest_first]
+        for count, limit in _SUMS.items():
+            if count <= len(self._departures) and any(abs(total[count - 1]) > limit for total in totals):
                 since_ns = self._departures[-count][0] - _BEFORE_NS
                 self.active = True
                 self._forget()

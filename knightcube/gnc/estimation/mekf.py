@@ -27,7 +27,6 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import (
     Vector,
-    added,
     compose,
     exponential,
     inverse,
@@ -218,19 +217,20 @@ def correct(
 
 def _moved(state: FilterState, error: list[float]) -> FilterState:
     """Return the state corrected by an estimated error (n,)."""
-    a, b, c, wx, wy, wz, bx, by, bz, dx, dy, dz, torsion, damping, gain, age, fx, fy, fz = error[:SIZE]
+    q, (wx, wy, wz), (bx, by, bz), (dx, dy, dz), (torsion, damping, gain), kept, age, (fx, fy, fz) = state
+    if kept:
+        turns = (exponential(*error[first : first + 3]) for first in range(SIZE, len(error), 3))
+        kept = tuple((m, compose(turn, then)) for turn, (m, then) in zip(turns, kept, strict=True))
+    e = error
     return FilterState(
-        compose(exponential(a, b, c), state.quaternion),
-        added(state.rate, (wx, wy, wz)),
-        added(state.bias, (bx, by, bz)),
-        added(state.disturbance, (dx, dy, dz)),
-        Parameters(*added(state.parameters, (torsion, damping, gain))),
-        tuple(
-            (measurement, compose(exponential(*error[first : first + 3]), quaternion))
-            for first, (measurement, quaternion) in zip(range(SIZE, len(error), 3), state.kept, strict=True)
-        ),
-        state.latency + age,
-        added(state.field_bias, (fx, fy, fz)),
+        compose(exponential(e[0], e[1], e[2]), q),
+        (wx + e[3], wy + e[4], wz + e[5]),
+        (bx + e[6], by + e[7], bz + e[8]),
+        (dx + e[9], dy + e[10], dz + e[11]),
+        Parameters(torsion + e[12], damping + e[13], gain + e[14]),
+        kept,
+        age + e[15],
+        (fx + e[16], fy + e[17], fz + e[18]),
     )
 
 
