@@ -325,8 +325,10 @@ _PART = 0.6
 _HOPELESS = 4.0
 # Margin (standard deviations of the PSF) beyond the distance at which a star's profile equals the noise.
 _DIM_SIGMAS = 2.0
-# Minimum distance (px) of the ends of a region from the image border for the region to be inside the image.
+# Minimum distance (px) from the image border of the ends of a streak or region that is inside the image.
 _BORDER_PX = 2
+# Largest standard deviation (px) of the ends of an object's streak.
+_VAGUE_PX = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -594,8 +596,8 @@ class Judge:
         if not stars and (located is None or located[2].misfit > _GOOD_FIT):
             own = np.flatnonzero(self.segmented.regions.label == region_along(self.segmented, ends))
             stars = fit_stars(self._patch(int(own[0])), self.rotation, self.pinhole)[0] if len(own) else []
-            again = self._located(ends, self._light(ends, stars), stars, improvement) if stars else None
-            if again is not None and (located is None or again[2].misfit < located[2].misfit):
+            again = self._located(ends, self._light(ends, stars), stars, improvement) if stars else located
+            if again is None or located is None or again[2].misfit < located[2].misfit:
                 located = again
         if located is None:
             return None
@@ -612,7 +614,10 @@ class Judge:
     def _located(
         self, ends: FloatArray, light: StarLight, stars: Sequence[FloatArray], improvement: float
     ) -> tuple[LocatedEnds, StarLight, Explanation] | None:
-        """Return located ends of an object, model of stars, and fit of stars and object, or None."""
+        """Return located ends of an object, model of stars, and fit of stars and object, or None.
+
+        Vague ends, and ends at the border of the image, do not show whether the object moves like a star.
+        """
         best = None
         for among_stars in (True, False):
             located = light.located(ends, among_stars)
@@ -625,6 +630,8 @@ class Judge:
         else:
             best = replace(best, sigma=np.hypot(best.sigma, self.objects.end_floor))
             light = self._light(best.ends, stars)
+        if best.sigma.max() > _VAGUE_PX or not self.pinhole.contains(best.ends, -_BORDER_PX).all():
+            return None
         found = light.explain(best.ends)
         uniform = best.misfit <= _UNIFORM
         if self._moves_like_a_star(best.ends, _FITTED_PX) or self.begins_a_star(best.ends, found.flux):

@@ -380,7 +380,12 @@ def light_on_path(segmented: Segmented, path: FloatArray, psf_sigma: float) -> F
 
 
 def _around(inside: BoolArray, middle: int) -> IntArray:
-    """Return the indices of the contiguous true values around the index `middle`, or an empty array."""
+    """Return the indices of the contiguous true values around the index `middle`.
+
+    The result is empty if the value at `middle` is false.
+    """
+    if not inside[middle]:
+        return np.arange(0)
     outside = np.flatnonzero(~inside)
     place = int(np.searchsorted(outside, middle))
     first = int(outside[place - 1]) + 1 if place > 0 else 0

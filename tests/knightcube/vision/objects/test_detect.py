@@ -38,7 +38,7 @@ from knightcube.vision.objects.detect import (
     star_ends,
 )
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
-from knightcube.vision.objects.star_light import Explanation, StarLight
+from knightcube.vision.objects.star_light import Explanation, LocatedEnds, StarLight
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from knightcube.vision.objects.streak_images import star_paths
 from knightcube.vision.streaks.estimate import estimate_motion
@@ -717,6 +717,65 @@ def test_a_region_with_many_corners_is_unclear_and_one_with_a_line_may_be_an_obj
     small = _light(chi_square=1590.0, chi_square_with=with_line)
     monkeypatch.setattr(Judge, "_light", lambda *_, **__: small)
     assert judge.crowd(corners).verdict is Verdict.STARS
+
+
+@pytest.mark.parametrize(
+    ("first", "sigma", "known"),
+    [
+        ((60.0, 80.0), 0.5, True),
+        ((60.0, 80.0), 4.9, True),
+        ((60.0, 80.0), 5.1, False),
+        ((1.6, 80.0), 0.5, True),
+        ((1.4, 80.0), 0.5, False),
+        ((60.0, 510.0), 0.5, False),
+    ],
+)
+def test_an_object_has_accurate_ends_inside_the_image(
+    first: tuple[float, float], sigma: float, known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A streak that the border truncates, or whose ends are vague, may belong to two stars."""
+    ends = np.array([first, (300.0, 250.0)])
+    found = LocatedEnds(ends, np.array([0.2, sigma]), 1.0)
+    fitted = Explanation(900.0, 1.0, 9.0, 1e4)
+    light = _light(located=lambda *_: found, explain=lambda _: fitted)
+    monkeypatch.setattr(Judge, "_light", lambda *_: light)
+    located = _judge()._located(ends, light, (), 600.0)
+    assert (located is not None) == known
+
+
+@pytest.mark.parametrize(
+    ("alone", "beside_stars", "reported"),
+    [
+        (1.3, None, 1.3),
+        (1.5, None, None),
+        (1.5, 1.2, 1.2),
+        (1.5, 1.6, 1.5),
+        (None, None, None),
+        (None, 1.2, 1.2),
+    ],
+)
+def test_a_poorly_fitted_object_is_reported_only_if_it_remains_beside_fitted_stars(
+    alone: float | None, beside_stars: float | None, reported: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = np.array([[60.0, 80.0], [300.0, 250.0]])
+
+    def located(_: Judge, __: FloatArray, light: Any, stars: list[FloatArray], ___: float) -> Any:
+        misfit = beside_stars if stars else alone
+        if misfit is None:
+            return None
+        return LocatedEnds(ends, np.ones(2), misfit), light, Explanation(900.0, misfit, 9.0, misfit)
+
+    light = _light(explain=lambda _: Explanation(900.0, 1.0, 9.0, 1e4))
+    judge = _judge()
+    own = dataclasses.replace(judge.segmented.regions, label=np.array([7]))
+    judge = dataclasses.replace(judge, segmented=dataclasses.replace(judge.segmented, regions=own))
+    monkeypatch.setattr(Judge, "_located", located)
+    monkeypatch.setattr(Judge, "_light", lambda *_: light)
+    monkeypatch.setattr(Judge, "_patch", lambda *_: None)
+    monkeypatch.setattr(detect_module, "region_along", lambda *_: 7)
+    monkeypatch.setattr(detect_module, "fit_stars", lambda *_: ([ends], None))
+    found = judge._candidate(ends, (), light, (), 600.0)
+    assert (None if found is None else found.flux) == reported
 
 
 def test_light_that_stars_do_not_explain_is_searched() -> None:

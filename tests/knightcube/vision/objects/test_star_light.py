@@ -235,6 +235,7 @@ def test_equations_that_are_not_positive_definite_are_refused() -> None:
         ([True, False, True, True, False, True], 3, [2, 3]),
         ([False, True, True, False], 1, [1, 2]),
         ([True, True, False, True], 3, [3]),
+        ([True, True, False, True], 2, []),
     ],
 )
 def test_only_the_part_of_a_path_around_its_middle_is_followed(
