@@ -351,6 +351,11 @@ class CoilMonitor:
         return np.array([axis not in broken for axis in range(len(self._trials))])
 
     @property
+    def rests(self) -> bool:
+        """Whether any axis is kept at zero current because its sign changed too often."""
+        return bool(self._rests)
+
+    @property
     def resting(self) -> BoolArray:
         """Flags (n,) of the axes that are kept at zero current because their sign changed too often."""
         return np.array([axis in self._rests for axis in range(len(self._trials))])

@@ -64,7 +64,7 @@ class CoilDrive:
         self._reported: set[int] = set()  # axes whose diagnosis was reported
         self._braked = NO_AXES
         self._has_rate = True  # without a rate, a self-test of the coils has no result
-        self.available = watch.available
+        self.available, self._all_available = watch.available, bool(watch.available.all())
         self._nothing: FloatArray = np.zeros(len(settings.limits))
         self._limits, self._share = settings.limits, 1.0
         self.command = self._nothing
@@ -140,6 +140,7 @@ class CoilDrive:
     def isolate(self) -> None:
         """Exclude the axes with broken coils: the reaction to the event `coil-broken`."""
         self.available = self._watch.available
+        self._all_available = bool(self.available.all())
 
     def trust(self, now_ns: int) -> None:
         """Use all axes again, as commanded by the ground. If a fault persists, it will be detected again."""
@@ -169,8 +170,8 @@ class CoilDrive:
         # A weak coil reaches its limit at a smaller effective current.
         limited = self._share < 1.0 or min(sizes) < 1.0
         beyond = limited and bool((np.abs(currents) > self._limits * sizes).any())
-        usable = self.available & ~watch.resting
-        if (beyond or not usable.all()) and currents.any():
+        if (beyond or watch.rests or not self._all_available) and currents.any():
+            usable = self.available & ~watch.resting
             # The usable axes share the torque that was commanded for all axes.
             # While the field is unknown, each usable axis keeps its own current.
             known, limits = field(), self._limits * sizes

@@ -145,8 +145,8 @@ def about_axis_y(angle: float) -> FloatArray:
 
 def angle_about_axis_y(q: FloatArray) -> float:
     """Return the angle (rad) of q (4,) about the y axis, the testbed's rotation axis, in [-pi, pi)."""
-    angle = 2.0 * np.arctan2(q[1], q[3])
-    return float(np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi)
+    angle = 2.0 * math.atan2(q[1], q[3])
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 NED_TO_TESTBED: FloatArray = np.array([0.5, -0.5, -0.5, 0.5])

@@ -93,22 +93,53 @@ LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThreadEstimate:
-    """Angle (rad), rate (rad/s) and disturbance (rad/s^2) about the thread, with their covariance (3, 3).
+    """Angle (rad), rate (rad/s) and disturbance (rad/s^2) about the thread.
 
-    `measured_ns` is the time of the newest measurement that the estimate uses.
+    The estimate `whole`, from which these values follow, contains the covariance and `measured_ns`, the time
+    of the newest measurement. The disturbance is relative to a plant with the parameters `model`.
     """
 
     time_ns: int
     angle: float
     rate: float
     disturbance: float
-    covariance: FloatArray
     measured_ns: int
+    whole: Estimate
+    model: Parameters
 
     @property
     def q2(self) -> float:
         """The second component of the quaternion (q2)."""
         return math.sin(0.5 * self.angle)
+
+    @property
+    def angle_sigma(self) -> float:
+        """The standard deviation of the angle, rad."""
+        return math.sqrt(self.whole.covariance[1, 1])
+
+    @property
+    def rate_sigma(self) -> float:
+        """The standard deviation of the rate, rad/s."""
+        return math.sqrt(self.whole.covariance[4, 4])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The covariance (3, 3) of angle, rate and disturbance."""
+        model, whole = self.model, self.whole
+        torsion, damping, _ = whole.parameters
+        scale = _gain_ratio(whole, model)
+        torque = self.disturbance - model.torsion * self.angle - model.damping * self.rate
+        rows = np.zeros((3, len(whole.covariance)))
+        rows[0, 1] = rows[1, 4] = 1.0
+        rows[2, 10] = scale
+        rows[2, 1], rows[2, 4] = model.torsion - scale * torsion, model.damping - scale * damping
+        rows[2, PARAMETERS] = -scale * self.angle, -scale * self.rate, -torque * scale / model.gain
+        return np.asarray(rows @ whole.covariance @ rows.T)
+
+
+def _gain_ratio(estimate: Estimate, model: Parameters) -> float:
+    """Return the coil gain of `model`, divided by the estimated gain within its limits."""
+    return model.gain / min(max(estimate.parameters.gain, LEAST_GAIN), MOST_GAIN)
 
 
 def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstimate:
@@ -118,22 +149,11 @@ def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstim
     so that this plant and the body need the same current to hold an attitude.
     """
     angle, rate = angle_about_axis_y(estimate.quaternion), float(estimate.rate[1])
-    torsion, damping, gain = estimate.parameters
-    scale = model.gain / min(max(gain, LEAST_GAIN), MOST_GAIN)
-    torque = scale * (float(estimate.disturbance[1]) - torsion * angle - damping * rate)
-    rows = np.zeros((3, len(estimate.covariance)))
-    rows[0, 1] = rows[1, 4] = 1.0
-    rows[2, 10] = scale
-    rows[2, 1], rows[2, 4] = model.torsion - scale * torsion, model.damping - scale * damping
-    rows[2, PARAMETERS] = -scale * angle, -scale * rate, -torque * scale / model.gain
-    return ThreadEstimate(
-        estimate.time_ns,
-        angle,
-        rate,
-        torque + model.torsion * angle + model.damping * rate,
-        rows @ estimate.covariance @ rows.T,
-        estimate.measured_ns,
-    )
+    torsion, damping, _ = estimate.parameters
+    unexplained = float(estimate.disturbance[1]) - torsion * angle - damping * rate
+    torque = _gain_ratio(estimate, model) * unexplained
+    disturbance = torque + model.torsion * angle + model.damping * rate
+    return ThreadEstimate(estimate.time_ns, angle, rate, disturbance, estimate.measured_ns, estimate, model)
 
 
 class ThreadReader:

@@ -38,6 +38,7 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
     coils = Coils()
     watch = SimpleNamespace(
         resting=np.array(resting),
+        rests=any(resting),
         available=np.ones(3, dtype=bool),
         at_rest=False,
         probe=None,

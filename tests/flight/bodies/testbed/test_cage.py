@@ -15,6 +15,7 @@ from flight.schema.document import ConfigError, config_path
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
+from knightcube.gnc.estimation.estimate import NOMINAL
 from knightcube.gnc.guidance.plant import PathSample
 from sim_hal.clock import SimClock
 from sim_hal.rig import utc_ns
@@ -83,8 +84,8 @@ class _Fixed:
     def at(self, _: int) -> FloatArray:
         return self._field
 
-    def read(self, _: Any) -> ThreadEstimate:
-        return ThreadEstimate(0, self._angle, 0.0, 0.0, np.zeros((3, 3)), 0)
+    def read(self, whole: Any) -> ThreadEstimate:
+        return ThreadEstimate(0, self._angle, 0.0, 0.0, 0, whole, NOMINAL)
 
     def command(self, _: Any, __: Any) -> CoilCommand:
         currents = np.array([self._current, 0.0, 0.0])

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.bodies.testbed.control import ThreadEstimate as Estimate
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.plant import SingleAxisPlant
 
@@ -41,6 +40,21 @@ class Measurement:
     def begin_ns(self) -> int:
         """Start time of the measured interval."""
         return self.time_ns if self.since_ns is None else self.since_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SingleAxisEstimate:
+    """Angle (rad), rate (rad/s) and disturbance (rad/s^2) with their covariance (3, 3).
+
+    `measured_ns` is the time of the newest measurement that the estimate uses.
+    """
+
+    time_ns: int
+    angle: float
+    rate: float
+    disturbance: float
+    covariance: FloatArray
+    measured_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,15 +139,15 @@ class SingleAxisFilter:
         self._forget(measurement.time_ns)
         return used
 
-    def at(self, time_ns: int) -> Estimate:
+    def at(self, time_ns: int) -> SingleAxisEstimate:
         """Return the estimate propagated to `time_ns`, without a change of the filter."""
         last = self._history[-1]
         newest = next((c for c in reversed(self._history) if c.used), last)
         state, covariance = self._propagate(last.state, last.covariance, last.measurement.time_ns, time_ns)
         angle, rate, disturbance = (float(value) for value in state)
-        return Estimate(time_ns, angle, rate, disturbance, covariance, newest.measurement.time_ns)
+        return SingleAxisEstimate(time_ns, angle, rate, disturbance, covariance, newest.measurement.time_ns)
 
-    def past(self, time_ns: int) -> Estimate | None:
+    def past(self, time_ns: int) -> SingleAxisEstimate | None:
         """Return the estimate at a past time, or None if the time precedes the stored history."""
         index = bisect.bisect_right(self._history, time_ns, key=lambda c: c.measurement.time_ns)
         if index == 0:
@@ -141,7 +155,7 @@ class SingleAxisFilter:
         then = self._history[index - 1]
         state, covariance = self._propagate(then.state, then.covariance, then.measurement.time_ns, time_ns)
         angle, rate, disturbance = (float(value) for value in state)
-        return Estimate(time_ns, angle, rate, disturbance, covariance, then.measurement.time_ns)
+        return SingleAxisEstimate(time_ns, angle, rate, disturbance, covariance, then.measurement.time_ns)
 
     def _insert(self, measurement: Measurement) -> bool:
         """Go back to the start of a measurement, apply it, and apply the later measurements again."""
