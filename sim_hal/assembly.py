@@ -260,17 +260,19 @@ def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> C
     """Return the motion at the inertial unit, whose magnetometer also measures the field of the coils."""
     errors, known = description_errors(config, section), config.inertial_unit.calibration
     gyro_matrix, field_matrix = np.array(known.gyro_matrix), np.array(known.field_matrix)
-    gyro_matrix, offset = gyro_matrix @ errors.gyro, np.array(known.field_bias)
     coil_field, bias = _coil_field(config, section), np.array(section.imu.field_bias) + errors.field_bias
     if not (coil_field.any() or bias.any() or errors is not NO_ERRORS or known != UnitCalibration()):
         return world.motion
 
+    offset = field_matrix @ bias + np.array(known.field_bias)
+    gyro_matrix, field_matrix = gyro_matrix @ errors.gyro, field_matrix @ errors.field
+
     def sense(time_ns: int) -> BodyMotion:
         # The unit averages its magnetometer over one control period, so the mean coil currents are used.
         motion = world.motion(time_ns)
-        field = errors.field @ (motion.field_body + coil_field @ circuit.currents()) + bias
-        field = field_matrix @ field + offset
-        return replace(motion, field_body=field, rate=gyro_matrix @ motion.rate)
+        field = field_matrix @ (motion.field_body + coil_field @ circuit.currents()) + offset
+        rate, force = gyro_matrix @ motion.rate, motion.specific_force_body
+        return BodyMotion(motion.time_ns, motion.quaternion, rate, field, force)
 
     return sense
 

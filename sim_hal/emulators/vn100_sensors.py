@@ -18,7 +18,15 @@ from typing import Literal
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply, normalise
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    compose,
+    conjugate,
+    exponential,
+    from_rotation_vector,
+    multiply,
+    normalise,
+)
 from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
 
 IMU_RATE_HZ = 800
@@ -125,20 +133,23 @@ class Sensors:
         vertical, so its attitude drifts at random.
         """
         self._rng, self._profile = rng, profile
-        self._to_sensor = attitude_matrix(conjugate(mounting))
+        # One matrix maps rate, field and specific force in body axes to sensor axes and the unit's own units.
+        self._map: FloatArray = np.kron(
+            np.diag([1.0, GAUSS_PER_TESLA, 1.0]), attitude_matrix(conjugate(mounting))
+        )
         # A matrix product is enough, because the measurement is bilinear in true and error quaternion.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
         self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
         self._fixed_bias = gyro_bias
         self._static: FloatArray | None = None
-        self._bias = gyro_bias
+        self._biases: FloatArray = np.array([*gyro_bias, *np.zeros(6)])
         self._free_fall = free_fall
         self._scales: dict[tuple[int, ...], FloatArray] = {}
 
     def restart(self) -> None:
         """Draw the errors that are constant until the next start of the unit."""
         draws = self._rng.standard_normal(6)
-        self._bias = self._fixed_bias + self._profile.gyro_bias * draws[:3]
+        self._biases[:3] = self._fixed_bias + self._profile.gyro_bias * draws[:3]
         static = np.array(self._profile.static_attitude)
         self._static = from_rotation_vector(static * draws[3:]) if static.any() else None
         if self._free_fall:
@@ -150,24 +161,24 @@ class Sensors:
         if windows not in self._scales:
             mag, accel, gyro = (math.sqrt(max(1, window)) for window in windows)
             densities = profile.rate_density, profile.field_density, profile.acceleration_density
-            self._scales[windows] = np.repeat(np.array(densities) / (gyro, mag, accel), 3)
-        bounded = 2.0 * self._rng.random(6) - 1.0
-        white = self._scales[windows] * (self._rng.standard_normal(9) * _ROOT_BANDWIDTH)
-        x, y, z = (profile.attitude_bound * bounded[:3]).tolist()
+            scales = np.array(densities) / (gyro, mag, accel) * (1.0, GAUSS_PER_TESLA, 1.0)
+            self._scales[windows] = np.repeat(scales * _ROOT_BANDWIDTH, 3)
+        a, b, c, *spun = self._rng.random(6).tolist()
+        noise = self._scales[windows] * self._rng.standard_normal(9)
+        bound = profile.attitude_bound
+        x, y, z = bound * (2.0 * a - 1.0), bound * (2.0 * b - 1.0), bound * (2.0 * c - 1.0)
         small = np.array([x, y, z, math.sqrt(1.0 - x * x - y * y - z * z)])
         q = small @ (motion.quaternion @ self._table).reshape(4, 4)
         if self._free_fall and self._static is not None:
-            drift = from_rotation_vector(_DRIFT_WITHOUT_GRAVITY * self._rng.standard_normal(3))
-            self._static = normalise(multiply(drift, self._static))
+            drift = exponential(*(_DRIFT_WITHOUT_GRAVITY * self._rng.standard_normal(3)).tolist())
+            self._static = np.array(compose(drift, self._static.tolist()))
         if self._static is not None:
             q = multiply(q, self._static)
-        turn = self._to_sensor
-        return Vn100Sample(
-            quaternion=q,
-            rate=turn @ (motion.rate + profile.rate_bound * bounded[3:]) + self._bias + white[:3],
-            mag=GAUSS_PER_TESLA * (turn @ motion.field_body + white[3:6]),
-            accel=turn @ motion.specific_force_body + white[6:],
-        )
+        vectors = np.concatenate([motion.rate, motion.field_body, motion.specific_force_body])
+        if profile.rate_bound:
+            vectors[:3] += [profile.rate_bound * (2.0 * share - 1.0) for share in spun]
+        values = self._map @ vectors + (noise + self._biases)
+        return Vn100Sample(quaternion=q, rate=values[:3], mag=values[3:6], accel=values[6:])
 
 
 GRAVITY_NED: FloatArray = np.array([0.0, 0.0, STANDARD_GRAVITY])
