@@ -7,19 +7,7 @@
 The unit of radiance is the radiance of a white Lambertian surface with the Sun at the zenith, so the radiance
 of the Sun's disc is 46,000.
 
-The air density decreases exponentially with height. Single scattering of sunlight in the air produces the
-soft limb, twilight, and haze over the ground. The optical depth along an oblique path is the vertical optical
-depth times Chapman's function. For a scale height far below the Earth's radius, Chapman's function is sqrt(pi
-X/2) exp(X mu^2/2) erfc(mu sqrt(X/2)), where X is the ratio of Earth radius to scale height and mu the cosine
-of the zenith angle (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). Huestis's formula is also
-valid for a Sun below the horizon. The model omits refraction (which raises the apparent limb by 0.2 km, or
-0.004 deg), ozone, and clouds above the limb.
-
-Lines of sight are intersected exactly with the WGS 84 ellipsoid, in axes that are scaled so that the
-ellipsoid is the unit sphere. The ground is Lambertian. Direct sunlight is attenuated by the air on the way to
-the ground and again on the way to the camera. Land, sea and cloud are noise with a power-law spectrum,
-sampled on a sphere in a periodic volume at two scales: continents and weather, and coasts and single clouds.
-The map does not show the real Earth, but has bright edges inside the limb, which disturb a horizon detector.
+`sim_hal.earth_light` describes the light of ground and air.
 
 The optics blur the Earth's image by a narrow Gaussian and scatter a little light over the whole frame. The
 Sun's disc has limb darkening, can be hidden by the Earth, and is dimmed by the atmosphere. Scattering in the
@@ -38,7 +26,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
-from scipy.special import erfcx, ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
@@ -51,80 +38,10 @@ from knightcube.astro.arrays import (
     cross_product,
     tangent_basis,
 )
-from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, semi_axes
+from knightcube.astro.earth.figure import semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
-
-_DEEPEST = -9.0
-"""Smallest argument of erfcx (optical depth 1e35); smaller arguments are clipped to this value."""
-
-
-@dataclass(frozen=True, slots=True)
-class Atmosphere:
-    """Exponential air.
-
-    Attributes:
-        scale_height: m.
-        optical_depth: vertical optical depth, by default of Rayleigh scattering at 550 nm (Bucholtz 1995,
-            Appl. Opt. 34).
-        multiple: ratio of all scattered light to singly scattered light.
-    """
-
-    scale_height: float = 8000.0
-    optical_depth: float = 0.097
-    multiple: float = 1.5
-
-    def __post_init__(self) -> None:
-        depth, multiple = (0.011, 10.0, ""), (0.0, 4.0, "")
-        limits = {"scale_height": (100.0, 50e3, "m"), "optical_depth": depth, "multiple": multiple}
-        check_limits("atmosphere", self, limits)
-
-    @property
-    def _ratio(self) -> float:
-        return SEMI_MAJOR_AXIS / self.scale_height
-
-    @property
-    def limb_depth(self) -> float:
-        """Optical depth of a line of sight that touches the ground, about 70 times `optical_depth`."""
-        return self.optical_depth * math.sqrt(2.0 * math.pi * self._ratio)
-
-    @property
-    def apparent_limb_height(self) -> float:
-        """Tangent height (m) at which a sunlit limb has half its full brightness.
-
-        At this height 1 - exp(-depth) is 1/2, with the depth `limb_depth` * exp(-height / scale height).
-        """
-        return self.scale_height * math.log(self.limb_depth / math.log(2.0))
-
-    def tangent_depth(self, heights: Float32Array) -> Float32Array:
-        """Return the optical depth of complete lines of sight with tangent heights (...), m."""
-        return np.asarray(self.limb_depth * np.exp(-heights / self.scale_height))
-
-    def slant_depth(self, cosines: Float32Array) -> Float32Array:
-        """Return the optical depth from the ground to space at zenith-angle cosines (...) of either sign."""
-        root = math.sqrt(0.5 * self._ratio)
-        argument = np.maximum(cosines * root, _DEEPEST)
-        return np.asarray(self.optical_depth * math.sqrt(math.pi) * root * erfcx(argument))
-
-    def scattered(self, depth: Float32Array, bottom: Float32Array, sunward: Float32Array) -> Float32Array:
-        """Return the fraction of sunlight scattered along lines of sight, without the phase function.
-
-        `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
-        line's lowest point, divided by the density at the ground. `sunward` (...) is the optical depth
-        towards the Sun, from the ground below the line of sight. The scattered light comes from the air above
-        the point where the optical depth along the line reaches one. The transmission of sunlight is averaged
-        over the scattering air.
-        """
-        x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)
-        return np.asarray(np.expm1(-depth) * np.expm1(-x) / x)
-
-    def phase(self, cosines: Float32Array) -> Float32Array:
-        """Return the radiance of optically thick sunlit air at cosines (...) of the scattering angle.
-
-        The radiance is a quarter of the Rayleigh phase function times `multiple`.
-        """
-        return np.asarray(self.multiple * 0.1875 * (1.0 + cosines * cosines))
-
+from sim_hal.earth_light import Atmosphere, EarthIntersection, air_tables, intersect, light, map_noise
 
 _SCENE = "Earth scene"
 
@@ -199,195 +116,28 @@ class EarthScene:
         return self.in_earth(self.position) / axes, ((self.camera_matrix @ self.earth_matrix.T) / axes).T
 
 
-OCEAN, LAND, CLOUD = 0.06, 0.22, 0.65
-"""Albedo of sea (0.05 to 0.1 in visible light), land (0.1 to 0.3) and cloud (up to 0.8)."""
-LAND_SHARE, CLOUD_SHARE = 0.29, 0.55
-"""Fractions of the Earth covered by land and by cloud."""
-
-_CELLS = 96
-"""Edge length (grid cells) of the periodic noise volume."""
-_SLOPE = -2.3
-"""Exponent of the noise amplitude as a power of the wave number, as for the spectrum of clouds."""
-_RADIUS = 0.42 * _CELLS
-"""Radius (grid cells) of the Earth's sphere in the noise volume."""
-_MAGNIFICATION, _FINE = 11.0, 0.5
-"""Magnification of the coordinates, and amplitude, of the fine noise relative to the coarse noise."""
-_SOFT = 0.1
-"""Width of the transition at a coast or a cloud edge, in standard deviations of the noise."""
-
-
-def albedo(directions: FloatArray | Float32Array, seed: int) -> Float32Array:
-    """Return the ground's albedo (n,) below Earth-fixed unit directions (n, 3)."""
-    places = np.ascontiguousarray(directions.T, dtype=np.float32)
-    places *= np.float32(_RADIUS)
-    places += np.float32(0.5 * _CELLS)
-    heights = _read(_noise(seed), places * np.float32(_MAGNIFICATION))
-    heights *= np.float32(_FINE)
-    heights += _read(_noise(seed), places)
-    heights /= np.float32(math.hypot(1.0, _FINE))
-    land, cloud = _covered(heights.real, LAND_SHARE), _covered(heights.imag, CLOUD_SHARE)
-    ground = OCEAN + (LAND - OCEAN) * land
-    return np.asarray(ground + (CLOUD - ground) * cloud)
-
-
-def _covered(heights: Float32Array, share: float) -> Float32Array:
-    """Return the cover (n,), from 0 to 1 with mean `share`, by land or cloud for noise values (n,)."""
-    above = (heights - np.float32(ndtri(1.0 - share))) / np.float32(_SOFT) + np.float32(0.5)
-    return np.asarray(np.clip(above, 0.0, 1.0))
-
-
-def _read(noise: npt.NDArray[np.complex64], places: Float32Array) -> npt.NDArray[np.complex64]:
-    """Return the periodic noise (n,), linearly interpolated, at `places` (3, n), in grid cells."""
-    low = np.floor(places)
-    along, across, up = places - low
-    i, j, k = low.astype(np.int32) % _CELLS
-    rows = [column % _CELLS * _CELLS for column in (j, j + 1)]
-    layers = [layer % _CELLS * _CELLS**2 for layer in (i, i + 1)]
-    after = (k + 1) % _CELLS
-
-    def line(layer: IntArray, row: IntArray) -> npt.NDArray[np.complex64]:
-        base = layer + row
-        return _between(noise.take(base + k), noise.take(base + after), up)
-
-    faces = [_between(line(layer, rows[0]), line(layer, rows[1]), across) for layer in layers]
-    return _between(faces[0], faces[1], along)
-
-
-def _between(
-    before: npt.NDArray[np.complex64], after: npt.NDArray[np.complex64], share: Float32Array
-) -> npt.NDArray[np.complex64]:
-    """Return the linear interpolation (n,) between values `before` and `after` (n,), overwriting `after`."""
-    after -= before
-    after *= share
-    after += before
-    return after
-
-
-@lru_cache(maxsize=4)
-def _noise(seed: int) -> npt.NDArray[np.complex64]:
-    """Return two periodic cubic grids of independent noise of unit variance, as one flat array.
-
-    The real part is the noise for land, and the imaginary part is the noise for clouds.
-    """
-    across = np.fft.fftfreq(_CELLS, 1.0 / _CELLS).astype(np.float32)
-    wave = np.sqrt(across[:, None, None] ** 2 + across[None, :, None] ** 2 + across**2)
-    amplitude = np.where(wave >= 1.5, np.maximum(wave, 1.5) ** _SLOPE, 0.0)
-    rng = np.random.default_rng(seed)
-    shape = (_CELLS, _CELLS, _CELLS)
-    white = rng.standard_normal(shape, np.float32) + 1j * rng.standard_normal(shape, np.float32)
-    # The transform of white noise is white noise, with independent real and imaginary parts.
-    noise = np.fft.ifftn(white * amplitude)
-    land, cloud = noise.real, noise.imag
-    whole = land / land.std() + 1j * (cloud / cloud.std())
-    return np.asarray(whole.astype(np.complex64).reshape(-1))
-
-
-TOP = 120e3
-"""Height (m) above which the air has less than a millionth of the limb's brightness."""
-_DARKEST = -0.2
-"""Cosine of the Sun's zenith angle below which only air above `TOP` is lit (11.5 deg below the horizon)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EarthIntersection:
-    """First intersections of n lines of sight with the Earth's ellipsoid, or their nearest points to it.
-
-    The heights (n,), m, are 0 for lines that meet the ground and infinite for lines that point away from the
-    Earth. The points `places` (n, 3) are in Earth-fixed axes that are scaled so that the ellipsoid is the
-    unit sphere.
-    """
-
-    hits: BoolArray
-    heights: Float32Array
-    places: npt.NDArray[np.floating[Any]]
-
-
 def look(scene: EarthScene, rays: npt.NDArray[np.floating[Any]]) -> EarthIntersection:
-    """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth.
+    """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth."""
+    return intersect(rays.T, *scene.on_unit_sphere())
 
-    The precision is that of `rays`. For 32-bit rays from altitudes up to 2,000 km, the errors of all heights
-    are below 2 m, and the errors of 99.9 % of the places are below 20 m. Places near the limb have larger
-    errors along the line of sight.
+
+def radiance(scene: EarthScene, rays: Float32Array) -> tuple[Float32Array, BoolArray]:
+    """Return the radiance along unit rays (3, n) in camera axes, and whether air above the limb is visible.
+
+    Both results are arrays (n,). The radiance does not include the Sun's disc.
     """
-    origin, into_earth = (array.astype(rays.dtype) for array in scene.on_unit_sphere())
-    axes: npt.NDArray[np.floating[Any]] = semi_axes().astype(rays.dtype)
-    # Computing with contiguous rows of coordinates is several times faster than with rows of vectors.
-    scaled = into_earth @ rays.T
-    squares, along = np.sum(scaled * scaled, axis=0), origin @ scaled
-    # The distance of the nearest point from the centre is more accurate than a quadratic's discriminant.
-    nearest = origin[:, None] - (along / squares) * scaled
-    nearest_squares = nearest * nearest
-    distance = np.sum(nearest_squares, axis=0)
-    ahead = along < 0.0
-    hits = ahead & (distance <= 1.0)
-    back = np.sqrt(np.maximum(1.0 - distance, 0.0) / squares)
-    places = nearest - np.where(hits, back, 0.0) * scaled
-    length = np.sqrt(distance)
-    local = np.sqrt(axes**2 @ nearest_squares) / length
-    heights = np.where(ahead, np.maximum(length - 1.0, 0.0) * local, np.inf).astype(np.float32, copy=False)
-    return EarthIntersection(np.asarray(hits), heights, places.T)
-
-
-def near_earth(scene: EarthScene, rays: Float32Array) -> IntArray:
-    """Return the indices of the `rays` (n, 3), camera axes, that may pass below the height `TOP`.
-
-    The indices include all rays for which `look` returns a height below `TOP`, and some further rays.
-    """
-    origin, into_earth = scene.on_unit_sphere()
-    reach = float(origin @ origin) - (1.0 + TOP / float(semi_axes().min())) ** 2
-    if reach <= 0.0:
-        return np.arange(len(rays))
-    scaled = into_earth.astype(np.float32) @ rays.T
-    along = origin.astype(np.float32) @ scaled
-    squares = scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2]
-    # The margin of 1e-5 is far larger than the rounding errors of 32-bit numbers.
-    return np.flatnonzero((along < 0.0) & (along * along > np.float32(reach * (1.0 - 1e-5)) * squares))
-
-
-def radiance(scene: EarthScene, rays: FloatArray | Float32Array, sight: EarthIntersection) -> Float32Array:
-    """Return the radiance (n,) along unit `rays` (n, 3) in camera axes, without the Sun's disc.
-
-    The argument `sight` contains the intersections of the rays with the Earth.
-    """
-    result = np.zeros(len(rays), dtype=np.float32)
-    axes = semi_axes().astype(np.float32)[:, None]
-    seen = np.flatnonzero(sight.heights < TOP)
-    places = _chosen(sight.places.T, seen)
-    normals = _unit(places / axes)
-    to_camera = scene.camera_matrix @ scene.earth_matrix.T
     distance = float(np.linalg.norm(scene.sun))
-    sun = scene.in_earth(scene.sun / distance)
-    solar = sun.astype(np.float32) @ normals
-    lit = np.flatnonzero(solar > _DARKEST)
-    if len(lit) < len(seen):
-        seen, solar, places, normals = seen[lit], solar[lit], places[:, lit], normals[:, lit]
-    directions = _chosen(rays.T, seen)
-    upward = np.maximum(-np.sum(directions * (to_camera.astype(np.float32) @ normals), axis=0), 0.0)
-    # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
-    turned = (to_camera @ sun).astype(np.float32) @ directions
-    air, hits = scene.atmosphere, sight.hits[seen]
-    bottom = np.exp(-sight.heights[seen] / air.scale_height)
-    depth = np.where(hits, air.slant_depth(upward), air.limb_depth * bottom)
-    towards = air.slant_depth(solar)
-    light = air.phase(turned) * air.scattered(depth, bottom, towards)
-    ground = np.flatnonzero(hits & (solar > 0.0))
-    beneath = _unit(places[:, ground] * axes)
-    matt = albedo(beneath.T, scene.texture) * solar[ground]
-    light[ground] += matt * np.exp(-depth[ground] - towards[ground])
-    result[seen] = light * np.float32((ASTRONOMICAL_UNIT / distance) ** 2)
-    return result
-
-
-def _chosen(vectors: npt.NDArray[np.floating[Any]], at: IntArray) -> Float32Array:
-    """Return the columns with the indices `at` of vectors (3, n) as 32-bit numbers."""
-    coarse = vectors.astype(np.float32, copy=False)
-    return coarse if len(at) == vectors.shape[1] else coarse.take(at, axis=1)
-
-
-def _unit(vectors: Float32Array) -> Float32Array:
-    """Return vectors (3, n) with unit length."""
-    x, y, z = vectors
-    return np.asarray(vectors / np.sqrt(x * x + y * y + z * z))
+    sunlight = (ASTRONOMICAL_UNIT / distance) ** 2
+    return light(
+        rays,
+        *scene.on_unit_sphere(),
+        semi_axes(),
+        scene.in_earth(scene.sun / distance),
+        sunlight,
+        sunlight * float(scene.atmosphere.phase(np.array(0.0))),
+        *air_tables(scene.atmosphere),
+        map_noise(scene.texture),
+    )
 
 
 RIM_DARKENING = 0.6
@@ -566,15 +316,14 @@ def pixel_rays(lens: CameraModel) -> FloatArray:
 def _pixel_rays(lens: Lens) -> FloatArray:
     rows, columns = np.mgrid[0 : lens.rows, 0 : lens.columns]
     rays = lens.unit_vectors(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float))
-    rays = np.asfortranarray(rays)  # column-major order makes the computations along the rays fast
     rays.setflags(write=False)
     return rays
 
 
 @lru_cache(maxsize=4)
 def _coarse_rays(lens: Lens) -> Float32Array:
-    """Return the `pixel_rays` as 32-bit numbers."""
-    return pixel_rays(lens).astype(np.float32, order="F")
+    """Return the `pixel_rays` as an array (3, rows x columns) of 32-bit numbers."""
+    return np.ascontiguousarray(pixel_rays(lens).T, dtype=np.float32)
 
 
 _SUBPIXELS = 6
@@ -798,24 +547,41 @@ def _light(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
 def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
     """Return the Earth's radiance (rows, columns), averaged within the pixels that the limb crosses."""
     rays = _coarse_rays(Lens.of(model.lens))
-    light = np.zeros(len(rays), dtype=np.float32)
-    near = near_earth(scene, rays)
-    if not len(near):
-        return light.reshape(model.rows, model.columns)
-    rays = rays.T.take(near, axis=1).T
-    sight = look(scene, rays)
-    found = radiance(scene, rays, sight)
-    light[near] = found
-    at_limb = near[~sight.hits & (found > 0.0)]
-    if len(at_limb):
+    image, above = radiance(scene, rays)
+    if above.any():
         # A pixel with its centre on the ground may extend beyond the limb, so neighbours are included.
-        wide = np.zeros((model.rows + 2, model.columns + 2), dtype=bool)
-        down, across = np.divmod(at_limb, model.columns)
-        for step in range(9):
-            wide[down + step // 3, across + step % 3] = True
-        at_limb = np.flatnonzero(wide[1:-1, 1:-1])
-        pixels = np.stack([at_limb % model.columns, at_limb // model.columns], axis=1)
-        points = (pixels[:, None, :] + _WITHIN).reshape(-1, 2)
-        fine = model.lens.unit_vectors(points).astype(np.float32, order="F")
-        light[at_limb] = radiance(scene, fine, look(scene, fine)).reshape(-1, len(_WITHIN)).mean(axis=1)
-    return light.reshape(model.rows, model.columns)
+        at_limb = _with_neighbours(above.reshape(model.rows, model.columns))
+        fine, _ = radiance(scene, _rays_within(rays, at_limb, model.columns))
+        image[at_limb] = fine.reshape(len(_WITHIN), -1).mean(axis=0)
+    return image.reshape(model.rows, model.columns)
+
+
+def _with_neighbours(pixels: BoolArray) -> IntArray:
+    """Return the indices of the set pixels (rows, columns) and of all pixels next to them."""
+    wide = pixels.copy()
+    wide[1:] |= pixels[:-1]
+    wide[:-1] |= pixels[1:]
+    high = wide.copy()
+    wide[:, 1:] |= high[:, :-1]
+    wide[:, :-1] |= high[:, 1:]
+    return np.flatnonzero(wide)
+
+
+def _rays_within(rays: Float32Array, pixels: IntArray, columns: int) -> Float32Array:
+    """Return the rays (3, 4 n) through 2 x 2 points within each of the n pixels with the indices `pixels`.
+
+    The rays are interpolated linearly from the rays (3, rows x columns) of the pixel centres. The error is
+    below 0.1 times the square of a pixel's angle, in rad. Beside a pixel without a ray (NaN), all four points
+    are at the pixel's centre.
+    """
+    centre = rays.take(pixels, axis=1)
+    slopes = []
+    for place, size, stride in (
+        (pixels % columns, columns, 1),
+        (pixels // columns, rays.shape[1] // columns, columns),
+    ):
+        before, after = np.minimum(place, 1), np.minimum(size - 1 - place, 1)
+        span = rays.take(pixels + stride * after, axis=1) - rays.take(pixels - stride * before, axis=1)
+        slopes.append(np.nan_to_num(span / np.maximum(before + after, 1).astype(np.float32)))
+    within = [centre + np.float32(x) * slopes[0] + np.float32(y) * slopes[1] for x, y in _WITHIN]
+    return np.concatenate(within, axis=1)

@@ -8,7 +8,8 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.earth.figure import semi_axes
-from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene, towards_sun
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, towards_sun
+from sim_hal.earth_light import Atmosphere
 
 APPARENT_LIMB_HEIGHT = Atmosphere().apparent_limb_height
 """Height (m) above the ellipsoid at which a sunlit limb has half its brightness in the default atmosphere."""

@@ -15,7 +15,8 @@ from knightcube.vision.horizon.settings import (
     LogarithmicResponse,
     SensedDirection,
 )
-from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene
+from sim_hal.earth_camera import EarthCameraModel, EarthScene
+from sim_hal.earth_light import Atmosphere
 from tests.sim_hal.earth_camera.scenes import random_direction
 
 KNOWN_LIMB = 1000.0

@@ -15,20 +15,23 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS, semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera import (
+    EarthCameraModel,
+    EarthScene,
+    expected_radiance,
+    look,
+    nadir,
+    pixel_rays,
+)
+from sim_hal.earth_light import (
     CLOUD,
     CLOUD_SHARE,
     LAND_SHARE,
     OCEAN,
     TOP,
     Atmosphere,
-    EarthCameraModel,
-    EarthScene,
     albedo,
-    expected_radiance,
-    look,
-    nadir,
+    map_noise,
     near_earth,
-    pixel_rays,
 )
 from tests.sim_hal.earth_camera.scenes import limb_scene, pointing, random_direction, random_scene
 from tests.support.earth_truth import APPARENT_LIMB_HEIGHT, limb_directions, limb_truth
@@ -158,11 +161,11 @@ def test_a_farther_sun_lights_less_by_the_square() -> None:
 
 def test_land_and_cloud_cover_their_shares_and_come_from_the_seed_alone() -> None:
     generator = np.random.default_rng(6)
-    directions = generator.standard_normal((200_000, 3))
+    directions = generator.standard_normal((200_000, 3)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     covered, sea = [], []
     for seed in range(6):
-        ground = albedo(directions, seed)
+        ground = albedo(directions.T, map_noise(seed))
         assert ground.min() >= OCEAN - 1e-6
         assert ground.max() <= CLOUD + 1e-6
         covered.append(np.mean(ground > 0.6))
@@ -170,8 +173,9 @@ def test_land_and_cloud_cover_their_shares_and_come_from_the_seed_alone() -> Non
     # A globe has few continents, so the fraction of land varies with the seed.
     assert np.mean(covered) == pytest.approx(CLOUD_SHARE, abs=0.12)
     assert np.mean(sea) == pytest.approx((1.0 - CLOUD_SHARE) * (1.0 - LAND_SHARE), abs=0.12)
-    assert np.array_equal(albedo(directions[:100], 3), albedo(directions[:100], 3))
-    assert not np.array_equal(albedo(directions[:100], 3), albedo(directions[:100], 4))
+    few = directions[:100].T
+    assert np.array_equal(albedo(few, map_noise(3)), albedo(few, map_noise(3)))
+    assert not np.array_equal(albedo(few, map_noise(3)), albedo(few, map_noise(4)))
 
 
 def test_the_ground_turns_with_the_earth() -> None:
@@ -347,7 +351,7 @@ def test_no_ray_below_the_top_of_the_air_is_left_out(altitude: float) -> None:
         rays = np.concatenate(
             [rays, np.repeat(edge, 20, axis=0) + 1e-3 * generator.standard_normal((4000, 3))]
         )
-        near = near_earth(scene, rays.astype(np.float32))
+        near = near_earth(rays.T.astype(np.float32), *scene.on_unit_sphere())
         below = np.flatnonzero(look(scene, rays).heights < TOP)
         assert len(below) > 20
         assert np.isin(below, near).all()

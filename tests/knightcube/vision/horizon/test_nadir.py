@@ -43,7 +43,8 @@ from knightcube.vision.horizon.settings import (
     RoughAttitude,
     SensedDirection,
 )
-from sim_hal.earth_camera import Atmosphere, EarthScene, nadir, render
+from sim_hal.earth_camera import EarthScene, nadir, render
+from sim_hal.earth_light import Atmosphere
 from tests.knightcube.vision.horizon.instants import ALTITUDE, UW, VT, WIDE_MODEL, Instant, instant
 from tests.sim_hal.earth_camera.scenes import limb_scene, random_scene
 from tests.support.earth_truth import limb_truth
