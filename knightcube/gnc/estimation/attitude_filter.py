@@ -25,7 +25,6 @@ not raise an alarm.
 from __future__ import annotations
 
 import bisect
-import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -104,7 +103,8 @@ class CommandCheck:
         self._model = model
         self._scale = 1.0
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
-        self._departures: deque[tuple[int, list[float]]] = deque(maxlen=max(_DEPARTURES))
+        # Times (ns) and innovations in standard deviations, as sums over all samples up to these times.
+        self._totals: deque[tuple[int, list[float]]] = deque(maxlen=max(_DEPARTURES) + 1)
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._natural: FloatArray = np.zeros(1)
         self._commanded: FloatArray = np.zeros(1)
@@ -121,28 +121,40 @@ class CommandCheck:
             self._test_recovery(newest.state, rate)
             return None
         assert newest.variance is not None  # only the first checkpoint has no variance
-        variances = newest.variance.diagonal().tolist()
-        departure = [y / math.sqrt(s) for y, s in zip(newest.innovation, variances, strict=True)]
-        largest = _DEPARTURES[1] * self._scale
-        if not all(abs(value) <= largest for value in departure) and not self._explains(newest):
+        variances, scale = newest.variance.diagonal().tolist(), self._scale
+        before = self._totals[-1][1] if self._totals else [0.0] * len(variances)
+        within, square, newly = True, 0.0, []
+        for y, variance, total in zip(newest.innovation, variances, before, strict=True):
+            departure = y / math.sqrt(variance)
+            within = within and abs(departure) <= _DEPARTURES[1] * scale
+            square += departure * departure
+            newly.append(total + departure / scale)
+        if not within and not self._explains(newest):
             return None
-        self._departures.append((newest.time_ns, [value / self._scale for value in departure]))
-        size = min(sum(value * value for value in departure) / len(departure), _DEPARTURES[1] ** 2)
-        self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
-        newest_first = zip(*(value for _, value in reversed(self._departures)), strict=True)
-        totals = [list(itertools.accumulate(axis)) for axis in newest_first]
+        if not self._totals:
+            self._totals.append((newest.time_ns, before))
+        self._totals.append((newest.time_ns, newly))
+        size = min(square / len(newly), _DEPARTURES[1] ** 2)
+        self._scale = math.sqrt(max(1.0, scale**2 + (size - scale**2) / _SCALE_OVER))
         for count, limit in _SUMS.items():
-            if count <= len(self._departures) and any(abs(total[count - 1]) > limit for total in totals):
-                since_ns = self._departures[-count][0] - _BEFORE_NS
+            if count < len(self._totals) and self._exceeds(count, limit):
+                since_ns = self._totals[-count][0] - _BEFORE_NS
                 self.active = True
                 self._forget()
                 return since_ns
         return None
 
+    def _exceeds(self, count: int, limit: float) -> bool:
+        """Return whether the sum of the last `count` innovations exceeds a limit about any axis."""
+        for total, earlier in zip(self._totals[-1][1], self._totals[-1 - count][1], strict=True):
+            if abs(total - earlier) > limit:
+                return True
+        return False
+
     def _explains(self, newest: Checkpoint) -> bool:
         """Return whether wrong coil currents and noise together can explain the newest innovation."""
         assert newest.variance is not None
-        gap = (newest.time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
+        gap = (newest.time_ns - self._totals[-1][0]) * 1e-9 if self._totals else _SHORTEST_GAP
         # The variable `change` is the largest change of the rate (rad/s) that unknown currents can cause.
         state, model, duration = newest.state, self._model, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP)
         idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
@@ -192,7 +204,7 @@ class CommandCheck:
         return True
 
     def _forget(self) -> None:
-        self._departures.clear()
+        self._totals.clear()
         self._samples.clear()
         self._natural = self._commanded = np.zeros(1)
 

@@ -149,8 +149,9 @@ class RigidBody:
 
         The default field is the constant field of the body description.
         """
-        x, y, z = (float(i) for i in currents)
-        bx, by, bz = (float(b) for b in (self.field if reference_field is None else reference_field))
+        x, y, z = np.asarray(currents, dtype=float).tolist()
+        field = self.field if reference_field is None else reference_field
+        bx, by, bz = np.asarray(field, dtype=float).tolist()
         n = self.dipole_per_ampere
         return Torquing(
             (n * x, n * y, n * z), (bx, by, bz), (float(x != 0.0), float(y != 0.0), float(z != 0.0)), known
@@ -308,7 +309,7 @@ def propagate(
         steps,
     )
     # The attitudes stored for exposures do not change.
-    return state._replace(quaternion=quaternion, rate=rate), covariance
+    return FilterState(quaternion, rate, *state[2:]), covariance
 
 
 def _propagated_numpy(
