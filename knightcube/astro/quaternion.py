@@ -75,11 +75,13 @@ def attitude_matrix(q: FloatArray) -> FloatArray:
 
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
-    """Return the quaternion (4,) of an attitude matrix (3, 3), with a scalar part of at least 0.
+    """Return the quaternions (..., 4) of attitude matrices (..., 3, 3), with scalar parts of at least 0.
 
     The largest component is computed first (Shepperd's method), so that the method has no singularity.
     """
     a = np.asarray(matrix)
+    if a.ndim > 2:
+        return _from_matrices(a)
     trace = a[0, 0] + a[1, 1] + a[2, 2]
     squares = np.array([a[0, 0], a[1, 1], a[2, 2], trace])
     largest = int(np.argmax(squares))
@@ -94,6 +96,20 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
         q[3] = a[j, k] - a[k, j]
     q = normalise(q)
     return -q if q[3] < 0 else q
+
+
+def _from_matrices(a: FloatArray) -> FloatArray:
+    """Return the quaternions (..., 4) of attitude matrices (..., 3, 3), by Shepperd's method (see above)."""
+    products = np.empty((*a.shape[:-2], 4, 4))  # four times the products of the components
+    products[..., :3, :3] = a + np.swapaxes(a, -1, -2)
+    own, trace = np.diagonal(a, axis1=-2, axis2=-1), np.trace(a, axis1=-2, axis2=-1)
+    i, j, k = np.arange(3), np.array([1, 2, 0]), np.array([2, 0, 1])
+    products[..., i, i] = 1.0 + 2.0 * own - trace[..., None]
+    products[..., 3, :3] = products[..., :3, 3] = a[..., j, k] - a[..., k, j]
+    products[..., 3, 3] = 1.0 + trace
+    largest = np.argmax(np.concatenate([own, trace[..., None]], axis=-1), axis=-1)
+    q = normalise(np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :])
+    return np.where(q[..., 3:] < 0.0, -q, q)
 
 
 def from_rotation_vector(vector: FloatArray) -> FloatArray:

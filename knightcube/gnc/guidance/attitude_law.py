@@ -122,7 +122,7 @@ class AttitudeLaw:
         """Return commanded attitudes (n, 4) at times (n,) s. Raises UsageError for parallel directions."""
         wanted = _frames(self.first(ephemeris, times), self.second(ephemeris, times))
         body = _frames(self.axis[None], self.across[None])[0]
-        return np.array([from_matrix(body.T @ frame) for frame in wanted])
+        return from_matrix(body.T @ wanted)
 
 
 Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
@@ -132,7 +132,8 @@ Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
 
 def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
     """Return commanded attitudes, and rates and accelerations by central differences, at times (n,), s."""
-    before, now, after = (attitudes(ephemeris, times + shift) for shift in (-DIFFERENCE, 0.0, DIFFERENCE))
+    shifted = np.concatenate([times - DIFFERENCE, times, times + DIFFERENCE])
+    before, now, after = np.split(attitudes(ephemeris, shifted), 3)
     back = to_rotation_vector(multiply(before, conjugate(now)))
     ahead = to_rotation_vector(multiply(after, conjugate(now)))
     return AttitudeReferences(times, now, (ahead - back) / (2.0 * DIFFERENCE), (ahead + back) / DIFFERENCE**2)

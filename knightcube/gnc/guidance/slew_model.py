@@ -26,12 +26,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import erfa
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices, tangent_basis
+from knightcube.astro.arrays import FloatArray, cross_matrices, tangent_basis
 from knightcube.astro.earth.disturbance import AIR, CONSTANT, LIGHT, Pressures, pressures
 from knightcube.astro.earth.ephemeris import Ephemeris
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
@@ -95,12 +96,6 @@ class SlewEnvironment:
     position: FloatArray
     pressures: Pressures | None = None
 
-    def part(self, which: IntArray) -> SlewEnvironment:
-        """Return the environment at the times with the indices `which`."""
-        found = self.pressures
-        pressed = None if found is None else Pressures(found.air[which], found.light[which])
-        return SlewEnvironment(self.field[which], self.position[which], pressed)
-
     def gradient(self) -> tuple[FloatArray, FloatArray]:
         """Return unit vectors (n, 3) along the positions, and gravity gradients 3 mu / r^3 (n,), 1/s^2."""
         radius = np.linalg.norm(self.position, axis=1)
@@ -162,6 +157,13 @@ class SlewDynamics:
         self._parts = np.zeros((len(down), _Z, 10))
         for part, columns in ((_M, _DIPOLE), (_W, _RATE), (_Q, _ATTITUDE)):
             self._parts[:, part, columns] = np.eye(part.stop - part.start)
+
+    def part(self, which: slice) -> SlewDynamics:
+        """Return the equations of motion at some of the times."""
+        found = copy(self)
+        found._forms, found._pushes = self._forms[which], self._pushes[which]
+        found._parts = self._parts[which]
+        return found
 
     def field(self, q: FloatArray) -> FloatArray:
         """Return the scaled magnetic field b (n, 3), body axes, at attitudes (n, 4)."""

@@ -82,8 +82,8 @@ def closed(
     equations, at = program.equations, point.at
     layout, count, scale = equations.layout, equations.count, equations.scale
     around = along(np.linspace(0.0, scale, 2 * _STEPS * count + 1))
-    firsts = 2 * _STEPS * np.arange(count)
-    motions = [SlewDynamics(craft, scale, unit, around.part(firsts + k)) for k in range(2 * _STEPS + 1)]
+    motion = SlewDynamics(craft, scale, unit, around)
+    motions = [motion.part(slice(k, 2 * _STEPS * count + k, 2 * _STEPS)) for k in range(2 * _STEPS + 1)]
     factors = program.factors(point)
     middles, ends = _integrated(motions, at, 1.0 / count)
     for _ in range(_ROUNDS):

@@ -108,6 +108,14 @@ def test_matrix_of_a_half_turn_has_no_singularity(axis: FloatArray) -> None:
     assert _close(np.abs(quaternion.from_matrix(quaternion.attitude_matrix(q))), np.abs(q))
 
 
+def test_matrices_are_converted_together_as_one_by_one() -> None:
+    q = quaternion.normalise(np.random.default_rng(5).normal(size=(60, 4)))
+    q = np.concatenate([q, np.eye(4)])
+    matrices = quaternion.attitude_matrix(q)
+    alone = np.array([quaternion.from_matrix(each) for each in matrices])
+    assert _close(quaternion.from_matrix(matrices.reshape(16, 4, 3, 3)), alone.reshape(16, 4, 4))
+
+
 @given(_unit(3), st.floats(0.0, 3.14))
 def test_rotation_vector_round_trip(axis: FloatArray, angle: float) -> None:
     vector = angle * axis
