@@ -403,6 +403,9 @@ AGAIN_NS = 10_000_000_000
 """Time (ns) until the next planning request after a failed plan, or while the orbit is unknown."""
 REST_AGAIN_NS = 5_000_000_000
 """Shortest time (ns) between two plans for the rest of a slew."""
+MOST_WAITS = 4
+"""Largest number of times `REST_AGAIN_NS` until the rest of a slew is planned again. The number grows by one
+with each plan that does not improve the present plan, because most plans that follow do not improve it."""
 _SMALLEST = 0.5
 """Smallest plausible principal moment of inertia, relative to the smallest configured moment."""
 
@@ -464,7 +467,7 @@ class PointingPlanner:
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = self._held = False
-        self._after_ns = self._count = self._accepted = self._refused = 0
+        self._after_ns = self._count = self._accepted = self._refused = self._unimproved = 0
 
     def busy_since_ns(self) -> int | None:
         """Return the time (ns) at which the worker began its plan, or None while the worker is idle."""
@@ -577,7 +580,7 @@ class PointingPlanner:
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:
-            self._accepted, self._held = self._accepted + 1, False
+            self._accepted, self._held, self._unimproved = self._accepted + 1, False, 0
             self._objects.judge(job, result.value, now_ns)
             if (slew := result.value.slew) is not None:
                 fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))
@@ -587,6 +590,8 @@ class PointingPlanner:
     def _continue(self, job: PointingJob, table: PointingTable | None, now_ns: int) -> None:
         """Follow a new plan for the rest of the running slew; without a new plan, keep the present plan."""
         paths = self._paths
+        self._unimproved = 0 if table is not None else self._unimproved + 1
+        self._after_ns = job.origin_ns + min(1 + self._unimproved, MOST_WAITS) * REST_AGAIN_NS
         if table is None or paths.astray.since is not None or not paths.is_slewing(now_ns, job.target):
             return
         if reason := paths.offer(table, job.target, job.origin_ns, continues=True):

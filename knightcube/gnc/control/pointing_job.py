@@ -88,6 +88,8 @@ HOTTER = 1.1
 """Largest accepted ratio of the coil heat of a new plan to the coil heat of the present plan, for the
 remaining slew. A new plan with more heat is rejected, because it would correct a deviation for which the
 remaining time is too short."""
+FEWEST = 12
+"""Smallest number of collocation intervals for the remaining part of a slew."""
 _INSIDE = 1e-6
 """Additional reduction (rad) of the half angle of a violated exclusion cone, so that the path is outside the
 cone."""
@@ -355,6 +357,9 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
     )
     around = along(ahead, LEAD, job.areas, near)
     task = _task(begin, wish, job.target, job.axes, ahead, around, near.horizon, avoided)
+    # The rest of a slew needs fewer intervals than the whole slew for the same accuracy.
+    nodes = math.ceil(NODES * near.horizon / wish.seconds)
+    task = replace(task, nodes=min(max(nodes, FEWEST), NODES))
     _, plan_rest = wish.planners()
     try:
         plan = plan_rest(task, near)

@@ -125,6 +125,10 @@ _ROOM = math.radians(0.005)
 """Minimum angle (rad) between camera axis and exclusion cone at the checked times. Between two checked times,
 the camera axis approaches a cone by less than this angle, and therefore does not enter the cone."""
 
+_RESERVE = 0.3
+"""Part of the deviation of a clearance from its chord that is added to the margin of a similar path. A larger
+part means fewer corrections of paths, but a larger distance from the cones and more heat."""
+
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
 _ASTRAY = 1.05
@@ -199,6 +203,8 @@ def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
     """
     check(task)
     search = SlewSearch(task, *GRIDS[0])
+    near = near.since(0.0, task.nodes)
+    search.solver.extra = _margins(task, near)
     found = search.solver.again(near)
     return None if found is None else _first(task, search, iter([found]))
 
@@ -220,6 +226,24 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
             else:
                 return plan
     return None
+
+
+def _margins(task: SlewTask, path: SlewPath) -> FloatArray:
+    """Return the angles (cones, 2 nodes), rad, that widen cones at the points of a path similar to `path`.
+
+    Between two points, the camera axis may be closer to a cone than at both points. The difference depends on
+    where between the points the axis is closest to the cone, and is at most the deviation of the clearance
+    from its chord. The margin is the difference on the given path plus a part of this deviation.
+    """
+    clear = _clearances(task, path)
+    ends, middles = clear[:, ::_DENSE], clear[:, _DENSE // 2 :: _DENSE]
+    least = clear[:, 1:].reshape(len(clear), 2 * task.nodes, _DENSE).min(axis=2)
+    nearer = np.maximum(np.minimum(ends[:, :-1], ends[:, 1:]) - least, 0.0)
+    bent = np.maximum(0.5 * (ends[:, :-1] + ends[:, 1:]) - middles, 0.0)
+    wider: FloatArray = np.minimum(nearer + _RESERVE * bent, bent) + _required(clear)
+    wider[:, :-1] = np.maximum(wider[:, :-1], wider[:, 1:])
+    wider[:, -1] = 0.0
+    return wider
 
 
 def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
@@ -286,9 +310,13 @@ def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
     the path, if this angle is smaller.
     """
     clear = _clearances(task, path)
-    room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
-    inside = np.maximum(room - clear, 0.0)
+    inside = np.maximum(_required(clear) - clear, 0.0)
     return np.asarray(inside[:, 1:].reshape(len(inside), 2 * task.nodes, _DENSE).max(axis=2))
+
+
+def _required(clear: FloatArray) -> FloatArray:
+    """Return the required angle (cones, 1), rad, from each cone, for clearances (cones, n) along a path."""
+    return np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
 
 
 LEAD = 2.0 * DIFFERENCE

@@ -12,7 +12,8 @@ been estimated by then (`learned`).
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
 worker (`pointing_job`). As in flight, the rest of the slew is planned again every EVERY cycles from the
-newest estimate, and each new path is followed from its start.
+newest estimate, later after plans that do not improve the present plan, and each new path is followed from
+its start.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.bodies.orbit.guidance import REST
+from flight.bodies.orbit.guidance import MOST_WAITS, REST
 from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import box_areas
@@ -146,7 +147,7 @@ class SlewFlight(PointingFlight):
         path = self._begin(start)
         optimum = self._optimum(path)
         running, begun, arrival = path, start + LEAD, start + LEAD + path.horizon
-        worst, plans, k = 0.0, 0, first
+        worst, plans, k, due, unimproved = 0.0, 0, first, first + EVERY, 0
         while k * CYCLE < arrival:
             time = k * CYCLE
             if self._next is not None and time >= self._next[0]:
@@ -155,9 +156,11 @@ class SlewFlight(PointingFlight):
                 running, self._next, plans = table.slew, None, plans + 1
                 self._law, self._begun = PointingLaw(table, self.flight.limit), origin
             is_near_end = arrival - time < REST * path.horizon
-            if k > first and (k - first) % EVERY == 0 and not is_near_end:
+            if k == due and not is_near_end:
                 job = self._slew_job(time)
                 rest = pointing_job.run(replace(job, running=RunningSlew(running, time - begun)))
+                unimproved = 0 if rest is not None else unimproved + 1
+                due = k + min(1 + unimproved, MOST_WAITS) * EVERY
                 self._next = None if rest is None else (time + LEAD, time, rest)
             self.cycle(time)
             worst, k = max(worst, float(np.linalg.norm(self._turn))), k + 1

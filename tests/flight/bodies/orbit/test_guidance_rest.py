@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.guidance import (
+    MOST_WAITS,
     REST,
     REST_AGAIN_NS,
     LearnedBody,
@@ -96,12 +97,26 @@ def test_the_rest_is_planned_again_every_few_seconds_with_the_learned_body(slew:
     assert job.slew.residual is RESIDUAL
     np.testing.assert_array_equal(job.inertia, LEARNED)
     np.testing.assert_array_equal(job.areas, box_areas(INERTIA))
-    flight.finish(41.0, None)
+    flight.finish(41.0, replace(slew, path=replace(slew.path, times=slew.path.times - 8.0)))
     again = 40.0 + REST_AGAIN_NS / SECOND_NS
     flight.serve(again - 0.1)
     assert len(flight.jobs) == 1
     flight.serve(again)
     assert len(flight.jobs) == 2
+
+
+def test_after_plans_that_improve_nothing_the_rest_is_planned_again_later(slew: PointingTable) -> None:
+    flight = Flight()
+    flight.paths.offer(slew, NADIR, 0)
+    flight.serve(40.0)
+    again = 40.0
+    for count, waits in enumerate([*range(2, MOST_WAITS + 1), MOST_WAITS], 1):
+        flight.finish(again + 0.1, None)
+        again += waits * REST_AGAIN_NS / SECOND_NS
+        flight.serve(again - 0.1)
+        assert len(flight.jobs) == count
+        flight.serve(again)
+        assert len(flight.jobs) == count + 1
 
 
 def test_near_its_end_a_slew_is_not_planned_again(slew: PointingTable) -> None:

@@ -21,7 +21,8 @@ from knightcube.gnc.guidance.slew_model import (
     Cone,
     SlewCraft,
 )
-from knightcube.gnc.guidance.slew_plan import SlewOrder, SlewStatus, plan_order, plan_task
+from knightcube.gnc.guidance.slew_plan import SlewOrder, SlewStatus, plan_near, plan_order, plan_task
+from knightcube.gnc.guidance.slew_search import SlewSearch
 from tests.support.circular_orbits import circular
 from tests.support.random_slews import clearance, slews
 from tests.support.recorded_slews import (
@@ -144,6 +145,17 @@ def test_a_plan_near_that_of_nearly_the_same_task_takes_a_tenth_of_the_steps() -
     assert again.steps < 30
     assert again.energy < 1.05 * plan_task(turned).energy
     assert clearance(turned, again) >= 0.0
+
+
+def test_a_plan_near_a_path_that_grazes_a_cone_needs_no_correction(monkeypatch: pytest.MonkeyPatch) -> None:
+    *_, (_, task) = slews(4, 44, True)
+    plan = plan_task(task)
+    monkeypatch.setattr(SlewSearch, "widened", Mock(side_effect=AssertionError("corrected")))
+    again = plan_near(task, plan.path)
+    assert again is not None
+    assert 0.0 <= clearance(task, plan) < np.radians(0.1)
+    assert clearance(task, again) >= 0.0
+    assert again.energy < 1.001 * plan.energy
 
 
 @pytest.mark.parametrize(("duration", "given", "longest"), [(200.0, None, 600.0), (200.0, 250.0, 250.0)])
