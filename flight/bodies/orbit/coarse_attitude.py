@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -234,14 +235,18 @@ class HorizonCameraFeed:
         ]
         if self.compare is not None:
             self.compare(time_ns, seen[0], seen[1], self._field_sight(time_ns))
+        of_cells = found.sun is not None and not found.sun.cameras
         if not self._filter.runs or self._against >= CONTRADICTED:
-            began = self._begin(time_ns, [one for one in seen if one is not None])
-            return began and seen[0] is not None, began and seen[1] is not None
+            first, nadir = seen
+            if first is not None and not of_cells:
+                # The filter adds only the misalignment of nadir's cameras to the error of a first attitude.
+                first = replace(first, covariance=first.covariance + self._filter.sun_misalignment)
+            began = self._begin(time_ns, [one for one in (first, nadir) if one is not None])
+            return began and first is not None, began and nadir is not None
         then = self._filter.past(time_ns)
         if then is None:
             return False, False
         # A Sun direction that comes from the solar cells alone is used by `CoarseSunFeed` instead.
-        of_cells = found.sun is not None and not found.sun.cameras
         mine = [None if of_cells else seen[0], seen[1]]
         claim, turn = then.covariance[ATTITUDE, ATTITUDE], attitude_matrix(then.quaternion)
         refused = [one is not None and _contradicts(one, turn, claim) for one in mine]

@@ -64,6 +64,7 @@ from knightcube.gnc.estimation.free_filter import (
     INERTIA,
     MAGNET,
     SLOW,
+    SUN_CAMERA,
     SUNLIT,
     TORQUES,
     FilterEnvironment,
@@ -514,6 +515,11 @@ class OrbitFilter:
     def runs(self) -> bool:
         """Whether the filter has started and accepts measurements, even if the attitude is lost."""
         return self._free.started
+
+    @property
+    def sun_misalignment(self) -> FloatArray:
+        """Covariance (3, 3), rad^2, of the misalignment of a camera that has not yet measured the Sun."""
+        return np.asarray(self._free.layout.prior[SUN_CAMERA, SUN_CAMERA])
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
         """Return the newest magnetic field and the gyro rate of the same step (`StepReplay.newest_field`)."""

@@ -17,13 +17,16 @@ from knightcube.astro.earth.disturbance import Pressures
 from knightcube.astro.quaternion import (
     angle_between,
     attitude_matrix,
+    conjugate,
     from_rotation_vector,
     multiply,
     normalise,
+    to_rotation_vector,
 )
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Knowledge
+from knightcube.gnc.estimation.estimate import ATTITUDE, AttitudeMeasurement, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
+from knightcube.gnc.estimation.rigid_body import BodyErrors
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection, StructureMap, run
 
@@ -98,6 +101,26 @@ def test_sun_and_nadir_start_the_filter_and_one_direction_with_the_field_does() 
         assert craft.look(craft.seen(1e-3, sun, nadir)) == (sun, nadir)
         assert craft.filter.started
         assert craft.error < np.radians(3.0), "the field is known to a degree"
+
+
+def test_the_first_attitude_counts_the_misalignments_of_the_cameras_of_sun_and_nadir() -> None:
+    """Misaligned cameras do not contradict each other; the covariance is up to three times too large."""
+    rng, sigma, squares = np.random.default_rng(11), 2e-4, []
+    for seed in range(40):
+        craft = Still(seed)
+        craft.rest(2)
+        body = attitude_matrix(craft.attitude)
+        sights = []
+        for reference in (SUN, DOWN):
+            misalignment = rng.normal(0.0, BodyErrors().horizon / np.sqrt(3.0), 3) + rng.normal(0.0, sigma, 3)
+            seen = attitude_matrix(from_rotation_vector(misalignment)) @ body @ reference
+            sights.append(MeasuredDirection(seen, sigma**2 * np.eye(3), (0,)))
+        assert craft.look(HorizonCameraResult(*sights)) == (True, True)
+        estimate = craft.filter.at(craft.now_ns)
+        error = to_rotation_vector(multiply(estimate.quaternion, conjugate(craft.attitude)))
+        claim = estimate.covariance[ATTITUDE, ATTITUDE]
+        squares.append(float(error @ np.linalg.solve(claim, error)) / 3.0)
+    assert 0.3 < np.mean(squares) < 1.3
 
 
 def test_a_nadir_of_eleven_degrees_starts_it_too_and_alone_says_nothing() -> None:
