@@ -184,7 +184,9 @@ def step(
     total = information + prior
     unit = np.sqrt(np.diag(total))
     if not np.all(unit > 0.0):
-        raise CalibrationError("a parameter of the lens has no information: give a prior")
+        raise CalibrationError(
+            "the stars do not determine a parameter of the lens: give its prior uncertainty"
+        )
     scaled = total / np.outer(unit, unit)
     if not np.linalg.eigvalsh(scaled)[0] > _MIN_INDEPENDENCE:
         raise CalibrationError("the matches do not separate the lens's parameters: give a prior")

@@ -767,7 +767,11 @@ _ALL = (
     _fault("bus: intermittent", _LOW_AT_TIMES, intermittently(_hanging_bus), _turns(), adds=True),
     *(fault for axis in COIL_NAMES for fault in _coil_faults(axis)),
     *_frame_faults("camera"),
-    _fault("gps: off", "no power; afterwards configuration and satellites are lost", _without_power),
+    _fault(
+        "gps: off",
+        "no power; then default settings and a new search for satellites",
+        _without_power,
+    ),
     _fault("gps: silent", "no byte arrives", _on_line, adds=True),
     _fault("gps: no-fix", "no satellite is received", _held("blind", lambda *_: True, False)),
     _fault("gps: stuck", "the same epoch repeatedly", _frozen),

@@ -264,7 +264,7 @@ def make_caged(inputs: WorldInputs) -> CagedTestbed:
     config, section = as_testbed(inputs.config), inputs.section
     if config.cage is None or section.cage is None:
         missing = "cage" if config.cage is None else "simulation.cage"
-        raise ConfigError(missing, "is missing: the world cage needs it")
+        raise ConfigError(missing, "is missing: the simulated Helmholtz coil needs it")
     model, angle, rate = model_of(config, section)
     field = OrbitField(section.cage, config.cage.scale, section.utc, section.seed)
     return CagedTestbed(model, angle, rate, inputs.currents, field, inputs.start_ns)

@@ -257,7 +257,7 @@ WORKLOAD = _packet(
 )(
     Field("level", "u1", "-", "level of the reduction; 0 if all work is done", limits=_LEVEL),
     counter("frames_shed", "frames of the star camera skipped since start"),
-    counter("plans_shed", "periodic plans skipped since start"),
+    counter("plans_shed", "periodic planning jobs skipped since start"),
     counter("frames_late", "frames since start whose processing took too long or whose worker was busy"),
     counter("plans_late", "plans since start that took too long"),
     counter("cycles_lost", "control cycles skipped since start"),

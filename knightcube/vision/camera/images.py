@@ -177,7 +177,7 @@ def _fits_content(path: Path) -> bytes:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
     if not content.startswith(SIGNATURE):
-        raise UsageError(f"{path}: contains no FITS image in gzip: decompress or convert it")
+        raise UsageError(f"{path}: compressed, but not a FITS image: decompress or convert it")
     if len(content) > _MOST_BYTES:
         raise UsageError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB: decompress it first")
     return content
