@@ -49,7 +49,9 @@ and 18 % for a single ADC sample of the chopped current (`hal.drivers.current_mo
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -131,6 +133,7 @@ class SelfTest:
         """Set the standard deviation `rate_noise` (rad/s) of a gyro sample."""
         self._response, self._settings = response, settings
         self._least = _SHOWN * rate_noise / (_EFFICIENCY * math.sqrt(4.0 * settings.gyro_hz / 3.0))
+        self._quiet: list[float] = (_QUIET * settings.limits).tolist()
         self._shown_ns: list[int | None] = [None] * len(settings.limits)
         self._running: tuple[int, int, int, float] | None = None
         self._loud_ns = 0
@@ -145,9 +148,12 @@ class SelfTest:
         self._running = None
         self._tested.clear()
 
-    def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
-        """Return test currents (n,), A, of a `usable` coil instead of the `wanted` currents, or None."""
-        if (np.abs(wanted) > _QUIET * self._settings.limits).any():
+    def wave(self, wanted: FloatArray, usable: Callable[[], BoolArray], now_ns: int) -> FloatArray | None:
+        """Return test currents (n,), A, of one coil instead of the `wanted` currents, or None.
+
+        The function `usable`, which is called before a test, returns flags (n,) of the coils to be tested.
+        """
+        if any(abs(current) > limit for current, limit in zip(wanted.tolist(), self._quiet, strict=True)):
             self._loud_ns, self._running = now_ns, None
         for axis, shown_ns in enumerate(self._shown_ns):
             if shown_ns is None or self._response.is_healthy(axis):
@@ -172,14 +178,15 @@ class SelfTest:
         tested, self._tested = sorted(self._tested), {}
         return "; ".join(f"coil {COIL_NAMES[axis]}: {self._response.text(axis)}" for axis in tested)
 
-    def _begin(self, usable: BoolArray, now_ns: int) -> None:
+    def _begin(self, usable: Callable[[], BoolArray], now_ns: int) -> None:
         """Begin the test of the next coil that is due."""
         interval_ns = self._settings.interval_ns
         due = [
             axis
             for axis, shown_ns in enumerate(self._shown_ns)
-            if usable[axis] and shown_ns is not None and now_ns - shown_ns >= interval_ns
+            if shown_ns is not None and now_ns - shown_ns >= interval_ns
         ]
+        due = list(compress(due, usable()[due])) if due else []
         strength = self._response.strength if due else None
         if strength is None:
             return
@@ -571,7 +578,7 @@ class CoilMonitor:
         if self.suspicion or self._leg.is_searching:
             self._self_test.stop()
             return None
-        return self._self_test.wave(wanted, self.available & ~self.resting, self._commands.newest_ns)
+        return self._self_test.wave(wanted, lambda: self.available & ~self.resting, self._commands.newest_ns)
 
     def test_soon(self) -> None:
         """Test all coils as soon as possible."""

@@ -343,7 +343,7 @@ class CoilResponse:
 
     def is_healthy(self, axis: int) -> bool:
         """Return whether an axis had the gain of a healthy coil in the last `persistence` fits."""
-        return axis in self.axes(Finding.SOUND)
+        return self._in_a_row[Finding.SOUND][axis] >= _PERSISTENCE
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
         """Return the observed change of torque, divided by the change that a suspected fault would cause.

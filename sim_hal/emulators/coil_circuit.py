@@ -19,9 +19,9 @@ resistance.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import Enum
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -139,6 +139,8 @@ class CoilCondition(Enum):
     B_LOW = "b-low"
 
 
+_BLOCK = 256
+"""Number of random numbers that are drawn at once."""
 _SOUND = CoilCondition.SOUND
 _FREE: tuple[Pulse | None, Pulse | None] = (None, None)
 _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
@@ -149,6 +151,12 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
 }
 """Constant output of the bridge legs A and B for each fault; None is for a bridge leg that follows its
 input."""
+
+
+def _uniform_draws(generator: np.random.Generator) -> Iterator[float]:
+    """Yield random numbers from 0 to 1, which are drawn in blocks."""
+    while True:
+        yield from generator.random(_BLOCK).tolist()
 
 
 class CoilCircuit:
@@ -179,7 +187,7 @@ class CoilCircuit:
             )
             for coil in truth.coils
         )
-        self._generator, self._now_ns, self._uncertainty = generator, now_ns, uncertainty
+        self._draws, self._now_ns, self._uncertainty = _uniform_draws(generator), now_ns, uncertainty
         self._bus_voltage = truth.supply_voltage if bus_voltage is None else bus_voltage
         self._supply_voltage = truth.supply_voltage
         count = len(self._coils)
@@ -208,7 +216,7 @@ class CoilCircuit:
     def update(self, written: int) -> None:
         """Update the currents after an I2C STOP. The bit mask `written` contains the written PWM channels."""
         count, high = len(self._coils), self.chip.high
-        draws = self._generator.random(count).tolist() if written else [0.5] * count
+        draws = list(islice(self._draws, count)) if written else [0.5] * count
         for axis, ((channel_a, channel_b), channels, step, limit) in enumerate(self._coils):
             stuck_a, stuck_b = self._stuck[axis]
             bridge = Bridge(stuck_a or high(channel_a), stuck_b or high(channel_b))

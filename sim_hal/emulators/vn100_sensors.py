@@ -134,8 +134,9 @@ class Sensors:
         """
         self._rng, self._profile = rng, profile
         # One matrix maps rate, field and specific force in body axes to sensor axes and the unit's own units.
-        self._map: FloatArray = np.kron(
-            np.diag([1.0, GAUSS_PER_TESLA, 1.0]), attitude_matrix(conjugate(mounting))
+        turn: FloatArray = attitude_matrix(conjugate(mounting))
+        self._map: FloatArray = np.asarray(
+            np.kron(np.diag([1.0, GAUSS_PER_TESLA, 1.0]), turn), dtype=np.float64
         )
         # A matrix product is enough, because the measurement is bilinear in true and error quaternion.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])

@@ -39,7 +39,7 @@ def _fly(
     flown = []
     for cycle in range(round(begin * 40), round((begin + seconds) * 40)):
         asked = np.zeros(3) if wanted is None else wanted
-        wave = test.wave(asked, usable, (cycle + 1) * TICK_NS)
+        wave = test.wave(asked, lambda: usable, (cycle + 1) * TICK_NS)
         flown.append(np.full(3, np.nan) if wave is None else wave)
     return np.array(flown)
 
@@ -118,7 +118,7 @@ def test_the_results_are_reported_once_after_the_last_test() -> None:
     told = []
     for cycle in range(40 * 80):
         now_ns = (cycle + 1) * TICK_NS
-        test.wave(np.zeros(3), ALL, now_ns)
+        test.wave(np.zeros(3), lambda: ALL, now_ns)
         if text := test.report(now_ns):
             told.append((cycle / 40, text))
     ((time, text),) = told
