@@ -25,7 +25,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import correlate1d, gaussian_filter
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
@@ -40,6 +40,7 @@ from knightcube.astro.arrays import (
 )
 from knightcube.astro.earth.figure import semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from sim_hal.earth_light import Atmosphere, EarthIntersection, air_tables, intersect, light, map_noise
 
@@ -368,11 +369,36 @@ def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -
     axis, _ = towards_sun(scene)
     if axis[2] <= 0.0 or model.scatter == 0.0:
         return
-    light = visible_share(scene) * float(axis[2]) * scatter_centre(model)
-    if light == 0.0:
+    glare = visible_share(scene) * float(axis[2]) * scatter_centre(model)
+    if glare == 0.0:
         return
-    squares = 2.0 - 2.0 * (pixel_rays(model.lens) @ axis).reshape(image.shape)
-    image += (light / (1.0 + squares / model.scatter_angle**2)).astype(np.float32)
+    _add_halo(_coarse_rays(Lens.of(model.lens)), axis, glare, model.scatter_angle**-2, image.reshape(-1))
+
+
+def _add_halo_numpy(
+    rays: Float32Array, axis: FloatArray, centre: float, sharpness: float, image: Float32Array
+) -> None:
+    """Add scattered light to `image`, as the numpy form of `_add_halo`."""
+    squares = np.zeros(len(image), dtype=np.float32)
+    for coordinates, value in zip(rays, axis.astype(np.float32), strict=True):
+        offset = coordinates - value
+        offset *= offset
+        squares += offset
+    squares *= np.float32(sharpness)
+    squares += 1.0
+    image += np.float32(centre) / squares
+
+
+@compiled_form_of(_add_halo_numpy)
+def _add_halo(
+    rays: Float32Array, axis: FloatArray, centre: float, sharpness: float, image: Float32Array
+) -> None:
+    """Add centre / (1 + sharpness s^2) to `image` (n,); s is the chord from `axis` (3,) to a ray (3, n)."""
+    peak, factor, one = np.float32(centre), np.float32(sharpness), np.float32(1.0)
+    x, y, z = np.float32(axis[0]), np.float32(axis[1]), np.float32(axis[2])
+    for n in range(len(image)):
+        right, down, ahead = rays[0, n] - x, rays[1, n] - y, rays[2, n] - z
+        image[n] += peak / (one + factor * (right * right + down * down + ahead * ahead))
 
 
 def scatter_centre(model: EarthCameraModel) -> float:
@@ -417,21 +443,93 @@ def blurred(model: EarthCameraModel, image: Float32Array) -> Float32Array:
     """
     if not image.any():
         return image
-    narrow = gaussian_filter(image, model.blur, mode="nearest", truncate=4.0) if model.blur > 0.0 else image
-    if model.scatter == 0.0:
-        return np.asarray(narrow)
-    return np.asarray(narrow * np.float32(1.0 - model.scatter) + _scattered(model, image))
+    return _spread(image, _blur_weights(model.blur), 1.0 - model.scatter, _scattered(model, image))
+
+
+@lru_cache(maxsize=4)
+def _blur_weights(sigma: float) -> Float32Array:
+    """Return the weights (2 k + 1,) of a Gaussian blur with standard deviation `sigma`, px, to 4 `sigma`."""
+    reach = int(4.0 * sigma + 0.5)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-9)) ** 2)
+    return np.asarray(weights / weights.sum()).astype(np.float32)
+
+
+def _spread_numpy(
+    image: Float32Array, weights: Float32Array, share: float, bins: Float32Array
+) -> Float32Array:
+    """Return the blurred image, as the numpy form of `_spread`."""
+    rows, columns = image.shape
+    narrow: Float32Array = correlate1d(
+        correlate1d(image, weights, 0, mode="nearest"), weights, 1, mode="nearest"
+    )
+    narrow *= np.float32(share)
+    narrow += _interpolation(len(bins), rows) @ bins @ _interpolation(bins.shape[1], columns).T
+    return narrow
+
+
+@compiled_form_of(_spread_numpy)
+def _spread(image: Float32Array, weights: Float32Array, share: float, bins: Float32Array) -> Float32Array:
+    """Return an image (rows, columns) after a blur and with scattered light.
+
+    Args:
+        image: radiance (rows, columns), which continues with its edge pixels beyond the edges.
+        weights: weights (2 k + 1,) of the blur along each axis.
+        share: factor of the blurred image.
+        bins: scattered light at the centres of bins of `_BIN` x `_BIN` px, for linear interpolation.
+    """
+    (rows, columns), (down, across) = image.shape, bins.shape
+    reach, factor = len(weights) // 2, np.float32(share)
+    result = np.empty((rows, columns), np.float32)
+    line, coarse = np.empty(columns + 2 * reach, np.float32), np.empty(across, np.float32)
+    for row in range(rows):
+        _add_rows(image, row, weights, line[reach : reach + columns])
+        line[:reach], line[reach + columns :] = line[reach], line[reach + columns - 1]
+        place = min(max((row + 0.5) / _BIN - 0.5, 0.0), down - 1.0)
+        above = int(place)
+        below, step = min(above + 1, down - 1), np.float32(place - above)
+        for n in range(across):
+            coarse[n] = bins[above, n] + step * (bins[below, n] - bins[above, n])
+        target = result[row]
+        for n in range(across + 1):
+            left, right = coarse[max(n - 1, 0)], coarse[min(n, across - 1)]
+            slope = (right - left) / np.float32(_BIN)
+            first = _BIN * n - _BIN // 2
+            for column in range(max(first, 0), min(first + _BIN, columns)):
+                target[column] = left + slope * (np.float32(column - first) + np.float32(0.5))
+        for k in range(len(weights)):
+            _add(factor * weights[k], line[k : k + columns], target)
+    return result
+
+
+@loop_helper
+def _add_rows(image: Float32Array, row: int, weights: Float32Array, total: Float32Array) -> None:
+    """Store the weighted sum of the rows around `row` of an image in `total` (columns,)."""
+    reach, bottom = len(weights) // 2, len(image) - 1
+    total[:] = np.float32(0.0)
+    for k in range(len(weights)):
+        _add(weights[k], image[min(max(row + k - reach, 0), bottom)], total)
+
+
+@loop_helper
+def _add(factor: np.float32, values: Float32Array, total: Float32Array) -> None:
+    """Add `factor` times `values` (n,) to `total` (n,)."""
+    for n in range(len(total)):
+        total[n] += factor * values[n]
 
 
 def _scattered(model: EarthCameraModel, image: Float32Array) -> Float32Array:
+    """Return the scattered light (rows / `_BIN`, columns / `_BIN`) at the centres of the bins."""
     rows, columns = image.shape
-    padded = np.pad(image, ((0, -rows % _BIN), (0, -columns % _BIN)), mode="edge")
-    down, across = padded.shape[0] // _BIN, padded.shape[1] // _BIN
-    bins = padded.reshape(down, _BIN, across, _BIN).mean(axis=(1, 3))
+    if rows % _BIN or columns % _BIN:
+        image = np.pad(image, ((0, -rows % _BIN), (0, -columns % _BIN)), mode="edge")
+    down, across = image.shape[0] // _BIN, image.shape[1] // _BIN
+    if model.scatter == 0.0:
+        return np.zeros((down, across), dtype=np.float32)
+    # Two sums are several times faster than a mean over two axes.
+    bins = image.reshape(down, _BIN, -1).sum(axis=1).reshape(down, across, _BIN).sum(axis=2) / _BIN**2
     kernel, shape = _kernel(down, across, model.scatter, model.scatter_angle, model.lens.focal_length)
     spread = irfft2(rfft2(bins, shape) * kernel, shape)[:down, :across]
-    smooth = _interpolation(down, rows) @ spread @ _interpolation(across, columns).T
-    return np.asarray(smooth, dtype=np.float32)
+    return np.ascontiguousarray(spread, dtype=np.float32)
 
 
 @lru_cache(maxsize=4)

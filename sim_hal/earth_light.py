@@ -117,6 +117,8 @@ _CELLS = 96
 """Edge length (grid cells) of the periodic noise volume."""
 _SLOPE = -2.3
 """Exponent of the noise amplitude as a power of the wave number, as for the spectrum of clouds."""
+_MODULO = np.arange(16 * _CELLS) % _CELLS
+"""Cells of the noise volume at whole coordinates up to the largest magnified coordinate and beyond."""
 _RADIUS = 0.42 * _CELLS
 """Radius (grid cells) of the Earth's sphere in the noise volume."""
 _MAGNIFICATION, _FINE = 11.0, 0.5
@@ -153,9 +155,10 @@ def _read(noise: npt.NDArray[np.int64], places: Float32Array) -> npt.NDArray[np.
     """
     low = np.floor(places)
     along, across, up = places - low
-    i, j, k = low.astype(np.int32) % _CELLS
-    rows = [column % _CELLS * _CELLS + k for column in (j, j + 1)]
-    layers = [layer % _CELLS * _CELLS**2 for layer in (i, i + 1)]
+    i, j, k = low.astype(np.intp)
+    k = _MODULO.take(k)
+    rows = [_MODULO.take(column) * _CELLS + k for column in (j, j + 1)]
+    layers = [_MODULO.take(layer) * _CELLS**2 for layer in (i, i + 1)]
 
     def line(layer: IntArray, row: IntArray) -> npt.NDArray[np.complex64]:
         pairs = noise.take(layer + row).view(np.int16).astype(np.float32).view(np.complex64)
@@ -263,6 +266,8 @@ _STEPS, _SUN_STEPS = 4096, 6144
 """Numbers of intervals in the tables of `AirTables`."""
 _HORIZON = 1024
 """Column of `AirTables.sun` for a Sun on the horizon."""
+_CHUNK = 32_768
+"""Number of lines of sight that the numpy form computes at a time, because small arrays are faster."""
 _BLOCK = 256
 """Number of lines of sight that `light` traces at a time."""
 
@@ -341,30 +346,34 @@ def light_numpy(
     """Return the radiance along rays, as the numpy form of `light`."""
     radiance = np.zeros(rays.shape[1], dtype=np.float32)
     at_limb = np.zeros(rays.shape[1], dtype=np.bool_)
-    chosen = near_earth(rays, origin, into_earth)
-    rays = _chosen(rays, chosen)
-    meeting = intersect(rays, origin, into_earth)
+    into_axes = (into_earth * axes[:, None]).astype(np.float32)
     scale, direction = axes.astype(np.float32)[:, None], sun.astype(np.float32)
-    normals = _unit(meeting.places.T / scale)
-    solar = direction @ normals
-    lit = np.flatnonzero((meeting.heights < TOP) & (solar > _DARKEST))
-    rays, places, normals = (_chosen(vectors, lit) for vectors in (rays, meeting.places.T, normals))
-    solar, hits, chosen = solar[lit], meeting.hits[lit], chosen[lit]
-    rays = (into_earth * axes[:, None]).astype(np.float32) @ rays
-    upward = np.clip(-np.sum(rays * normals, axis=0), 0.0, 1.0)
-    # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
-    turned = direction @ rays
-    above = meeting.heights[lit] * _PER_HEIGHT + np.float32(_STEPS + 1)
-    bottom, depth, opacity = _interpolated(sight_table, np.where(hits, upward * np.float32(_STEPS), above))
-    towards, warmth = _interpolated(sun_table, (np.minimum(solar, 1.0) - _DARKEST) * _PER_COSINE)
-    depth += 1.0
-    share = _interpolated(share_table, np.float32(_STEPS) * depth / (depth + towards * bottom))[0]
-    found = np.float32(haze) * (1.0 + turned * turned) * opacity * share
-    ground = np.flatnonzero(hits & (warmth > 0.0))
-    matt = np.float32(sunlight) * warmth[ground] * (1.0 - opacity[ground])
-    found[ground] += matt * albedo(_unit(places[:, ground] * scale), noise)
-    radiance[chosen] = found
-    at_limb[chosen] = ~hits & (found > 0.0)
+    for first in range(0, rays.shape[1], _CHUNK):
+        some = rays[:, first : first + _CHUNK]
+        chosen = near_earth(some, origin, into_earth)
+        some = _chosen(some, chosen)
+        meeting = intersect(some, origin, into_earth)
+        normals = _unit(meeting.places.T / scale)
+        solar = direction @ normals
+        lit = np.flatnonzero((meeting.heights < TOP) & (solar > _DARKEST))
+        some, places, normals = (_chosen(vectors, lit) for vectors in (some, meeting.places.T, normals))
+        solar, hits, chosen = solar[lit], meeting.hits[lit], chosen[lit] + first
+        some = into_axes @ some
+        upward = np.clip(-np.sum(some * normals, axis=0), 0.0, 1.0)
+        # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
+        turned = direction @ some
+        above = meeting.heights[lit] * _PER_HEIGHT + np.float32(_STEPS + 1)
+        place = np.where(hits, upward * np.float32(_STEPS), above)
+        bottom, depth, opacity = _interpolated(sight_table, place)
+        towards, warmth = _interpolated(sun_table, (np.minimum(solar, 1.0) - _DARKEST) * _PER_COSINE)
+        depth += 1.0
+        share = _interpolated(share_table, np.float32(_STEPS) * depth / (depth + towards * bottom))[0]
+        found = np.float32(haze) * (1.0 + turned * turned) * opacity * share
+        ground = np.flatnonzero(hits & (warmth > 0.0))
+        matt = np.float32(sunlight) * warmth[ground] * (1.0 - opacity[ground])
+        found[ground] += matt * albedo(_unit(places[:, ground] * scale), noise)
+        radiance[chosen] = found
+        at_limb[chosen] = ~hits & (found > 0.0)
     return radiance, at_limb
 
 
@@ -464,20 +473,22 @@ def _trace(
     m31, m32, m33 = m[2, 0], m[2, 1], m[2, 2]
     o1, o2, o3 = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
     a1, a2, a3 = np.float32(axes[0]), np.float32(axes[1]), np.float32(axes[2])
+    b1, b2, b3 = _ONE / a1, _ONE / a2, _ONE / a3
     s1, s2, s3 = np.float32(sun[0]), np.float32(sun[1]), np.float32(sun[2])
     for i in range(size):
         x, y, z = rays[0, start + i], rays[1, start + i], rays[2, start + i]
         u, v, w = m11 * x + m12 * y + m13 * z, m21 * x + m22 * y + m23 * z, m31 * x + m32 * y + m33 * z
         squares, along = u * u + v * v + w * w, o1 * u + o2 * v + o3 * w
-        share = along / squares
+        inverse = _ONE / squares
+        share = along * inverse
         x, y, z = o1 - share * u, o2 - share * v, o3 - share * w
         distance = x * x + y * y + z * z
         length = np.sqrt(distance)
         local = np.sqrt(a1 * a1 * x * x + a2 * a2 * y * y + a3 * a3 * z * z) / length
         height = max(length - _ONE, _ZERO) * local
-        back = np.sqrt(max(_ONE - distance, _ZERO) / squares)
+        back = np.sqrt(max(_ONE - distance, _ZERO) * inverse)
         x, y, z = x - back * u, y - back * v, z - back * w
-        n1, n2, n3 = x / a1, y / a2, z / a3
+        n1, n2, n3 = x * b1, y * b2, z * b3
         normal = _ONE / np.sqrt(n1 * n1 + n2 * n2 + n3 * n3)
         solar = min((s1 * n1 + s2 * n2 + s3 * n3) * normal, _ONE)
         upward = min(back * squares * normal, _ONE)

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 from knightcube.vision.camera.lens import Pinhole
+from sim_hal import earth_camera
 from sim_hal.earth_camera import (
     EarthCameraModel,
     EarthScene,
@@ -27,6 +29,7 @@ from sim_hal.earth_camera import (
     visible_share,
 )
 from tests.sim_hal.earth_camera.scenes import limb_scene, pointing, random_sun_scene
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.earth_truth import sun_direction, sun_point
 
 LOGARITHMIC = EarthCameraModel.fuga15d(dead_pixels=0, hot_pixels=0, fixed_pattern=0.0)
@@ -133,6 +136,26 @@ def test_the_same_seeds_make_the_same_frame_and_others_another() -> None:
     assert frames[0].shape == (512, 512)
     assert np.array_equal(frames[0], frames[1])
     assert not np.array_equal(frames[0], frames[2])
+
+
+@pytest.mark.parametrize("shape", [(40, 48), (37, 53), (3, 1)])
+@pytest.mark.parametrize("blur", [0.0, 0.6, 2.0])
+def test_the_loop_form_of_the_blur_equals_the_numpy_form(shape: tuple[int, int], blur: float) -> None:
+    generator = np.random.default_rng(4)
+    image = generator.uniform(0.0, 1.0, shape).astype(np.float32)
+    bins = generator.uniform(0.0, 1.0, (-(-shape[0] // 8), -(-shape[1] // 8))).astype(np.float32)
+    weights = earth_camera._blur_weights(blur)
+    assert_forms_agree(earth_camera._spread, image, weights, 0.9, bins, relative=1e-5)
+    expected = 0.9 * gaussian_filter(image.astype(float), max(blur, 1e-9), mode="nearest", truncate=4.0)
+    found = earth_camera._spread.numpy_form(image, weights, 0.9, np.zeros_like(bins))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_the_loop_form_of_the_glare_equals_the_numpy_form() -> None:
+    rays = np.ascontiguousarray(pixel_rays(Pinhole.from_field_of_view(40, 30, 1.0)).T, dtype=np.float32)
+    axis = np.array([0.1, -0.2, 0.97])
+    light = np.random.default_rng(5).uniform(0.0, 1.0, 1200).astype(np.float32)
+    assert_forms_agree(earth_camera._add_halo, rays, axis, 3.0, 1e4, light, relative=1e-5)
 
 
 CLEAN = EarthCameraModel.fuga15d(scatter=0.0)
