@@ -9,10 +9,11 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_about_axis_y
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import RateMeasurement
-from knightcube.gnc.estimation.replay import CommandHistory
-from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, begin, fly, follow
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, CommandCheck
+from knightcube.gnc.estimation.estimate import SIZE, FilterState, Parameters, RateMeasurement
+from knightcube.gnc.estimation.replay import Checkpoint, CommandHistory
+from knightcube.gnc.estimation.rigid_body import RigidBody
+from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, Flight, begin, fly, follow
 from tests.support.consistency_worlds import CYCLE_NS
 
 STUCK, FOUND, FREE_AGAIN, END = 400, 420, 600, 800
@@ -88,6 +89,44 @@ def test_a_gyro_that_jumps_further_than_any_current_pushes_raises_no_doubt(flown
         filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
     assert filter_.refused > 0
     assert not filter_.doubts_commands
+
+
+def judged(body: RigidBody, departures: list[float]) -> tuple[int, int | None]:
+    """Return the number of gyro samples up to an alarm, and the cycle of the first sample of its mean.
+
+    The values `departures` are the innovations about the y axis, in standard deviations. The innovations
+    about the other axes are zero.
+    """
+    settings = dataclasses.replace(SETTINGS, unknown_current=LIMIT)
+    model, sigma, axes = AttitudeFilter(body, settings)._model, 1e-4, 1 if body.suspended else 3
+    state = FilterState((0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, Parameters())
+    check = CommandCheck(model)
+    for cycle, departure in enumerate(departures):
+        sample = RateMeasurement(cycle * CYCLE_NS, np.zeros(3), sigma**2 * np.eye(3))
+        value = (sigma * departure,) if axes == 1 else (0.0, sigma * departure, 0.0)
+        newest = Checkpoint(sample, True, state, np.eye(SIZE), 0.0, value, sigma**2 * np.eye(axes))
+        since_ns = check.judge(newest)
+        if since_ns is not None:
+            assert check.active
+            return cycle + 1, (since_ns + 500_000_000) // CYCLE_NS
+    assert not check.active
+    return len(departures), None
+
+
+@pytest.mark.parametrize("body", [SUSPENDED, FREE])
+def test_a_sample_or_the_mean_of_several_samples_raises_an_alarm(body: RigidBody) -> None:
+    """A strong fault raises an alarm in one sample, a weaker fault in the mean of 4 or of 16 samples.
+
+    The currents are unknown from half a second before the first sample of the mean.
+    """
+    quiet = [0.0] * 20
+    assert judged(body, [*quiet, -6.0]) == (21, 20)
+    assert judged(body, [*quiet, *[-3.2] * 8]) == (24, 20)
+    assert judged(body, [3.2] * 8) == (4, 0)
+    number, since = judged(body, [*quiet, *[-2.6] * 16])
+    assert 30 < number <= 36
+    assert since == number - 16
+    assert judged(body, [*quiet, *[3.2, -3.2] * 20]) == (60, None)
 
 
 def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:
