@@ -30,11 +30,12 @@ from knightcube.astro import chi_square
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import multiply
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image
-from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, find_edges, observe
+from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, ScanLines, find_edges, observe
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine, near_limb
 from knightcube.vision.horizon.initial_guess import (
     MOST_MISMATCH,
     SPHERE_ALTITUDE_SIGMA,
+    ConeCandidate,
     InitialGuess,
     Place,
     above_sphere,
@@ -56,6 +57,7 @@ from knightcube.vision.horizon.limb import (
     shared_error,
 )
 from knightcube.vision.horizon.settings import (
+    EdgeSettings,
     HorizonKnowledge,
     HorizonSettings,
     RoughAttitude,
@@ -205,10 +207,17 @@ def find_nadir(
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
-    check_image(image, camera)
-    if hidden is not None:
-        check_image(hidden, camera)
-    search = _search(image, camera, knowledge, settings, hidden)
+    return _find(_ScannedImage(image, camera, hidden), knowledge, settings)
+
+
+def _find(
+    image: _ScannedImage, knowledge: HorizonKnowledge, settings: HorizonSettings, is_last: bool = True
+) -> HorizonSolution:
+    """Return the result of `find_nadir`.
+
+    If the search is not the last one in this image, it does not search for the reason of a refusal.
+    """
+    search = _search(image, knowledge, settings, is_last=False)
     found = search.solution()
     if found.nadir is not None and found.nadir.used >= settings.enough_edges:
         return found
@@ -217,14 +226,42 @@ def find_nadir(
     again = replace(settings, edges=replace(settings.edges, lines=settings.edges.more_lines))
     read = found.pixels_read
     if found.nadir is not None:
-        closer = _closer_search(search, image, camera, knowledge, again)
+        closer = _closer_search(search, image, knowledge, again)
         read += closer.read
         second = closer.solution()
         if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
             # The first search has already compared this horizon with the other horizons in the image.
             return replace(second, candidates=found.candidates, pixels_read=read)
-    second = _search(image, camera, knowledge, again, hidden).solution()
+    second = _search(image, knowledge, again, is_last).solution()
     return replace(second, pixels_read=read + second.pixels_read)
+
+
+class _ScannedImage:
+    """An image whose edges and cones are kept for further searches with other knowledge of directions."""
+
+    def __init__(self, image: Image, camera: CameraModel, hidden: BoolArray | None) -> None:
+        """Keep an image and its mask. Raises ValueError as `find_nadir`."""
+        check_image(image, camera)
+        if hidden is not None:
+            check_image(hidden, camera)
+        self.image, self.camera, self.hidden = image, camera, hidden
+        self._observed: dict[int, tuple[Observation, ScanLines, list[_FreeCone]]] = {}
+
+    def observed(self, settings: EdgeSettings) -> tuple[Observation, ScanLines, list[_FreeCone]]:
+        """Return edges and scan lines of the whole image, and the best cones that are already known."""
+        if settings.lines not in self._observed:
+            edges, lines = find_edges(self.image, settings, hidden=self.hidden)
+            self._observed[settings.lines] = observe(edges, lines, self.camera), lines, []
+        return self._observed[settings.lines]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FreeCone:
+    """The best cone through free edges (or None), the number of its free edges, and the edges left free."""
+
+    cone: ConeCandidate | None
+    count: int
+    free: BoolArray
 
 
 _FIELD_STEPS: FloatArray = np.linspace(-2.5, 2.5, 11)
@@ -311,7 +348,8 @@ def _by_field(
     for _ in range(_FIELD_ROUNDS):
         steps, trials = [], []
         for step in centre + width * _FIELD_STEPS:
-            search = _search(image, camera.rescaled(math.exp(step * sigma)), knowledge, settings, hidden)
+            rescaled = camera.rescaled(math.exp(step * sigma))
+            search = _search(_ScannedImage(image, rescaled, hidden), knowledge, settings)
             if search.hypotheses and not _contradiction(search.hypotheses[0]):
                 best = search.hypotheses[0]
                 steps.append(step)
@@ -386,65 +424,61 @@ class _Search:
 
 
 def _search(
-    image: Image,
-    camera: CameraModel,
-    knowledge: HorizonKnowledge,
-    settings: HorizonSettings,
-    hidden: BoolArray | None,
+    image: _ScannedImage, knowledge: HorizonKnowledge, settings: HorizonSettings, is_last: bool = True
 ) -> _Search:
     """Search a whole image for horizons."""
-    edges, lines = find_edges(image, settings.edges, hidden=hidden)
-    observation = observe(edges, lines, camera)
-    hypotheses = _hypotheses(observation, place_of(knowledge, settings), knowledge, settings, camera)
+    observation, lines, cones = image.observed(settings.edges)
+    # Another search follows only if the image has some edges.
+    is_last = is_last or len(observation.edges) < settings.some_edges
+    hypotheses = _hypotheses(observation, cones, knowledge, settings, image.camera, is_last)
     return _Search(observation, lines.levels, hypotheses, lines.pixels, settings.altitudes)
 
 
 def _closer_search(
-    search: _Search, image: Image, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
+    search: _Search, image: _ScannedImage, knowledge: HorizonKnowledge, settings: HorizonSettings
 ) -> _Search:
     """Search an image again near the best horizon of a first search, on more scan lines."""
     best, before = search.hypotheses[0], search.observation
     points = before.edges.points[best.members]
     box = np.stack([points.min(axis=0) - before.space, points.max(axis=0) + before.space])
-    edges, lines = find_edges(image, settings.edges, ImagePart(box, search.levels), before.hidden)
+    edges, lines = find_edges(image.image, settings.edges, ImagePart(box, search.levels), before.hidden)
     # The samples of the first search are used again, because they cover the whole image.
-    observation = observe(edges, lines, camera, before.samples)
+    observation = observe(edges, lines, image.camera, before.samples)
     members = near_limb(best.fit.view, observation, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
-    found = examine(again, observation, knowledge, settings, camera)
+    found = examine(again, observation, knowledge, settings, image.camera)
     hypotheses = [] if found is None or not _is_limb(found) else [found]
     return _Search(observation, search.levels, hypotheses, lines.pixels, settings.altitudes)
 
 
 def _hypotheses(
     observation: Observation,
-    place: Place | None,
+    cones: list[_FreeCone],
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
     camera: CameraModel,
+    is_last: bool,
 ) -> list[Hypothesis]:
     """Return the horizons found in the image, the best first.
 
     A horizon is fitted to the edges that agree with each of the best cones. Accepted horizons come before
-    refused horizons, and horizons with more edges before horizons with fewer edges.
+    refused horizons, and horizons with more edges before horizons with fewer edges. The list `cones` contains
+    the best cones known from an earlier search, and is extended by the cones that are needed.
     """
-    if place is None:
-        least, most = settings.altitudes
-        low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
-    else:
-        low = high = place.cosine
+    place = place_of(knowledge, settings)
     free = np.ones(len(observation.edges), dtype=bool)
     sound: list[Hypothesis] = []
     contradicted: list[InitialGuess] = []
     # Cones with so few edges that they cannot make an accepted horizon ambiguous are skipped.
     enough = float(settings.least_edges)
-    for _ in range(settings.candidates):
+    for number in range(settings.candidates):
         if np.count_nonzero(free) < enough:
             break
-        cone = best_cone(observation.rays, free, (low, high), settings.tolerance, settings.tries)
-        if cone is None or np.count_nonzero(cone.members & free) < enough:
+        if number == len(cones):
+            cones.append(_next_cone(observation, free, place, settings))
+        cone, free = cones[number].cone, cones[number].free
+        if cone is None or cones[number].count < enough:
             break
-        free = left_free(observation.rays, free, cone, settings.tolerance)
         guess = initial_guess(cone, observation, place, knowledge)
         if guess.orientation.mismatch > MOST_MISMATCH:
             contradicted.append(guess)
@@ -454,11 +488,27 @@ def _hypotheses(
             sound.append(found)
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
-    if all(_flaw(each) for each in sound):
+    if is_last and all(_flaw(each) for each in sound):
         # Initial guesses that contradict prior knowledge are fitted only to report why they are refused.
         fitted = (examine(each, observation, knowledge, settings, camera) for each in contradicted)
         sound += [each for each in fitted if each is not None and _is_limb(each)]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
+
+
+def _next_cone(
+    observation: Observation, free: BoolArray, place: Place | None, settings: HorizonSettings
+) -> _FreeCone:
+    """Return the best cone through the edges in the mask `free` (n,)."""
+    if place is None:
+        least, most = settings.altitudes
+        low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
+    else:
+        low = high = place.cosine
+    cone = best_cone(observation.rays, free, (low, high), settings.tolerance, settings.tries)
+    if cone is None:
+        return _FreeCone(None, 0, free)
+    left = left_free(observation.rays, free, cone, settings.tolerance)
+    return _FreeCone(cone, int(np.count_nonzero(cone.members & free)), left)
 
 
 def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
@@ -616,22 +666,27 @@ def nadir_of_cameras(
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
 
-    def searched(number: int, known: HorizonKnowledge) -> HorizonSolution:
+    scanned = {
+        number: _ScannedImage(image, cameras[number].lens, (hidden or {}).get(number))
+        for number, image in images.items()
+    }
+
+    def searched(number: int, known: HorizonKnowledge, is_last: bool = True) -> HorizonSolution:
         camera = cameras[number]
         rough = known.attitude
         if rough is not None:
             rough = RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma)
         sensed = tuple(replace(one, camera=camera.in_camera(one.camera)) for one in known.sensed)
-        seen = replace(known, attitude=rough, sensed=sensed)
-        return find_nadir(images[number], camera.lens, seen, settings, (hidden or {}).get(number))
+        return _find(scanned[number], replace(known, attitude=rough, sensed=sensed), settings, is_last)
 
-    each = {number: searched(number, knowledge) for number in images}
+    each = {number: searched(number, knowledge, is_last=False) for number in images}
     votes = [vote for number, solution in each.items() for vote in _votes(number, solution, cameras[number])]
     group, rival = _agreed(votes)
-    if rival:
-        return JointNadir(HorizonStatus.AMBIGUOUS, rival, None, (), each)
-    if not group:
-        return JointNadir(*_why_none(each), None, (), each)
+    if rival or not group:
+        # The reasons of refusals are searched only now, because further searches usually replace them.
+        each = {n: found if found.nadir is not None else searched(n, knowledge) for n, found in each.items()}
+        status, reason = (HorizonStatus.AMBIGUOUS, rival) if rival else _why_none(each)
+        return JointNadir(status, reason, None, (), each)
     vote = max(group, key=lambda one: one.edges)
     view = each[vote.camera].view
     assert view is not None  # each vote comes from a camera with a fitted horizon
