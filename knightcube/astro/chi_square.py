@@ -7,6 +7,7 @@ inverted by bisection. The module scipy.stats would need 13 MB of memory in the 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 _BISECTIONS = 200
 
@@ -20,6 +21,7 @@ def chance_beyond(x: float, degrees: int) -> float:
     return chance
 
 
+@lru_cache(maxsize=64)
 def bound(chance: float, degrees: int) -> float:
     """Return the value that a chi-square variable exceeds with a probability `chance` above 0 and up to 1."""
     low, high = 0.0, 1.0

@@ -29,7 +29,9 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
     """
     half = run // 2
     size = binary.shape[1]
-    padded = np.pad(binary.astype(np.int16), ((0, 0), (half, half)), mode="edge")
+    padded = np.empty((len(binary), size + 2 * half), dtype=np.int16)
+    padded[:, half : half + size] = binary
+    padded[:, :half], padded[:, half + size :] = binary[:, :1], binary[:, -1:]
     total = padded[:, :size].copy()
     for place in range(1, run):
         total += padded[:, place : place + size]
@@ -463,12 +465,11 @@ def _span(levels: Levels) -> float:
 
 def _sample_levels(light: FloatArray, levels: Levels) -> FloatArray:
     """Return `Samples.level` and `Samples.mottle`, as (2, k), of the sampled pixels of scan lines (n, m)."""
-    size, half = light.shape[1], _AVERAGED // 2
+    size, half = light.shape[1], _AVERAGED + _AVERAGED // 2
     index = _sample_places(size)[:, None] + np.arange(-half, half + 1)
-    before, here, after = (
-        light[:, np.clip(index + step, 0, size - 1)].mean(axis=2).ravel()
-        for step in (-_AVERAGED, 0, _AVERAGED)
-    )
+    around = light.take(np.minimum(np.maximum(index, 0), size - 1), axis=1)
+    means = around.reshape(*around.shape[:2], 3, _AVERAGED).mean(axis=3)
+    before, here, after = means.reshape(-1, 3).T
     mottle = (before - 2.0 * here + after) / 6.0**0.5
     return np.stack([here - levels.dark, mottle]) / _span(levels)
 

@@ -40,6 +40,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, tangent_bas
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
 from knightcube.vision.frame import MAD_TO_SIGMA
 
+_EYE3: FloatArray = np.eye(3)
 MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0
 """Mean radius of the Earth (m), 6,371,008.8 (WGS 84)."""
 
@@ -70,7 +71,7 @@ class Ellipsoid:
         return distance - distance / float(np.linalg.norm(self.stretching() @ position))
 
     def _along_axes(self, across: float, along: float) -> FloatArray:
-        return across * np.eye(3) + (along - across) * np.outer(self.pole, self.pole)
+        return across * _EYE3 + (along - across) * (self.pole[:, None] * self.pole)
 
 
 def earth(pole: FloatArray) -> Ellipsoid:

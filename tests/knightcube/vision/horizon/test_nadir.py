@@ -540,8 +540,8 @@ def _searched_by_focal_length(
     the altitude grows, in proportion to the focal length. The trial is `refused` at some focal lengths.
     """
 
-    def searched(_: Image, camera: Pinhole, *__: object) -> SimpleNamespace:
-        step = float(np.log(camera.focal_length / MODEL.lens.focal_length)) / _FOCAL_SIGMA
+    def searched(image: Any, *_: object) -> SimpleNamespace:
+        step = float(np.log(image.camera.focal_length / MODEL.lens.focal_length)) / _FOCAL_SIGMA
         tilt = _TILT * step
         direction = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
         own = 1e-6 * (np.eye(3) - np.outer(direction, direction))
