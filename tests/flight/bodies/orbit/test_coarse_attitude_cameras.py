@@ -115,7 +115,7 @@ def test_the_first_attitude_counts_the_misalignments_of_the_cameras_of_sun_and_n
             misalignment = rng.normal(0.0, BodyErrors().horizon / np.sqrt(3.0), 3) + rng.normal(0.0, sigma, 3)
             seen = attitude_matrix(from_rotation_vector(misalignment)) @ body @ reference
             sights.append(MeasuredDirection(seen, sigma**2 * np.eye(3), (0,)))
-        assert craft.look(HorizonCameraResult(*sights)) == (True, True)
+        assert craft.look(HorizonCameraResult(sights[0], sights[1])) == (True, True)
         estimate = craft.filter.at(craft.now_ns)
         error = to_rotation_vector(multiply(estimate.quaternion, conjugate(craft.attitude)))
         claim = estimate.covariance[ATTITUDE, ATTITUDE]
