@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import lru_cache
 
 import numpy as np
 
@@ -129,12 +130,14 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     shares = currents / strings.peaks
     if shares.max() < strings.dark:
         return CoarseSun(CoarseSunStatus.DARK, reason=f"no string has {strings.dark:g} of its peak current")
-    earth, covariance = _earthlight(strings, nadir)
-    information = np.linalg.inv(covariance)
+    earth, information, averaging = _constants(strings)
+    if nadir is not None:
+        earth, covariance = _earthlight(strings, nadir)
+        information = np.linalg.inv(covariance)
     readings = shares - earth
     # The initial guess is the mean of the normals, weighted by the currents of the strings.
     normals = strings.normals
-    total = np.linalg.pinv(normals.T @ normals) @ normals.T @ np.maximum(shares, 0.0)
+    total = averaging @ np.maximum(shares, 0.0)
     length = float(np.linalg.norm(total))
     if not length > 0.5 * strings.dark:
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the currents of opposite strings cancel")
@@ -187,6 +190,18 @@ def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[Fl
     second = 0.25 + normals @ normals.T / 12.0
     covariance = (strings.albedo**2 + square) * second - strings.albedo**2 * np.outer(even, even)
     return strings.albedo * even, own + covariance
+
+
+@lru_cache(maxsize=8)
+def _constants(strings: SolarStringModel) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the earthlight (n,) and information (n, n) without nadir, and the matrix (3, n) of the guess.
+
+    The earthlight is a fraction of the peak currents; the information is the inverse of the covariance. The
+    product of the matrix and the sunlight (n,) is the initial guess of the Sun direction, not normalised.
+    """
+    earth, covariance = _earthlight(strings, None)
+    normals = strings.normals
+    return earth, np.linalg.inv(covariance), np.linalg.pinv(normals.T @ normals) @ normals.T
 
 
 _TURNS = 180

@@ -11,6 +11,7 @@ import math
 import re
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from sgp4.api import SGP4_ERRORS, WGS72, Satrec
@@ -111,14 +112,20 @@ class GpsFix:
         age = (julian_date - self.julian_date) * DAY
         if not abs(age) <= self.longest_age:
             raise OrbitError(f"the last fix is {age:.0f} s old: fixes are used for {self.longest_age:g} s")
-        to_ground = celestial_to_terrestrial(self.julian_date)
-        x, y, _ = self.position.tolist()
-        with_ground = self.velocity + np.array([-ROTATION_RATE * y, ROTATION_RATE * x, 0.0])
-        state = np.concatenate([self.position @ to_ground, with_ground @ to_ground])
-        later = propagated(state, age)
+        state = _measured(self)
+        later = propagated(state, age) if age else state
         # In orbit, an along-track velocity error causes three times the position error of free space.
         sigma = math.hypot(self.sigma, 3.0 * age * self.velocity_sigma)
         return OrbitState(julian_date, later[:3], later[3:], sigma)
+
+
+@lru_cache(maxsize=16)
+def _measured(fix: GpsFix) -> FloatArray:
+    """Return the position (m) and velocity (m/s) of a fix, together (6,), ICRS, at the time of the fix."""
+    to_ground = celestial_to_terrestrial(fix.julian_date)
+    x, y, _ = fix.position.tolist()
+    with_ground = fix.velocity + np.array([-ROTATION_RATE * y, ROTATION_RATE * x, 0.0])
+    return np.concatenate([fix.position @ to_ground, with_ground @ to_ground])
 
 
 class TwoLineElements:
@@ -148,6 +155,7 @@ class TwoLineElements:
             raise UsageError(f"{second!r}: these elements describe no orbit at their epoch: {reason}")
         self._sigma, self._growth = sigma, growth
         self._drag_growth = _drag_growth(self._satellite)
+        self._newest: OrbitState | None = None
 
     @property
     def epoch(self) -> float:
@@ -156,6 +164,8 @@ class TwoLineElements:
 
     def at(self, julian_date: float) -> OrbitState:
         """Return the orbit state at a Julian date UTC. Raises OrbitError if SGP4 fails."""
+        if self._newest is not None and self._newest.julian_date == julian_date:
+            return self._newest
         whole = math.floor(julian_date)
         code, position, velocity = self._satellite.sgp4(whole, julian_date - whole)
         if code:
@@ -163,9 +173,10 @@ class TwoLineElements:
         to_icrs = mean_equator_to_celestial(julian_date)
         age = abs(julian_date - self.epoch)
         sigma = math.hypot(self._sigma + self._growth * age, self._drag_growth * age**2)
-        return OrbitState(
+        self._newest = OrbitState(
             julian_date, 1e3 * (to_icrs @ np.array(position)), 1e3 * (to_icrs @ np.array(velocity)), sigma
         )
+        return self._newest
 
 
 def _drag_growth(satellite: Satrec) -> float:
