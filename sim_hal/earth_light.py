@@ -266,7 +266,7 @@ _STEPS, _SUN_STEPS = 4096, 6144
 """Numbers of intervals in the tables of `AirTables`."""
 _HORIZON = 1024
 """Column of `AirTables.sun` for a Sun on the horizon."""
-_CHUNK = 32_768
+_CHUNK = 65_536
 """Number of lines of sight that the numpy form computes at a time, because small arrays are faster."""
 _BLOCK = 256
 """Number of lines of sight that `light` traces at a time."""
