@@ -265,7 +265,7 @@ def near_earth(rays: Float32Array, origin: FloatArray, into_earth: FloatArray) -
 _STEPS, _SUN_STEPS = 4096, 6144
 """Numbers of intervals in the tables of `AirTables`."""
 _HORIZON = 1024
-"""Column of `AirTables.sun` for a Sun on the horizon."""
+"""Column of `AirTables.sun` for a Sun on the horizon, if the first column is for `_DARKEST`."""
 _CHUNK = 65_536
 """Number of lines of sight that the numpy form computes at a time, because small arrays are faster."""
 _BLOCK = 256
@@ -275,7 +275,7 @@ _BLOCK = 256
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _FLOAT_TOP, _FLOAT_DARKEST, _FLOAT_STEPS = np.float32(TOP), np.float32(_DARKEST), np.float32(_STEPS)
 _PER_HEIGHT, _LIMB = np.float32(_STEPS / TOP), np.float32(_STEPS + 1)
-_PER_COSINE = np.float32((_SUN_STEPS - _HORIZON) / 1.0)
+_PER_COSINE = np.float32(_SUN_STEPS - _HORIZON)
 _SIDE = np.float32(_CELLS)
 _FLOAT_RADIUS, _CENTRE, _FINER = np.float32(_RADIUS), np.float32(0.5 * _CELLS), np.float32(_MAGNIFICATION)
 _NORMALISED = math.hypot(1.0, _FINE) / _RESOLUTION
@@ -349,19 +349,19 @@ def light_numpy(
     into_axes = (into_earth * axes[:, None]).astype(np.float32)
     scale, direction = axes.astype(np.float32)[:, None], sun.astype(np.float32)
     for first in range(0, rays.shape[1], _CHUNK):
-        some = rays[:, first : first + _CHUNK]
-        chosen = near_earth(some, origin, into_earth)
-        some = _chosen(some, chosen)
-        meeting = intersect(some, origin, into_earth)
+        part = rays[:, first : first + _CHUNK]
+        chosen = near_earth(part, origin, into_earth)
+        part = _chosen(part, chosen)
+        meeting = intersect(part, origin, into_earth)
         normals = _unit(meeting.places.T / scale)
         solar = direction @ normals
         lit = np.flatnonzero((meeting.heights < TOP) & (solar > _DARKEST))
-        some, places, normals = (_chosen(vectors, lit) for vectors in (some, meeting.places.T, normals))
+        part, places, normals = (_chosen(vectors, lit) for vectors in (part, meeting.places.T, normals))
         solar, hits, chosen = solar[lit], meeting.hits[lit], chosen[lit] + first
-        some = into_axes @ some
-        upward = np.clip(-np.sum(some * normals, axis=0), 0.0, 1.0)
+        part = into_axes @ part
+        upward = np.clip(-np.sum(part * normals, axis=0), 0.0, 1.0)
         # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
-        turned = direction @ some
+        turned = direction @ part
         above = meeting.heights[lit] * _PER_HEIGHT + np.float32(_STEPS + 1)
         place = np.where(hits, upward * np.float32(_STEPS), above)
         bottom, depth, opacity = _interpolated(sight_table, place)

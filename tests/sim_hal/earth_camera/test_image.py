@@ -151,6 +151,19 @@ def test_the_loop_form_of_the_blur_equals_the_numpy_form(shape: tuple[int, int],
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(("field_deg", "k1"), [(92.0, 0.0), (67.0, -0.12), (20.0, -0.12)])
+def test_rays_within_pixels_have_the_stated_error(field_deg: float, k1: float) -> None:
+    model = EarthCameraModel.fuga15d(field_of_view=math.radians(field_deg), k1=k1)
+    rays = np.ascontiguousarray(pixel_rays(model.lens).T, dtype=np.float32)
+    edges = [0, 511, 512 * 512 - 1, 512 * 300, 512 * 301 - 1]
+    pixels = np.concatenate([edges, np.random.default_rng(2).integers(0, 512 * 512, 2000)])
+    found = earth_camera._rays_within(rays, pixels, 512)
+    centres = np.stack([pixels % 512, pixels // 512], axis=1)
+    exact = np.concatenate([model.lens.unit_vectors(centres + offset) for offset in earth_camera._WITHIN])
+    apart = np.linalg.norm(found.T - exact, axis=1)
+    assert apart.max() < 0.3 / model.lens.focal_length**2 + 2e-7
+
+
 def test_the_loop_form_of_the_glare_equals_the_numpy_form() -> None:
     rays = np.ascontiguousarray(pixel_rays(Pinhole.from_field_of_view(40, 30, 1.0)).T, dtype=np.float32)
     axis = np.array([0.1, -0.2, 0.97])
