@@ -133,7 +133,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     earth, information, averaging = _constants(strings)
     if nadir is not None:
         earth, covariance = _earthlight(strings, nadir)
-        information = np.linalg.inv(covariance)
+        information = np.asarray(np.linalg.inv(covariance), dtype=float)
     readings = shares - earth
     # The initial guess is the mean of the normals, weighted by the currents of the strings.
     normals = strings.normals
@@ -201,7 +201,8 @@ def _constants(strings: SolarStringModel) -> tuple[FloatArray, FloatArray, Float
     """
     earth, covariance = _earthlight(strings, None)
     normals = strings.normals
-    return earth, np.linalg.inv(covariance), np.linalg.pinv(normals.T @ normals) @ normals.T
+    information = np.asarray(np.linalg.inv(covariance), dtype=float)
+    return earth, information, np.linalg.pinv(normals.T @ normals) @ normals.T
 
 
 _TURNS = 180

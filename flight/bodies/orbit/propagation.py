@@ -16,7 +16,7 @@ import numpy as np
 
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_matrix
 from knightcube.astro.quaternion import (
     Matrix,
     Quaternion,
@@ -31,11 +31,11 @@ from knightcube.astro.quaternion import (
     skew,
     times,
 )
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Measurement, Parameters
 from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeFilter, FreeMemory, FreeMotion
-from knightcube.gnc.estimation.rigid_body import by_matrix
 
 Floats = tuple[float, float, float]
 _NOTHING: Floats = (0.0, 0.0, 0.0)
@@ -267,6 +267,10 @@ class _Motion(NamedTuple):
     field: Vector
 
 
+_Moved = tuple[float, Vector, Quaternion, Vector, Vector, Vector]
+"""The elements of `_Motion`."""
+
+
 class PropagatedEstimate(Estimate):
     """An estimate whose covariance (19, 19) is computed when it is first read or copied."""
 
@@ -339,35 +343,25 @@ class EstimatePropagation:
     def camera_covariance(self, seconds: float, dipole: FloatArray, around: FilterEnvironment) -> FloatArray:
         """Return the attitude covariance (3, 3), rad^2, of the star camera, propagated by `seconds`."""
         begun = self._beginning(self._free.memory(), around)
-        transition, grown = self._transition(begun, _moved(begun, seconds, dipole))
-        rows = transition[0:3].copy()
+        moved = _moved(begun, seconds, dipole)
+        rows = _transition(begun.motion.inertia, begun.motion.inverse, moved)[0:3]
         rows[:, _CAMERA] += _EYE
         moving = begun.memory.covariance[_MOVED]
-        return np.asarray(rows @ moving @ rows.T + seconds**2 / 3.0 * grown)
-
-    def _transition(self, begun: _Beginning, moved: _Motion) -> tuple[FloatArray, FloatArray]:
-        """Return the transition matrix (6, 21) of the errors, and the covariance (3, 3) of the rate noise."""
-        motion, seconds, dipole = begun.motion, moved.seconds, np.array(moved.dipole)
-        found = np.zeros((6, len(_MOVING)))
-        found[0:3, 0:3], found[0:3, 3:6] = matrix(moved.rotation), seconds * _EYE
-        found[3:6, 3:6] = _EYE + seconds * motion.stiffness(np.array(moved.middle))
-        by_dipole = -seconds * (motion.inverse @ np.array(skew(moved.field)))
-        found[3:6, 6:15], found[3:6, _VARIATION] = by_dipole @ by_matrix(dipole), by_dipole * dipole
-        found[0:3, 6:] = 0.5 * seconds * found[3:6, 6:]
-        noise = self._free.rate_noise(dipole, begun.around, then=begun.memory, motion=motion)
-        return found, seconds * noise
+        return np.asarray(rows @ moving @ rows.T + seconds**2 / 3.0 * self._grown(begun, moved))
 
     def _covariance(self, begun: _Beginning, moved: _Motion) -> FloatArray:
         """Return the covariance (19, 19) at the end, with the states in the order of the loop's estimates."""
-        seconds, before = moved.seconds, begun.memory.covariance
-        transition, grown = self._transition(begun, moved)
-        spread = np.zeros((_SIZE, _SIZE))
-        spread[_PLACED] = before[_PICKED]
-        among = transition @ before[_MOVED] @ transition.T
-        among[0:3, 0:3] += seconds**2 / 3.0 * grown
-        among[3:6, 3:6] += grown
-        spread[_MOTION] = among
-        return spread
+        motion = begun.motion
+        # numba accepts a tuple faster than a NamedTuple.
+        return _spread(
+            begun.memory.covariance, motion.inertia, motion.inverse, moved[:], self._grown(begun, moved)
+        )
+
+    def _grown(self, begun: _Beginning, moved: _Motion) -> FloatArray:
+        """Return the covariance (3, 3), rad^2/s^2, of the rate due to noise during a propagation."""
+        dipole = np.array(moved.dipole)
+        noise = self._free.rate_noise(dipole, begun.around, then=begun.memory, motion=begun.motion)
+        return moved.seconds * noise
 
     def _propagated(
         self, begun: _Beginning, time_ns: int, seconds: float, dipole: FloatArray, measured_ns: int
@@ -404,6 +398,95 @@ def _moved(begun: _Beginning, seconds: float, dipole: FloatArray) -> _Motion:
     u, v, w = first[0] + 2.0 * second[0], first[1] + 2.0 * second[1], first[2] + 2.0 * second[2]
     mean = _ahead(rate, seconds / 6.0, (u + 0.5 * a, v + 0.5 * b, w + 0.5 * c))
     return _Motion(seconds, (x, y, z), exponential(*_scaled(seconds, mean)), after, middle, field)
+
+
+def _transition(inertia: FloatArray, inverse: FloatArray, moved: _Moved) -> FloatArray:
+    """Return the transition matrix (6, 21) of the errors of attitude and rate for a motion.
+
+    The columns are the states `_MOVING`. `inverse` (3, 3) is the inverse of the inertia tensor (3, 3).
+    """
+    seconds, dipole, rotation, _, middle, field = moved
+    found = np.zeros((6, len(_MOVING)))
+    found[0:3, 0:3], found[0:3, 3:6] = matrix(rotation), seconds * _EYE
+    rate = np.array(middle)
+    by_rate = inverse @ (cross_matrix(inertia @ rate) - cross_matrix(rate) @ inertia)
+    found[3:6, 3:6] = _EYE + seconds * by_rate
+    by_dipole = -seconds * (inverse @ np.array(skew(field)))
+    found[3:6, 6:15] = (by_dipole[:, :, None] * dipole).reshape(3, 9)
+    found[3:6, _VARIATION] = by_dipole * dipole
+    found[0:3, 6:] = 0.5 * seconds * found[3:6, 6:]
+    return found
+
+
+def _spread_numpy(
+    before: FloatArray, inertia: FloatArray, inverse: FloatArray, moved: _Moved, grown: FloatArray
+) -> FloatArray:
+    """Return the covariance (19, 19) after a motion, with the states in the order of the loop's estimates.
+
+    The covariance of the filter's states (n, n) was `before`. The noise during the motion increases the
+    covariance of the rate by `grown` (3, 3). See `_transition` for the other arguments.
+    """
+    seconds, transition = moved[0], _transition(inertia, inverse, moved)
+    spread = np.zeros((_SIZE, _SIZE))
+    spread[_PLACED] = before[_PICKED]
+    among = transition @ before[_MOVED] @ transition.T
+    among[0:3, 0:3] += seconds**2 / 3.0 * grown
+    among[3:6, 3:6] += grown
+    spread[_MOTION] = among
+    return spread
+
+
+@loop_helper
+def _transition_by_loops(inertia: FloatArray, inverse: FloatArray, moved: _Moved) -> FloatArray:
+    """See `_transition`."""
+    seconds, dipole, rotation, _, middle, field = moved
+    (a, b, c), (d, e, f), (g, h, i) = inertia[0], inertia[1], inertia[2]
+    turned, across, by_field = matrix(rotation), skew(middle), skew(field)
+    gyroscopic = skew(times(((a, b, c), (d, e, f), (g, h, i)), middle))
+    found = np.zeros((6, 21))
+    for j in range(3):
+        for k in range(3):
+            by_rate = by_dipole = 0.0
+            for m in range(3):
+                changed = gyroscopic[m][k]
+                for n in range(3):
+                    changed -= across[m][n] * inertia[n, k]
+                by_rate += inverse[j, m] * changed
+                by_dipole -= seconds * inverse[j, m] * by_field[m][k]
+            found[j, k], found[3 + j, 3 + k] = turned[j][k], seconds * by_rate
+            for m in range(3):
+                found[3 + j, 6 + 3 * k + m] = by_dipole * dipole[m]
+            found[3 + j, 18 + k] = by_dipole * dipole[k]
+        found[j, 3 + j] = seconds
+        found[3 + j, 3 + j] += 1.0
+        for k in range(6, 21):
+            found[j, k] = 0.5 * seconds * found[3 + j, k]
+    return found
+
+
+@compiled_form_of(_spread_numpy)
+def _spread(
+    before: FloatArray, inertia: FloatArray, inverse: FloatArray, moved: _Moved, grown: FloatArray
+) -> FloatArray:
+    """See `_spread_numpy`."""
+    transition, seconds = _transition_by_loops(inertia, inverse, moved), moved[0]
+    half, spread = np.zeros((6, 21)), np.zeros((_SIZE, _SIZE))
+    for j in range(6):
+        for k in range(21):
+            for m in range(21):
+                half[j, m] += transition[j, k] * before[_MOVING[k], _MOVING[m]]
+    for j in range(12):
+        for k in range(12):
+            spread[_TO[j], _TO[k]] = before[_FROM[j], _FROM[k]]
+    for j in range(6):
+        for k in range(6):
+            among = 0.0
+            for m in range(21):
+                among += half[j, m] * transition[k, m]
+            if j // 3 == k // 3:
+                among += grown[j % 3, k % 3] * (1.0 if j > 2 else seconds**2 / 3.0)
+            spread[_TO[j], _TO[k]] = among
+    return spread
 
 
 def _ahead(vector: Vector, seconds: float, slope: Vector) -> Vector:

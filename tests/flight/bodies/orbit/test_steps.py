@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flight.bodies.orbit import propagation
 from flight.bodies.orbit.propagation import DipoleHistory, OpenStep, RateByField
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.earth.disturbance import Pressures
 from knightcube.astro.quaternion import IDENTITY
-from knightcube.gnc.estimation.free_filter import FilterEnvironment
+from knightcube.gnc.estimation.free_filter import STATES, FilterEnvironment
+from tests.support.compiled_forms import assert_forms_agree
 
 NOTHING = np.zeros(3)
 AROUND = FilterEnvironment(NOTHING, np.ones(3), Pressures(np.zeros((1, 3)), np.zeros((1, 3))), 1.0)
@@ -66,4 +68,16 @@ def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean()
     history.record(2 * SECOND_NS, (0.0, 0.0, 0.0), True)
     assert history.impulse(SECOND_NS, 2 * SECOND_NS) == pytest.approx([0.0, 0.04, 0.0]), (
         "half of a constant dipole"
+    )
+
+
+def test_compiled_and_interpreted_covariances_of_a_propagated_estimate_agree() -> None:
+    generator = np.random.default_rng(3)
+    root = generator.normal(size=(STATES, STATES))
+    inertia = np.diag([1.1e-3, 1.05e-3, 0.99e-3]) + 1e-5
+    dipole, middle, after = (0.01, -0.02, 0.03), (0.02, -0.01, 0.015), (0.1, 0.2, 0.3)
+    rotation = (0.1, -0.5, 0.1, 0.73**0.5)
+    moved = (0.13, dipole, rotation, after, middle, (1e-5, 2e-5, -3e-5))
+    assert_forms_agree(
+        propagation._spread, root @ root.T, inertia, np.linalg.inv(inertia), moved, 1e-3 * np.eye(3)
     )
