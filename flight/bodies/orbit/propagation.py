@@ -16,7 +16,7 @@ import numpy as np
 
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray, cross_matrix
+from knightcube.astro.arrays import FloatArray, IntArray, cross_matrix
 from knightcube.astro.quaternion import (
     Matrix,
     Quaternion,
@@ -209,10 +209,8 @@ class OpenStep:
 _EYE: FloatArray = np.eye(3)
 _FROM = np.r_[states.ATTITUDE, states.RATE, states.GYRO, states.MAGNET]
 _TO = np.r_[form.ATTITUDE, form.RATE, form.BIAS, form.FIELD_BIAS]
-_PICKED, _PLACED = np.ix_(_FROM, _FROM), np.ix_(_TO, _TO)
 _MOVING = np.r_[states.ATTITUDE, states.RATE, states.COILS, states.CAMERA, states.VARIATION]
 _MOVED, _CAMERA, _VARIATION = np.ix_(_MOVING, _MOVING), slice(15, 18), slice(18, 21)
-_MOTION = np.ix_(*2 * [np.r_[form.ATTITUDE, form.RATE]])
 _SIZE = FIELD_BIAS.stop
 _PARAMETERS, _NONE = Parameters(), np.zeros(3)
 
@@ -353,8 +351,17 @@ class EstimatePropagation:
         """Return the covariance (19, 19) at the end, with the states in the order of the loop's estimates."""
         motion = begun.motion
         # numba accepts a tuple faster than a NamedTuple.
+        grown = self._grown(begun, moved)
         return _spread(
-            begun.memory.covariance, motion.inertia, motion.inverse, moved[:], self._grown(begun, moved)
+            begun.memory.covariance,
+            motion.inertia,
+            motion.inverse,
+            moved[:],
+            grown,
+            _MOVING,
+            _FROM,
+            _TO,
+            _SIZE,
         )
 
     def _grown(self, begun: _Beginning, moved: _Motion) -> FloatArray:
@@ -419,20 +426,30 @@ def _transition(inertia: FloatArray, inverse: FloatArray, moved: _Moved) -> Floa
 
 
 def _spread_numpy(
-    before: FloatArray, inertia: FloatArray, inverse: FloatArray, moved: _Moved, grown: FloatArray
+    before: FloatArray,
+    inertia: FloatArray,
+    inverse: FloatArray,
+    moved: _Moved,
+    grown: FloatArray,
+    moving: IntArray,
+    picked: IntArray,
+    placed: IntArray,
+    size: int,
 ) -> FloatArray:
-    """Return the covariance (19, 19) after a motion, with the states in the order of the loop's estimates.
+    """Return the covariance (size, size) after a motion, in the order of the loop's estimates.
 
     The covariance of the filter's states (n, n) was `before`. The noise during the motion increases the
-    covariance of the rate by `grown` (3, 3). See `_transition` for the other arguments.
+    covariance of the rate by `grown` (3, 3). The indices of the states on which attitude and rate depend are
+    `moving` (21,), and the states `picked` (k,) have the indices `placed` (k,) in the result. Attitude and
+    rate are the first of these states. See `_transition` for the other arguments.
     """
     seconds, transition = moved[0], _transition(inertia, inverse, moved)
-    spread = np.zeros((_SIZE, _SIZE))
-    spread[_PLACED] = before[_PICKED]
-    among = transition @ before[_MOVED] @ transition.T
+    spread = np.zeros((size, size))
+    spread[np.ix_(placed, placed)] = before[np.ix_(picked, picked)]
+    among = transition @ before[np.ix_(moving, moving)] @ transition.T
     among[0:3, 0:3] += seconds**2 / 3.0 * grown
     among[3:6, 3:6] += grown
-    spread[_MOTION] = among
+    spread[np.ix_(placed[:6], placed[:6])] = among
     return spread
 
 
@@ -466,18 +483,26 @@ def _transition_by_loops(inertia: FloatArray, inverse: FloatArray, moved: _Moved
 
 @compiled_form_of(_spread_numpy)
 def _spread(
-    before: FloatArray, inertia: FloatArray, inverse: FloatArray, moved: _Moved, grown: FloatArray
+    before: FloatArray,
+    inertia: FloatArray,
+    inverse: FloatArray,
+    moved: _Moved,
+    grown: FloatArray,
+    moving: IntArray,
+    picked: IntArray,
+    placed: IntArray,
+    size: int,
 ) -> FloatArray:
     """See `_spread_numpy`."""
     transition, seconds = _transition_by_loops(inertia, inverse, moved), moved[0]
-    half, spread = np.zeros((6, 21)), np.zeros((_SIZE, _SIZE))
+    half, spread = np.zeros((6, 21)), np.zeros((size, size))
     for j in range(6):
         for k in range(21):
             for m in range(21):
-                half[j, m] += transition[j, k] * before[_MOVING[k], _MOVING[m]]
-    for j in range(12):
-        for k in range(12):
-            spread[_TO[j], _TO[k]] = before[_FROM[j], _FROM[k]]
+                half[j, m] += transition[j, k] * before[moving[k], moving[m]]
+    for j in range(len(picked)):
+        for k in range(len(picked)):
+            spread[placed[j], placed[k]] = before[picked[j], picked[k]]
     for j in range(6):
         for k in range(6):
             among = 0.0
@@ -485,7 +510,7 @@ def _spread(
                 among += half[j, m] * transition[k, m]
             if j // 3 == k // 3:
                 among += grown[j % 3, k % 3] * (1.0 if j > 2 else seconds**2 / 3.0)
-            spread[_TO[j], _TO[k]] = among
+            spread[placed[j], placed[k]] = among
     return spread
 
 

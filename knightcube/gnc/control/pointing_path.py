@@ -42,6 +42,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.attitude_law import AttitudeReferences
 
@@ -164,29 +165,131 @@ def sweep(
     The affine part k of the controls has the shape (n, controls, columns). The affine part of the error model
     is `affine` (n, 6, columns), and `end` is the cost-to-go after the last step.
     """
-    from scipy.linalg.lapack import dgesv  # noqa: PLC0415 - only the worker that plans needs scipy
-
-    (count, controls), columns = cost.control.shape, affine.shape[2]
-    feedback = np.empty((count, controls, 6 + columns))
     # The matrices that multiply the errors, and the affine parts, are concatenated to save operations.
     ahead = np.concatenate([linear.transition, affine], axis=2)
     weights = np.concatenate([cost.state, cost.state_slope], axis=2)
-    square, slope = end.square, end.slope
+    # numba compiles the function again for arrays that are not contiguous.
+    others = linear.by_control, weights, cost.control, cost.control_slope, end.square, end.slope
+    feedback, square, slope, is_singular = _riccati(ahead, *map(np.ascontiguousarray, others))
+    if is_singular:
+        raise np.linalg.LinAlgError("the costs of the controls are singular")
+    return feedback[:, :, :6], feedback[:, :, 6:], CostToGo(square, slope)
+
+
+def _riccati_numpy(
+    ahead: FloatArray,
+    by_control: FloatArray,
+    weights: FloatArray,
+    control: FloatArray,
+    control_slope: FloatArray,
+    square: FloatArray,
+    slope: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """Return feedback matrices, the cost-to-go at the start, and whether the costs are singular.
+
+    The error model is `ahead` (n, 6, 6 + columns), and the weights of the errors are `weights`, of the same
+    shape. The feedback matrices have the shape (n, controls, 6 + columns). See `sweep`.
+    """
+    from scipy.linalg.lapack import dgesv  # noqa: PLC0415 - only the worker that plans needs scipy
+
+    count, controls = control.shape
+    feedback = np.empty((count, controls, ahead.shape[2]))
     for k in range(count - 1, -1, -1):
-        push, drive = linear.by_control[k], linear.transition[k]
+        push, drive = by_control[k], ahead[k, :, :6]
         spread = push.T @ (square @ push)
-        spread.reshape(-1)[:: controls + 1] += cost.control[k]
+        spread.reshape(-1)[:: controls + 1] += control[k]
         later = square @ ahead[k]
         later[:, 6:] += slope
         sides = push.T @ later
-        sides[:, 6:] += cost.control_slope[k]
+        sides[:, 6:] += control_slope[k]
         *_, feedback[k], singular = dgesv(spread, sides)  # numpy.linalg.solve is slower for small matrices
         if singular:
-            raise np.linalg.LinAlgError("the costs of the controls are singular")
+            return feedback, square, slope, True
         found = drive.T @ later - sides[:, :6].T @ feedback[k] + weights[k]
         square, slope = 0.5 * (found[:, :6] + found[:, :6].T), found[:, 6:]
-    gain, steady = feedback[:, :, :6], feedback[:, :, 6:]
-    return gain, steady, CostToGo(square, slope)
+    return feedback, square, slope, False
+
+
+@loop_helper
+def _product(one: FloatArray, other: FloatArray, columns: int) -> FloatArray:
+    """Return the product (columns, k) of the transposed first columns of `one` (m, n) with `other` (m, k)."""
+    result = np.zeros((columns, other.shape[1]))
+    for m in range(len(one)):
+        for i in range(columns):
+            for j in range(other.shape[1]):
+                result[i, j] += one[m, i] * other[m, j]
+    return result
+
+
+@loop_helper
+def _add(matrix: FloatArray, other: FloatArray) -> None:
+    """Add `other` (n, k) to the last columns of a matrix (n, m)."""
+    first = matrix.shape[1] - other.shape[1]
+    for i in range(len(other)):
+        for j in range(other.shape[1]):
+            matrix[i, first + j] += other[i, j]
+
+
+@loop_helper
+def _eliminated(matrix: FloatArray, sides: FloatArray) -> bool:
+    """Replace `sides` (n, k) by the solution of linear equations, unless the matrix (n, n) is singular.
+
+    Returns whether the matrix is singular. The matrix is positive definite, so elimination needs no pivots.
+    """
+    size = len(matrix)
+    for pivot in range(size):
+        if matrix[pivot, pivot] == 0.0:
+            return True
+        for row in range(size):
+            if row != pivot:
+                factor = matrix[row, pivot] / matrix[pivot, pivot]
+                for j in range(pivot, size):
+                    matrix[row, j] -= factor * matrix[pivot, j]
+                for j in range(sides.shape[1]):
+                    sides[row, j] -= factor * sides[pivot, j]
+    for row in range(size):
+        for j in range(sides.shape[1]):
+            sides[row, j] /= matrix[row, row]
+    return False
+
+
+@compiled_form_of(_riccati_numpy)
+def _riccati(
+    ahead: FloatArray,
+    by_control: FloatArray,
+    weights: FloatArray,
+    control: FloatArray,
+    control_slope: FloatArray,
+    square: FloatArray,
+    slope: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """See `_riccati_numpy`."""
+    count, controls = control.shape
+    feedback = np.empty((count, controls, ahead.shape[2]))
+    square, slope = square.copy(), slope.copy()
+    for k in range(count - 1, -1, -1):
+        push, gain = by_control[k], feedback[k]
+        spread, later = _product(push, _product(square, push, 6), controls), _product(square, ahead[k], 6)
+        _add(later, slope)
+        sides = _product(push, later, controls)
+        _add(sides, control_slope[k])
+        for i in range(controls):
+            spread[i, i] += control[k, i]
+            for j in range(gain.shape[1]):
+                gain[i, j] = sides[i, j]
+        if _eliminated(spread, gain):
+            return feedback, square, slope, True
+        found, reduced = _product(ahead[k], later, 6), _product(sides, gain, 6)
+        _add(found, weights[k])
+        for i in range(6):
+            for j in range(gain.shape[1]):
+                found[i, j] -= reduced[i, j]
+        for i in range(6):
+            for j in range(6):
+                square[i, j] = 0.5 * (found[i, j] + found[j, i])
+            for j in range(slope.shape[1]):
+                slope[i, j] = found[i, 6 + j]
+    return feedback, square, slope, False
 
 
 def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -78,6 +78,7 @@ def test_compiled_and_interpreted_covariances_of_a_propagated_estimate_agree() -
     dipole, middle, after = (0.01, -0.02, 0.03), (0.02, -0.01, 0.015), (0.1, 0.2, 0.3)
     rotation = (0.1, -0.5, 0.1, 0.73**0.5)
     moved = (0.13, dipole, rotation, after, middle, (1e-5, 2e-5, -3e-5))
-    assert_forms_agree(
-        propagation._spread, root @ root.T, inertia, np.linalg.inv(inertia), moved, 1e-3 * np.eye(3)
-    )
+    layout = propagation._MOVING, propagation._FROM, propagation._TO, propagation._SIZE
+    noise = 1e-3 * np.eye(3)
+    inverse = np.linalg.inv(inertia)
+    assert_forms_agree(propagation._spread, root @ root.T, inertia, inverse, moved, noise, *layout)
