@@ -43,8 +43,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray, cross_matrix, cross_product, tangent_basis
-from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas, shapes
-from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -68,9 +67,9 @@ from knightcube.gnc.estimation.error_state import (
     with_role,
 )
 from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.free_motion import Bodies, step
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
-    by_inertia,
     by_matrix,
     inertia_covariance,
     per_trace,
@@ -119,6 +118,8 @@ SLOW = slice(GYRO.start, CAMERA.stop)
 """Indices of the slowly varying states, which are stored for the next boot."""
 STATES = SUN_CAMERA.stop
 """Number of elements of the error state."""
+_MOVING: IntArray = np.r_[ATTITUDE, RATE, DIPOLE, SUNLIT, TORQUES, INERTIA, COILS, VARIATION]
+"""Indices of the states on which the angular acceleration depends, in the order of `MotionStep.slopes`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,57 +165,16 @@ class FreeMotion:
         self.by_torque: FloatArray = self.inverse @ self.inverse
         """Covariance (3, 3) of the angular acceleration due to a torque of unit variance per axis."""
 
-    def acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
-        """Return the angular acceleration (3,) rad/s^2 at a rate (3,) rad/s under a torque (3,) N m."""
-        return np.asarray(self.inverse @ (torque - cross_product(rate, self.inertia @ rate)))
+    @property
+    def body(self) -> Bodies:
+        """The properties of the body on which its motion depends."""
+        return self.inertia, self.inverse, self._areas, self.trace
 
     def stiffness(self, rate: FloatArray) -> FloatArray:
         """Return the derivative (3, 3) of the angular acceleration with respect to the rate (3,) rad/s."""
         return np.asarray(
             self.inverse @ (cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia)
         )
-
-    def torque(
-        self,
-        quaternion: FloatArray,
-        driven: FloatArray,
-        dipole: FloatArray,
-        sizes: FloatArray,
-        around: FilterEnvironment,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the external torque (3,) N m, and the error dynamics without the gyroscopic torque.
-
-        The commanded dipole of the coils is `driven` (3,), A m^2. The sum of the estimated dipole of the
-        coils and the residual dipole is `dipole` (3,), A m^2. The components of the disturbance torques are
-        `sizes` (9,), N m. The error dynamics (6, STATES) are the rows for attitude and rate.
-        """
-        to_body = attitude_matrix(quaternion)
-        field, position = to_body @ around.field, to_body @ around.position
-        radius = math.sqrt(float(position @ position))
-        up = position / radius
-        stiff = self.inertia @ up
-        strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
-        shape = shapes(around.pressures.facing(self._areas, to_body[None]), to_body[None])[0]
-        across, upright = cross_matrix(field), cross_matrix(up)
-        torque = -across @ dipole + strength * upright @ stiff + shape @ sizes
-        flow = np.zeros((6, STATES))
-        stiffness = strength * (upright @ self.inertia - cross_matrix(stiff)) @ upright
-        flow[3:6, ATTITUDE] = self.inverse @ (cross_matrix(dipole) @ across + stiffness)
-        flow[3:6, DIPOLE] = -self.inverse @ across
-        flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
-        flow[3:6, COILS] = flow[3:6, DIPOLE] @ by_matrix(driven)
-        flow[3:6, VARIATION] = flow[3:6, DIPOLE] * driven
-        flow[3:6, TORQUES] = self.inverse @ shape
-        flow[3:6, INERTIA] = self.trace * strength * self.inverse @ upright @ by_inertia(up)
-        return torque, flow
-
-    def by_inertia(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
-        """Return the derivative (3, 6) of the angular acceleration with respect to the inertia's error.
-
-        The gravity gradient is not included.
-        """
-        changed = by_inertia(acceleration) + cross_matrix(rate) @ by_inertia(rate)
-        return np.asarray(-self.trace * self.inverse @ changed)
 
 
 _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
@@ -780,29 +740,27 @@ class FreeFilter:
         self.changes += 1
         motion, rate = self.motion, self.rate
         motion.correct(self._constants[INERTIA])
-        middle = multiply(from_rotation_vector(0.5 * dt * rate), self.quaternion)
         whole = self.coil_matrix @ driven + self._constants[VARIATION] * driven
         whole += self.residual_dipole(around.sunlit)
-        torque, flow = motion.torque(middle, driven, whole, self._constants[TORQUES], around)
-        first = motion.acceleration(rate, torque)
-        second = motion.acceleration(rate + 0.5 * dt * first, torque)
-        half = rate + 0.5 * dt * second
-        acceleration = motion.acceleration(half, torque)
-        last = motion.acceleration(rate + dt * acceleration, torque)
-        flow[0:3, ATTITUDE], flow[0:3, RATE] = -cross_matrix(half), _EYE
-        flow[3:6, RATE] = motion.stiffness(half)
-        flow[3:6, INERTIA] += motion.by_inertia(half, acceleration)
+        moved = step(
+            motion.body,
+            self.quaternion,
+            rate,
+            (driven, whole),
+            self._constants[TORQUES],
+            (around.field, around.position, around.pressures.air, around.pressures.light),
+            around.sunlit,
+            dt,
+        )
+        flow = np.zeros((6, STATES))
+        flow[0:3, ATTITUDE], flow[0:3, RATE] = -cross_matrix(moved.middle), _EYE
+        flow[3:6, _MOVING] = moved.slopes
         self._slope = flow[3:6].copy()
-        after = rate + dt / 6.0 * (first + 2.0 * (second + acceleration) + last)
-        swept = dt * (rate + dt / 6.0 * (first + second + acceleration))
-        # The rate changes its direction during the step (Bortz 1971, to second order).
-        rotation = from_rotation_vector(swept + dt * dt / 12.0 * cross_product(rate, after))
-        self._lag = self._lag + self._since * (after - rate) + dt * after - swept
+        self._lag = self._lag + self._since * (moved.rate - rate) + dt * moved.rate - moved.swept
         self._given = self._given + dt * (self._since + 0.5 * dt) * driven
         self._since += dt
-        self.quaternion = multiply(rotation, self.quaternion)
-        self.acceleration, self.driven = acceleration, driven
-        self.rate = after
+        self.quaternion, self.rate = moved.quaternion, moved.rate
+        self.acceleration, self.driven = moved.acceleration, driven
         noise = self.rate_noise(driven, around, doubt) + self._curvature(flow[3:6, INERTIA])
         self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
         self.covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
