@@ -46,6 +46,7 @@ import numpy as np
 from flight.loop.coil_currents import ELECTRICAL, NEWEST, Bounds, CoilFault, Predicted, Supplied, fits
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import FloatArray, cross_matrices
+from knightcube.gnc.estimation.coil_gains import fitted, whitenings
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
@@ -240,7 +241,7 @@ class CoilResponse:
         # Fit parameters: torsion and damping of each free axis, a weight of each error mode, and the gains.
         spreads = [settings.torsion] * count + [settings.damping] * count + [1.0] * errors
         self._others = len(spreads)
-        self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
+        self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
         # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniform within a bound.
         healthy = np.full(coils, 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2)
         # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
@@ -435,16 +436,16 @@ class CoilResponse:
         fits = self._solved(rows, tuple(counts), span)
         whole = fits[0]
         self.fastest = max(self._speeds)
-        self.gain, self.sigma, self._weights = whole.gain.copy(), whole.sigma.copy(), whole.weights
+        self.gain, self.sigma, self._weights = np.array(whole.gain), np.array(whole.sigma), whole.weights
         # The gain of a coil that has just failed differs between the whole window and its newest half.
         newest = fits[min(1, len(fits) - 1)]
-        steady = np.abs(newest.gain - whole.gain) < _STEADY * newest.sigma
         for axis in range(self._count_of_coils):
             shown = [fit for fit in fits if fit.possible and fit.is_reversed[axis]]
             shown = [fit for fit in shown if fit.gain[axis] < _HIGHEST_REVERSED]
             if shown:
                 self.gain[axis], self.sigma[axis] = shown[0].gain[axis], shown[0].sigma[axis]
-            alone, is_steady = bool(whole.alone[axis]), bool(steady[axis])
+            alone = bool(whole.alone[axis])
+            is_steady = bool(abs(newest.gain[axis] - whole.gain[axis]) < _STEADY * newest.sigma[axis])
             self._count(axis, whole.possible, alone=alone, is_reversed=bool(shown), is_steady=is_steady)
 
     def _solved(self, rows: FloatArray, counts: tuple[int, ...], span: float) -> list[MotionFit]:
@@ -453,28 +454,25 @@ class CoilResponse:
         The equations `rows` (m, f, p + 1) belong to m neighbouring bins, and `span` is the time (s) from bin
         to bin. Each fit uses as many of the newest bins as `counts` states.
         """
-        coils, others, free = self._count_of_coils, self._others, len(self._free)
+        free, coils = len(self._free), self._count_of_coils
         equations = self._whitened(rows, counts, span)
         normal = equations.transpose(0, 2, 1) @ equations
-        # Eliminate the nuisance parameters, which leaves one equation for each gain.
-        mixed = normal[:, :others, others:]
-        coupling = np.linalg.solve(normal[:, :others, :others] + self._prior, mixed)
-        reduced = normal[:, others:, others:] - mixed.transpose(0, 2, 1) @ coupling
-        gains, variances, gain_costs = _solved_gains(reduced, self._prior_weights, self._expected)
-        freedom = free * np.array(counts) - free - coils
-        spread = np.maximum(1.0, gain_costs[:, 0] / np.maximum(freedom, 1))[:, None]
-        # If a gain is impossible even within its uncertainty, the model is wrong.
-        sigmas = np.sqrt(spread * variances[:, 0])
-        possible = (np.abs(gains[:, 0]) - 3.0 * sigmas < self.largest).all(axis=1).tolist()
-        weights = (
-            coupling[:, 2 * free :, coils] - (coupling[:, 2 * free :, :coils] @ gains[:, 0, :, None])[..., 0]
-        )
-        single = gains[:, 1 : coils + 1].diagonal(axis1=1, axis2=2)
-        deviations = np.sqrt(spread * variances[:, 1 : coils + 1].diagonal(axis1=1, axis2=2))
-        return [
-            MotionFit(single[place], deviations[place], weights[place], possible[place], *_judged(costs))
-            for place, costs in enumerate((gain_costs / spread).tolist())
-        ]
+        gains, variances, costs, others = fitted(normal, self._prior, self._prior_weights, self._expected)
+        largest, fits = self.largest.tolist(), []
+        for count, gain, variance, cost, other in zip(
+            counts, gains.tolist(), variances.tolist(), costs.tolist(), others, strict=True
+        ):
+            spread = max(1.0, cost[0] / max(free * (count - 1) - coils, 1))
+            # If a gain is impossible even within its uncertainty, the model is wrong.
+            possible = all(
+                abs(value) - 3.0 * math.sqrt(spread * square) < limit
+                for value, square, limit in zip(gain[0], variance[0], largest, strict=True)
+            )
+            single = [gain[axis + 1][axis] for axis in range(coils)]
+            sigma = [math.sqrt(spread * variance[axis + 1][axis]) for axis in range(coils)]
+            judged = _judged([each / spread for each in cost])
+            fits.append(MotionFit(single, sigma, other[2 * free :], possible, *judged))
+        return fits
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
         """Count the consecutive fits that agree on an axis.
@@ -517,7 +515,7 @@ class CoilResponse:
         # The span is rounded to ns, so that equal spans use the stored matrix.
         span = round(span, 9)
         variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
-        whitening = _whitenings(counts, settings.model_error**2, variance, self._walk * span)
+        whitening = whitenings(counts, settings.model_error**2, variance, self._walk * span)
         white = whitening @ rows.reshape(len(rows), -1)
         return np.asarray(white.reshape(len(counts), -1, rows.shape[2]))
 
@@ -543,38 +541,6 @@ def _sums_and_means(count: int) -> FloatArray:
     return np.stack([np.ones(count), np.arange(count, 0, -1) / count])
 
 
-@functools.lru_cache(maxsize=256)
-def _whitenings(counts: tuple[int, ...], independent: float, variance: float, walk: float) -> FloatArray:
-    """Return matrices (w, m, m), each of which whitens the newest differences of bins, as `_whitening` does.
-
-    The number of differences is m for the first matrix, and `counts` contains the numbers for all matrices.
-    The elements for earlier differences are zero.
-    """
-    matrices = np.zeros((len(counts), counts[0], counts[0]))
-    for matrix, count in zip(matrices, counts, strict=True):
-        matrix[-count:, -count:] = _whitening(count, independent, variance, walk)
-    return matrices
-
-
-def _whitening(count: int, independent: float, variance: float, walk: float) -> FloatArray:
-    """Return the matrix (m, m) that whitens the differences of bins and removes their constant part.
-
-    Args:
-        count: number m of differences between bins.
-        independent: variance of the independent errors of the differences.
-        variance: variance of the rate of a bin, divided by the squared time between bins.
-        walk: increase per bin of the variance of the disturbance, which is a random walk.
-    """
-    covariance = (independent + 2.0 * variance) * np.eye(count)
-    covariance -= variance * (np.eye(count, k=1) + np.eye(count, k=-1))
-    number = np.arange(1, count + 1)
-    covariance += walk * np.minimum(number[:, None], number)
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    constant = whitening.sum(axis=1)
-    constant /= math.sqrt(float(constant @ constant))
-    return np.asarray(whitening - np.outer(constant, constant @ whitening))
-
-
 class Finding(Enum):
     """Kinds of findings about a coil that a fit can yield."""
 
@@ -598,34 +564,12 @@ class MotionFit(NamedTuple):
             better than healthy coils.
     """
 
-    gain: FloatArray
-    sigma: FloatArray
+    gain: Sequence[float]
+    sigma: Sequence[float]
     weights: FloatArray
     possible: bool
     alone: tuple[bool, ...]
     is_reversed: tuple[bool, ...]
-
-
-def _solved_gains(
-    equations: FloatArray, weights: FloatArray, expected: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit n gains under k hypotheses with the prior weights (k, n) of the expected gains (k, n), 1 or -1.
-
-    The weighted sum of squares at gains g is g S g - 2 t g + c. The matrices `equations` (w, n + 1, n + 1) of
-    w fits contain S, the vector t as last row and column, and c as last element. The result is gains (w, k,
-    n), their variances (w, k, n), and costs (w, k), which are the sums of squares of all residuals, including
-    the deviations from the expected values.
-    """
-    coils = weights.shape[1]
-    normal = np.repeat(equations[:, None, :coils, :coils], len(weights), axis=1)
-    normal.reshape(*normal.shape[:2], -1)[:, :, :: coils + 1] += weights
-    covariance = np.linalg.inv(normal)
-    rights = equations[:, None, coils, :coils] + weights * expected
-    gains = (covariance @ rights[..., None])[..., 0]
-    # The prior adds weight * (gain - expected)^2 to the cost for each gain.
-    # Expected gains are 1 or -1, so the term weight * expected^2 equals the weight.
-    costs = equations[:, coils, coils, None] + weights.sum(axis=1) - (rights * gains).sum(axis=2)
-    return gains, np.asarray(covariance.diagonal(axis1=2, axis2=3), dtype=np.float64), costs
 
 
 def _judged(costs: list[float]) -> tuple[tuple[bool, ...], tuple[bool, ...]]:

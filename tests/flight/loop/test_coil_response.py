@@ -239,9 +239,9 @@ def test_an_impossible_or_unclear_fit_of_few_bins_changes_no_sign(
     possible: bool, gain: float, found: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
-    gains, never = np.array([gain, 1.0, 1.0]), (False, False, False)
-    short = MotionFit(gains, np.full(3, 0.1), np.zeros(0), possible, never, (True, False, False))
-    whole = MotionFit(np.ones(3), np.full(3, 0.1), np.zeros(0), True, never, never)
+    gains, never = [gain, 1.0, 1.0], (False, False, False)
+    short = MotionFit(gains, [0.1] * 3, np.zeros(0), possible, never, (True, False, False))
+    whole = MotionFit([1.0] * 3, [0.1] * 3, np.zeros(0), True, never, never)
     response._rows.extend([np.zeros((3, 6))] * 15)
     response._speeds.append(0.1)
     monkeypatch.setattr(response, "_solved", lambda *_: [whole, short])
@@ -336,7 +336,7 @@ def test_a_gain_that_changed_within_the_bins_is_not_used(
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     alone, never = (False, True, False), (False, False, False)
     fits = {
-        bins: MotionFit(np.array([1.0, gain, 1.0]), np.full(3, sigma), np.zeros(0), True, alone, never)
+        bins: MotionFit([1.0, gain, 1.0], [sigma] * 3, np.zeros(0), True, alone, never)
         for bins, gain, sigma in ((16, 0.4, 0.05), (8, newest, 0.07))
     }
     response._rows = deque([np.zeros((3, 6))] * 16)
