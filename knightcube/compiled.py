@@ -34,8 +34,8 @@ _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 """LLVM options for functions that loop forms call: any order of sums, which permits vector instructions."""
 _COMPILING = (
-    "numba compiles the star tracker, the streak fit and the attitude filter for this machine; this takes up "
-    f"to a minute, once ({_SWITCH}=0 avoids it)"
+    "numba compiles the functions in use for this machine; this takes up to a minute, once "
+    f"({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []
 """Functions that loop forms call and that are not yet registered for compilation by numba."""
@@ -80,8 +80,11 @@ class HotFunction(Generic[Parameters, Result]):
         """
         numba = importlib.import_module("numba")
         _announce_compilation()
+        # Without inlining, a process that compiles a helper would call another compiled form of it than the
+        # processes that load the cache file, with sums in another order.
+        options = {"error_model": "numpy", "fastmath": _ANY_ORDER, "forceinline": True}
         while _helpers:
-            numba.extending.register_jitable(error_model="numpy", fastmath=_ANY_ORDER)(_helpers.pop())
+            numba.extending.register_jitable(**options)(_helpers.pop())
         try:
             return _typed(numba.njit(cache=True, error_model="numpy")(self.loop_form))
         except RuntimeError:  # no cache folder is writable

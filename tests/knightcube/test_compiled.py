@@ -86,6 +86,30 @@ def test_compilation_is_announced_and_a_damaged_file_of_machine_code_is_left_asi
         assert list(tmp_path.rglob("*.nbc"))
 
 
+def test_the_process_that_compiles_a_function_computes_the_same_as_later_processes(tmp_path: Path) -> None:
+    """The background of a frame is subtracted with helpers that may compute sums in any order."""
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    environment = {
+        **os.environ,
+        "KNIGHTCUBE_COMPILED": "1",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": str(ROOT),
+    }
+    code = (
+        "import hashlib\nimport numpy as np\nfrom knightcube.vision.frame import Background\n"
+        "rng = np.random.default_rng(1)\nlevel, noise = rng.uniform(90.0, 110.0, (2, 8, 8))\n"
+        "pixels = rng.poisson(400.0, (512, 512)).astype(np.uint16)\n"
+        "signal, variance = Background(level, noise, (512, 512), False).subtracted(pixels)\n"
+        "print(hashlib.sha256(signal.tobytes() + variance.tobytes()).hexdigest())"
+    )
+    command = [sys.executable, "-c", code]
+    results = [
+        subprocess.run(command, env=environment, timeout=100, check=True, capture_output=True).stdout
+        for _ in range(2)
+    ]
+    assert results[0] == results[1]
+
+
 @pytest.mark.parametrize("dtype", [">f8", "f2"])
 def test_arrays_that_numba_does_not_know_are_left_to_numpy(
     dtype: str, monkeypatch: pytest.MonkeyPatch
