@@ -45,13 +45,14 @@ import numpy as np
 
 from flight.loop.coil_currents import ELECTRICAL, NEWEST, Bounds, CoilFault, Predicted, Supplied, fits
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
-from knightcube.astro.arrays import FloatArray, cross_matrices
-from knightcube.gnc.estimation.coil_gains import fitted, whitenings
+from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
+    fitted_gains,
     gyroscopic_coefficients,
     rate_products,
+    whitenings,
 )
 
 _SAMPLES_NS = 25_000_000
@@ -226,7 +227,8 @@ class CoilResponse:
         self._count_of_coils = coils = len(directions)
         # Accelerations per ampere (3, 3 n) of the n coils in a unit field along each body axis. The
         # acceleration by coil a with the dipole d_a per ampere is J^-1 (d_a x B).
-        per_field = directions @ cross_matrices(np.eye(3)) @ (strongest * np.linalg.inv(settings.inertia).T)
+        torques = np.cross(directions, np.eye(3)[:, None])
+        per_field = torques @ (strongest * np.linalg.inv(settings.inertia).T)
         self._per_field: FloatArray = per_field.reshape(3, 3 * coils)
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)
@@ -457,7 +459,9 @@ class CoilResponse:
         free, coils = len(self._free), self._count_of_coils
         equations = self._whitened(rows, counts, span)
         normal = equations.transpose(0, 2, 1) @ equations
-        gains, variances, costs, others = fitted(normal, self._prior, self._prior_weights, self._expected)
+        gains, variances, costs, others = fitted_gains(
+            normal, self._prior, self._prior_weights, self._expected
+        )
         largest, fits = self.largest.tolist(), []
         for count, gain, variance, cost, other in zip(
             counts, gains.tolist(), variances.tolist(), costs.tolist(), others, strict=True

@@ -2,7 +2,7 @@
 
 The filter applies each measurement at the time for which the measurement is valid. A late measurement is
 inserted at its measurement time, and all later measurements are applied again, either in a single call, or a
-few in each call while the filter continues without the late measurement (module `replay`). The rate from a
+few in each call while the filter continues without the late measurement (class `Replay`). The rate from a
 streaked image is the mean rate during the exposure, so the filter stores the attitude at the start of an
 exposure until the exposure ends. The filter can also estimate the age of the inertial unit's samples (module
 `mekf`). For a body that hangs on the testbed's thread, the filter uses only the component of each measurement
@@ -49,8 +49,8 @@ from knightcube.gnc.estimation.estimate import (
     RateMeasurement,
     SlowPrior,
 )
-from knightcube.gnc.estimation.mekf import LONGEST_LATENCY
-from knightcube.gnc.estimation.replay import (
+from knightcube.gnc.estimation.mekf import (
+    LONGEST_LATENCY,
     Checkpoint,
     CheckpointHistory,
     CommandHistory,

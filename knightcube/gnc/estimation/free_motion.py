@@ -55,6 +55,26 @@ class MotionStep(NamedTuple):
     slopes: FloatArray
 
 
+def _rates_numpy(
+    inertia: FloatArray, inverse: FloatArray, rate: FloatArray, torque: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the rate (3,) after a step of `dt` s, and three other elements of a `MotionStep`.
+
+    The other elements are the integral of the rate, and the rate and the acceleration in the middle.
+    """
+
+    def accelerated(at: FloatArray) -> FloatArray:
+        return np.asarray(inverse @ (torque - cross_product(at, inertia @ at)))
+
+    first = accelerated(rate)
+    second = accelerated(rate + 0.5 * dt * first)
+    middle = rate + 0.5 * dt * second
+    third = accelerated(middle)
+    last = accelerated(rate + dt * third)
+    after = rate + dt / 6.0 * (first + 2.0 * (second + third) + last)
+    return after, dt * (rate + dt / 6.0 * (first + second + third)), middle, third
+
+
 def _step_numpy(
     body: Bodies,
     quaternion: FloatArray,
@@ -85,17 +105,7 @@ def _step_numpy(
     shape = shapes(Pressures(around[2], around[3]).facing(areas, to_body[None]), to_body[None])[0]
     across, upright = cross_matrix(field), cross_matrix(up)
     torque = -across @ dipole + strength * upright @ stiff + shape @ sizes
-
-    def accelerated(at: FloatArray) -> FloatArray:
-        return np.asarray(inverse @ (torque - cross_product(at, inertia @ at)))
-
-    first = accelerated(rate)
-    second = accelerated(rate + 0.5 * dt * first)
-    middle = rate + 0.5 * dt * second
-    acceleration = accelerated(middle)
-    last = accelerated(rate + dt * acceleration)
-    after = rate + dt / 6.0 * (first + 2.0 * (second + acceleration) + last)
-    swept = dt * (rate + dt / 6.0 * (first + second + acceleration))
+    after, swept, middle, acceleration = _rates_numpy(inertia, inverse, rate, torque, dt)
     # The rate changes its direction during the step (Bortz 1971, to second order).
     rotation = from_rotation_vector(swept + dt * dt / 12.0 * cross_product(rate, after))
     turning = cross_matrix(middle)
@@ -156,6 +166,22 @@ def _accelerated(inertia: FloatArray, inverse: FloatArray, rate: Vector, torque:
 
 
 @loop_helper
+def _rates(
+    inertia: FloatArray, inverse: FloatArray, rate: Vector, torque: Vector, dt: float
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """See `_rates_numpy`."""
+    first = _accelerated(inertia, inverse, rate, torque)
+    second = _accelerated(inertia, inverse, _ahead(rate, 0.5 * dt, first), torque)
+    middle = _ahead(rate, 0.5 * dt, second)
+    third = _accelerated(inertia, inverse, middle, torque)
+    last = _accelerated(inertia, inverse, _ahead(rate, dt, third), torque)
+    twice = added(second, third)
+    after = _ahead(rate, dt / 6.0, added(added(added(first, twice), twice), last))
+    mean = _ahead(rate, dt / 6.0, added(first, twice))
+    return after, (dt * mean[0], dt * mean[1], dt * mean[2]), middle, third
+
+
+@loop_helper
 def _exposed(areas: FloatArray, pressure: Vector) -> Vector:
     """Return a pressure vector (3,), body axes, multiplied by the exposed area of the body."""
     x, y, z = pressure
@@ -213,17 +239,8 @@ def _step(
     torque = _ahead(torque, strength, cross(up, _times(inertia, up)))
     torque = added(torque, cross((sizes[3], sizes[4], sizes[5]), air))
     torque = added(torque, cross((sizes[6], sizes[7], sizes[8]), light))
-    first = _accelerated(inertia, inverse, begun, torque)
-    second = _accelerated(inertia, inverse, _ahead(begun, half, first), torque)
-    middle = _ahead(begun, half, second)
-    third = _accelerated(inertia, inverse, middle, torque)
-    last = _accelerated(inertia, inverse, _ahead(begun, dt, third), torque)
-    twice = added(second, third)
-    mean = added(first, twice)
-    after = _ahead(begun, dt / 6.0, added(added(mean, twice), last))
-    sixth = dt * dt / 6.0
-    swept = dt * rate[0] + sixth * mean[0], dt * rate[1] + sixth * mean[1], dt * rate[2] + sixth * mean[2]
-    x, y, z = _ahead(swept, 0.5 * sixth, cross(begun, after))
+    after, swept, middle, third = _rates(inertia, inverse, begun, torque, dt)
+    x, y, z = _ahead(swept, dt * dt / 12.0, cross(begun, after))
     found = _by_unknowns(body, given, field, up, strength, air, light)
     eye, turning = np.eye(3), _skew(middle)
     _add(found, 3, 1.0, eye, _skew(_times(inertia, middle)))

@@ -683,11 +683,9 @@ def estimate_motion(
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
     binning, frame, regions, sigma = prepare_frame(pixels, pinhole, saturation, settings)
-    line_time_sigma = settings.line_time_sigma
-    settings, pinhole = binning.settings(settings), binning.pinhole
+    line_time_sigma, settings, pinhole = settings.line_time_sigma, binning.settings(settings), binning.pinhole
     shutter = Shutter(settings.delay_per_row / exposure, pinhole.centre[1])
-    growing = settings.rate_model == "accelerating"
-    camera = FitProblem(frame, pinhole, shutter, settings, sigma, growing)
+    camera = FitProblem(frame, pinhole, shutter, settings, sigma, settings.rate_model == "accelerating")
     if prior_course is not None and settings.rate_model != "constant":
         camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)

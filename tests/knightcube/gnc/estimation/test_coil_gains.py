@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.coil_gains import fitted, whitenings
+from knightcube.gnc.estimation.rigid_body import fitted_gains, whitenings
 from tests.support.compiled_forms import assert_forms_agree
 
 
@@ -23,7 +23,7 @@ def test_gains_and_costs_equal_a_least_squares_solution_that_contains_the_priors
     coils: int, others: int
 ) -> None:
     rows, prior, weights, expected = _problem(coils, others)
-    gains, variances, costs, other = fitted(rows.transpose(0, 2, 1) @ rows, prior, weights, expected)
+    gains, variances, costs, other = fitted_gains(rows.transpose(0, 2, 1) @ rows, prior, weights, expected)
     for place in range(2):
         for k, (weight, value) in enumerate(zip(weights, expected, strict=True)):
             root = np.sqrt(np.concatenate([prior, weight]))
@@ -41,7 +41,7 @@ def test_gains_and_costs_equal_a_least_squares_solution_that_contains_the_priors
 @pytest.mark.parametrize(("coils", "others"), [(3, 2), (3, 16)])
 def test_the_loop_form_of_the_fit_equals_the_numpy_form(coils: int, others: int) -> None:
     rows, prior, weights, expected = _problem(coils, others)
-    assert_forms_agree(fitted, rows.transpose(0, 2, 1) @ rows, prior, weights, expected)
+    assert_forms_agree(fitted_gains, rows.transpose(0, 2, 1) @ rows, prior, weights, expected)
 
 
 def test_whitened_differences_have_unit_variance_except_for_their_constant_part() -> None:

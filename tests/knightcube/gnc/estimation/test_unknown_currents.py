@@ -11,7 +11,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_about_axis_y
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, CommandCheck
 from knightcube.gnc.estimation.estimate import SIZE, FilterState, Parameters, RateMeasurement
-from knightcube.gnc.estimation.replay import Checkpoint, CommandHistory
+from knightcube.gnc.estimation.mekf import Checkpoint, CommandHistory
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, Flight, begin, fly, follow
 from tests.support.consistency_worlds import CYCLE_NS
