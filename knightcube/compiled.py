@@ -34,7 +34,7 @@ _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 """LLVM options for functions that loop forms call: any order of sums, which permits vector instructions."""
 _COMPILING = (
-    "numba compiles the functions in use for this machine; this takes up to a minute, once "
+    "numba compiles the functions in use for this machine; this takes about a minute, once "
     f"({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []

@@ -106,7 +106,7 @@ class Touched:
             return
         code = frame.f_code
         outside = code.co_filename.startswith(f"{ROOT}/sim_hal/") or code is LockStepRunner.submit.__code__
-        outside |= code.co_name == "<module>"  # decorators that an import calls
+        outside |= code.co_name == "<module>"  # An import calls decorators, which do not count.
         if event == "return":
             self._outside -= bool(self._outside and outside)
             return
