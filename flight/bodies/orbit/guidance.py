@@ -405,7 +405,8 @@ REST_AGAIN_NS = 5_000_000_000
 """Shortest time (ns) between two plans for the rest of a slew."""
 MOST_WAITS = 4
 """Largest number of times `REST_AGAIN_NS` until the rest of a slew is planned again. The number grows by one
-with each plan that does not improve the present plan, because most plans that follow do not improve it."""
+with each plan that does not improve the present plan, because most plans that follow do not improve it. If a
+coil fails or is used again, the rest is planned at once."""
 _SMALLEST = 0.5
 """Smallest plausible principal moment of inertia, relative to the smallest configured moment."""
 
@@ -466,6 +467,7 @@ class PointingPlanner:
         self._smallest = _SMALLEST * float(np.linalg.eigvalsh(craft.inertia)[0])
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
+        self._planned_with = usable()
         self._wanted = self._held = False
         self._after_ns = self._count = self._accepted = self._refused = self._unimproved = 0
 
@@ -503,7 +505,7 @@ class PointingPlanner:
             if not astray.ready:
                 return
         elif self._paths.is_slewing(now_ns, goal):
-            if estimate is not None and self._job is None and now_ns >= self._after_ns:
+            if estimate is not None and self._job is None and self._rest_is_due(now_ns):
                 self._plan_rest(estimate, goal, now_ns)
             return
         if self._paths.has_arrived(now_ns):
@@ -529,6 +531,9 @@ class PointingPlanner:
             self._wanted, self._job, self._count = False, job, job.number
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
+    def _rest_is_due(self, now_ns: int) -> bool:
+        return now_ns >= self._after_ns or not np.array_equal(self._usable(), self._planned_with)
+
     def _plan_rest(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> None:
         """Submit the job that plans the rest of the running slew again, unless the slew is near its end."""
         running = self._paths.running(now_ns)
@@ -546,6 +551,7 @@ class PointingPlanner:
             return None
         learned = self._learned()
         usable, duty = self._usable(), craft.duty
+        self._planned_with = usable
         limit, slewing = craft.coils.working(usable).limits, craft.coils.working(usable, ACROSS)
         wish = replace(craft.slew, residual=learned.residual, heat=slewing.heat, limit=duty * slewing.limits)
         # A physically impossible inertia tensor is not used.

@@ -119,6 +119,21 @@ def test_after_plans_that_improve_nothing_the_rest_is_planned_again_later(slew: 
         assert len(flight.jobs) == count + 1
 
 
+def test_when_a_coil_fails_the_rest_is_planned_at_once(slew: PointingTable) -> None:
+    flight = Flight()
+    flight.paths.offer(slew, NADIR, 0)
+    flight.serve(40.0)
+    flight.finish(40.1, None)
+    flight.serve(41.0)
+    assert len(flight.jobs) == 1
+    flight.usable = np.array([True, True, False])
+    flight.serve(41.1)
+    assert len(flight.jobs) == 2
+    flight.finish(41.2, None)
+    flight.serve(42.0)
+    assert len(flight.jobs) == 2, "the rest is planned once with the changed coils"
+
+
 def test_near_its_end_a_slew_is_not_planned_again(slew: PointingTable) -> None:
     assert slew.slew is not None
     last = 10.0 + (1.0 - REST) * slew.slew.horizon
