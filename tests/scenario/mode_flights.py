@@ -48,7 +48,7 @@ def entered(run: Run, mode: Mode, occurrence: int = -1) -> float:
 
 def currents(run: Run, since: float, until: float) -> FloatArray:
     """Return the largest coil current |I| at each sample of the truth in an interval."""
-    time = run["truth"]["time_ns"] * 1e-9
+    time: FloatArray = run["truth"]["time_ns"] * 1e-9
     largest: FloatArray = np.abs(run["truth"]["current"]).max(axis=1)
     return largest[(time >= since) & (time < until)]
 

@@ -30,7 +30,7 @@ WITHIN = 0.1
 def true_current(run: Run, since: float, until: float) -> FloatArray:
     """Return the largest coil current at each sample of the truth in an interval."""
     truth = run["truth"]
-    time = truth["time_ns"] * 1e-9
+    time: FloatArray = truth["time_ns"] * 1e-9
     largest: FloatArray = np.abs(truth["current"]).max(axis=1)
     return largest[(time >= since) & (time < until)]
 

@@ -28,7 +28,9 @@ import numpy.typing as npt
 from flight.link.telemetry.definitions import PACKETS, Field, Packet
 from knightcube.errors import FlightError
 
-PacketArray = npt.NDArray[np.void]
+PacketArray = Any
+"""Structured array (n,) with a column for each field of a packet. numpy's type of a structured array does not
+contain the types of its columns; with `Any`, mypy needs a third less time for the repository."""
 
 HEADER_BYTES = 6
 SECONDARY_BYTES = 9

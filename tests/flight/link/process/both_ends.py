@@ -205,7 +205,7 @@ class BothEnds:
     def status(self) -> PacketArray:
         """Return the newest status packet of the link."""
         (row,) = LAYOUTS[LINK.name].array(self.of(LINK.name)[-1])
-        return row  # type: ignore[no-any-return]  # numpy types no row of a structured array
+        return row
 
     def close(self) -> None:
         """Close the open files and sockets."""
