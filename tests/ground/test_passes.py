@@ -44,6 +44,12 @@ def seen(station: Station, at: datetime) -> tuple[float, float, float]:
     return elevation, math.degrees(math.atan2(east, north)) % 360.0, math.sqrt(north**2 + east**2 + down**2)
 
 
+def test_positions_agree_with_the_exact_nutation_within_a_decimetre(prediction: OrbitPrediction) -> None:
+    times = prediction._scale.from_datetimes(prediction._at[::400])
+    exact = prediction._satellite.at(times).position.m.T
+    assert np.abs(prediction._positions[::400] - exact).max() < 0.1
+
+
 def test_a_pass_begins_and_ends_at_the_mask_and_culminates_between(prediction: OrbitPrediction) -> None:
     found = prediction.passes(STATIONS)
     assert {one.station.name for one in found} == {"Berlin", "Tromso"}
