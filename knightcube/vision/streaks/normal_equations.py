@@ -35,6 +35,7 @@ SHARED = 7
 """Number of parameters that all stars share: rate (3), acceleration (3) and point-spread width (1)."""
 ALONE = 4
 """Number of parameters of a single star: x, y, flux and sky level."""
+_PARAMETERS = SHARED + ALONE
 
 # Margin (standard deviations) between modelled counts and saturation below which a pixel is excluded.
 # A selection by measured instead of modelled counts would be biased by their noise.
@@ -263,38 +264,30 @@ def _sum_products(
     (star, matrix), (gain, clip) = of_blocks, limits
     slot, inside, signal, floor, ceiling = of_pixels
     blocks, count, size = images.shape
-    gram, weighted = np.empty((count, count)), np.empty(size, dtype=np.float32)
+    gram, weighted = np.zeros((count, count)), np.empty(size, dtype=np.float32)
     model, least = np.empty(size, dtype=np.float32), np.float32(0.0)
     per_count, margin, unresolved = np.float32(1.0 / gain), np.float32(_MARGIN), np.float32(_UNRESOLVED)
     share, room = np.float32(clip), np.float32(0.0 if clip > 0.0 else np.inf)
     for b in range(blocks):
         owner, left, weights = star[b], images[b, count - 1], weight[b]
-        variance, off, full = floor[b], signal[b], ceiling[b]
+        variance, off, full, within = floor[b], signal[b], ceiling[b], inside[b]
         for p in range(size):
             model[p] = total[slot[b, p]]
         for p in range(size):
             expected = max(model[p], least) * per_count + variance[p]
             residual, deviation = off[p] - model[p], np.float32(math.sqrt(expected))
-            good = (model[p] + margin * deviation < full[p]) & inside[b, p]
+            good = (model[p] + margin * deviation < full[p]) & within[p]
             good &= abs(residual) <= share * deviation + unresolved * model[p] + room
             weights[p] = np.float32(1.0) / expected if good else least
-            left[p] = residual if good else least
         for p in range(size):
-            pixels[owner] += weights[p] > 0.0
-        for i in range(count):
-            for p in range(size):
-                weighted[p] = weights[p] * images[b, i, p]
-            for k in range(i, count):
-                gram[i, k] = _scalar_product(weighted, images[b, k])
-                gram[k, i] = gram[i, k]
+            left[p] = off[p] - model[p] if weights[p] > least else least
+        used = 0
+        for p in range(size):
+            used += weights[p] > least
+        pixels[owner] += used
+        _multiply_images(gram, images[b], weights, weighted)
         _add_block(information[owner], gradient[owner], gram, matrix[b])
         chi2[owner] += gram[count - 1, count - 1]
-    for b in range(blocks):
-        of_star = information[star[b]]
-        if b == 0 or star[b] != star[b - 1]:
-            for q in range(len(of_star)):
-                for r in range(q):
-                    of_star[r, q] = of_star[q, r]
 
 
 @loop_helper
@@ -307,25 +300,42 @@ def _scalar_product(a: Any, b: Any) -> Any:
 
 
 @loop_helper
+def _multiply_images(
+    gram: FloatArray, images: Float32Array, weights: Float32Array, weighted: Float32Array
+) -> None:
+    """Compute the products `gram` (i, i), with the `weights` (p,), of i images (i, p); `weighted` is scratch."""
+    count, size = images.shape
+    for i in range(count):
+        square = np.float32(0.0)
+        for p in range(size):
+            weighted[p] = weights[p] * images[i, p]
+            square += weights[p] * images[i, p] * images[i, p]
+        gram[i, i] = square
+        # In most blocks, the images of the streak ends are zero.
+        for k in range(i):
+            product = np.float32(0.0)
+            for p in range(size if square > 0.0 and gram[k, k] > 0.0 else 0):
+                product += weighted[p] * images[k, p]
+            gram[i, k] = product
+            gram[k, i] = product
+
+
+@loop_helper
 def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
-    """Add the products `gram` of images to one star's gradient and lower half of the information matrix."""
-    images, count = matrix.shape
-    along = np.empty(images)
-    for q in range(count):
-        used = False
-        for i in range(images):
-            along[i] = 0.0
+    """Add the products `gram` of images to the gradient and the information matrix of one star."""
+    images = len(matrix)
+    row = np.empty(_PARAMETERS)
+    for i in range(images):
+        row[:] = 0.0
         for k in range(images):
-            share = matrix[k, q]
+            for r in range(_PARAMETERS):
+                row[r] += gram[i, k] * matrix[k, r]
+        for q in range(_PARAMETERS):
+            share = matrix[i, q]
             if share != 0.0:
-                used = True
-                gradient[q] += share * gram[k, images]
-                for i in range(images):
-                    along[i] += share * gram[k, i]
-        if used:
-            for r in range(q + 1):
-                for i in range(images):
-                    information[q, r] += along[i] * matrix[i, r]
+                gradient[q] += share * gram[i, images]
+                for r in range(_PARAMETERS):
+                    information[q, r] += share * row[r]
 
 
 def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:

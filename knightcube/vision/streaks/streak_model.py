@@ -38,6 +38,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
@@ -337,10 +338,14 @@ def _draw(
 ) -> None:
     (corner, step, time), (position, velocity, acceleration) = lines, points
     blocks, _, line_count, count = out.shape
-    pixels, bits = np.empty((4, line_count * count)), np.empty(line_count * count, dtype=np.int64)
-    exponential = bits.view(np.float64)
-    paces = np.empty((line_count, 5))
+    size = line_count * count
+    values = np.zeros((_VALUES, line_count, count), dtype=np.float32)
+    pixels = values.reshape(_VALUES, size)
+    power = np.zeros(pixels.shape[1], dtype=np.int32)
+    exponential, of_lines = power.view(np.float32), np.empty((line_count, 5))
+    narrow = 1.0 / width**2
     for b in range(blocks):
+        drawn = out[b].reshape(out.shape[1], size)
         centre = 0.5 * (time[b, line_count // 2 - 1] + time[b, line_count // 2])
         by_x, by_y = step[b, 0], step[b, 1]
         for i in range(line_count):
@@ -348,143 +353,187 @@ def _draw(
             tx, ty = velocity[0, b, i] / speed, velocity[1, b, i] / speed
             bent_x, bent_y = acceleration[0, b, i], acceleration[1, b, i]
             dx, dy = corner[b, i, 0] - position[0, b, i], corner[b, i, 1] - position[1, b, i]
+            gained, shift = bent_x * tx + bent_y * ty, (time[b, i] - centre) * speed
+            scale = _BELL / (width * speed)
+            square = scale * _KURTOSIS / 24.0 * narrow * narrow * (1.0 - 2.0 * (tx * ty) ** 2)
             first = dy * tx - dx * ty, dx * tx + dy * ty
             each = by_y * tx - by_x * ty, by_x * tx + by_y * ty
-            bend, narrow = (bent_y * tx - bent_x * ty) / speed**2, 1.0 / width**2
-            square = _KURTOSIS / 24.0 * narrow * narrow * (1.0 - 2.0 * (tx * ty) ** 2)
-            paces[i, 0], paces[i, 1] = speed, bent_x * tx + bent_y * ty
-            paces[i, 2], paces[i, 3] = time[b, i], time[b, i] - centre
-            paces[i, 4] = (corner[b, i, 1] - delay[1]) * delay[0]
-            thinning, shift = paces[i, 1] / speed**2, paces[i, 3] * speed
-            profile = narrow, _BELL / (width * speed), square
-            _endless_line(pixels, i * count, count, first, each, (bend, thinning, shift), profile)
-        _exponential(pixels[2], bits, exponential)
-        _fill(out[b].reshape(out.shape[1], line_count * count), pixels, exponential)
-        for i in range(line_count):
-            part = slice(i * count, (i + 1) * count)
-            late, later = paces[i, 4], paces[i, 4] + by_y * delay[0] * (count - 1)
-            reach = (_ENDS + _OBLIQUE) * width / paces[i, 0]
-            for sign in (1.0, -1.0):
-                edge = max(late, later) if sign > 0.0 else min(late, later)
-                if 0.5 + sign * (paces[i, 2] - edge) < reach:
-                    _from_end(pixels[:, part], paces[i], width, sign, by_y * delay[0])
-                    _exponential(pixels[2, part], bits[part], exponential[part])
-                    ended = out[b].reshape(out.shape[1], line_count * count)[:, part]
-                    _draw_end(ended, pixels[3, part], exponential[part], width, sign, paces[i])
-        _draw_moments(out[b].reshape(out.shape[1], line_count * count), pixels, width)
+            bend, thinning = (bent_y * tx - bent_x * ty) / speed**2, gained / speed**2
+            shared = bend, thinning, shift, scale + 3.0 * square, square
+            _set_line(values, i, first, each, shared)
+            of_lines[i, 0], of_lines[i, 1], of_lines[i, 2] = speed, gained, time[b, i]
+            of_lines[i, 3], of_lines[i, 4] = centre, (corner[b, i, 1] - delay[1]) * delay[0]
+        _endless_block(pixels, narrow)
+        _exponential(pixels[_EXPONENT], power, exponential)
+        _fill(drawn, pixels, exponential)
+        for sign in (1.0, -1.0):
+            if _reaches_end(of_lines, width, sign, by_y * delay[0] * (count - 1)):
+                _from_end(values, of_lines, width, sign, by_y * delay[0])
+                _exponential(pixels[_EXPONENT], power, exponential)
+                _draw_end(drawn, pixels, exponential, width, sign)
+        _draw_moments(drawn, pixels, width)
+
+
+# Rows of the values of each pixel in `_draw`: distances (px) across the path and ahead of the crossing, the
+# curvature of the path, the acceleration along the path divided by the squared speed, and the distance (px)
+# of the crossing from the centre of the block.
+_ACROSS, _AHEAD, _BEND, _THINNING, _SHIFT = range(5)
+_Five = tuple[float, float, float, float, float]
+# Coefficients of the profile's factor, distance (px) along the path, exponent of the profile, its factor, and
+# distance (point-spread widths) from a streak end.
+_CONSTANT, _QUADRATIC, _ALONG, _EXPONENT, _FACTOR, _DISTANCE = range(5, 11)
+_VALUES = 11
 
 
 @loop_helper
-def _exponential(exponents: FloatArray, bits: IntArray, out: FloatArray) -> None:
+def _set_line(
+    pixels: Float32Array, i: int, first: tuple[float, float], each: tuple[float, float], shared: _Five
+) -> None:
+    """Set the distances of the pixels of the line `i`, and the values that all pixels of the line share.
+
+    The distances across and along the path from the crossing are `first` (px) for the first pixel, and change
+    by `each` from pixel to pixel.
+    """
+    across, ahead = np.float32(first[0]), np.float32(first[1])
+    by_across, by_ahead = np.float32(each[0]), np.float32(each[1])
+    bend, thinning, shift = np.float32(shared[0]), np.float32(shared[1]), np.float32(shared[2])
+    constant, quadratic = np.float32(shared[3]), np.float32(shared[4])
+    for k in range(pixels.shape[2]):
+        offset = np.float32(np.int32(k))
+        pixels[_ACROSS, i, k], pixels[_AHEAD, i, k] = across + offset * by_across, ahead + offset * by_ahead
+        pixels[_BEND, i, k], pixels[_THINNING, i, k], pixels[_SHIFT, i, k] = bend, thinning, shift
+        pixels[_CONSTANT, i, k], pixels[_QUADRATIC, i, k] = constant, quadratic
+
+
+@loop_helper
+def _endless_block(pixels: Float32Array, narrow: float) -> None:
+    """Compute exponent and factor of an infinite streak's profile from the values of `_set_line`.
+
+    The distances become distances across and along the curved path, the latter from the centre of the block,
+    and the factor replaces the constant coefficient. The argument `narrow` is the inverse squared width.
+    """
+    half, one, cubic = np.float32(0.5), np.float32(1.0), np.float32(0.375)
+    six, inverse = np.float32(6.0), np.float32(narrow)
+    for k in range(pixels.shape[1]):
+        squeeze = min(max(pixels[_BEND, k] * pixels[_ACROSS, k], -half), half)
+        pixels[_ALONG, k] = pixels[_AHEAD, k] / (one - squeeze)
+    for k in range(pixels.shape[1]):
+        squeeze = min(max(pixels[_BEND, k] * pixels[_ACROSS, k], -half), half)
+        thinned = one - pixels[_ALONG, k] * pixels[_THINNING, k]
+        pixels[_FACTOR, k] = (one + squeeze * (half + cubic * squeeze)) * thinned
+    for k in range(pixels.shape[1]):
+        pixels[_ACROSS, k] -= half * pixels[_BEND, k] * pixels[_AHEAD, k] * pixels[_ALONG, k]
+    for k in range(pixels.shape[1]):
+        u = inverse * pixels[_ACROSS, k] * pixels[_ACROSS, k]
+        pixels[_EXPONENT, k] = -half * u
+        pixels[_FACTOR, k] *= (u - six) * u * pixels[_QUADRATIC, k] + pixels[_CONSTANT, k]
+    for k in range(pixels.shape[1]):
+        pixels[_ALONG, k] += pixels[_SHIFT, k]
+
+
+@loop_helper
+def _exponential(exponents: Float32Array, power: npt.NDArray[np.int32], out: Float32Array) -> None:
     """Compute the exponential `out` (k,) of non-positive exponents (k,), which are overwritten.
 
-    The power of two is written as the exponent `bits` of `out`, which shares its memory with `bits`. The
-    relative error of the result is below 1e-9. Exponents below -80 are replaced by -80.
+    The power of two is written as the exponent bits (`power`) of `out`, which shares its memory with `power`.
+    Exponents below -80 are replaced by -80.
     """
-    for k in range(len(bits)):
-        exponent = max(exponents[k], -80.0)
-        power = np.int32(exponent * _PER_OCTAVE - 0.5)
-        exponents[k] = exponent - power * _OCTAVE
-        bits[k] = (np.int64(power) + 1023) << 52
-    for k in range(len(bits)):
+    lowest, half, one = np.float32(-80.0), np.float32(0.5), np.float32(1.0)
+    per_octave, octave = np.float32(_PER_OCTAVE), np.float32(_OCTAVE)
+    third, quarter, fifth = np.float32(1 / 3), np.float32(1 / 4), np.float32(1 / 5)
+    sixth, seventh = np.float32(1 / 6), np.float32(1 / 7)
+    for k in range(len(power)):
+        exponent = max(exponents[k], lowest)
+        whole = np.int32(exponent * per_octave - half)
+        exponents[k] = exponent - np.float32(whole) * octave
+        power[k] = (whole + np.int32(127)) << np.int32(23)
+    for k in range(len(power)):
         x = exponents[k]
-        series = 1.0 + x * (1 / 6) * (1.0 + x * (1 / 7) * (1.0 + x * (1 / 8)))
-        series = 1.0 + x * (1 / 3) * (1.0 + x * (1 / 4) * (1.0 + x * (1 / 5) * series))
-        out[k] *= 1.0 + x * (1.0 + x * (1 / 2) * series)
-
-
-_Three = tuple[float, float, float]
+        series = one + x * quarter * (one + x * fifth * (one + x * sixth * (one + x * seventh)))
+        out[k] *= one + x * (one + x * half * (one + x * third * series))
 
 
 @loop_helper
-def _endless_line(
-    pixels: FloatArray,
-    begin: int,
-    count: int,
-    first: tuple[float, float],
-    each: tuple[float, float],
-    path: _Three,
-    profile: _Three,
-) -> None:
-    """Compute four values for each of `count` pixels on a line across an infinite streak, from `begin`.
-
-    The four values are the distance across the path, the distance along the path from the centre of the
-    block, and the exponent and the factor of the profile. The distances across and along the path from the
-    crossing are `first` (px) for the first pixel, and change by `each` from pixel to pixel. The argument
-    `path` contains the curvature, the acceleration along the path divided by the squared speed, and the
-    distance of the line from the centre. The argument `profile` contains the inverse squared width, the
-    maximum, and the correction for the fourth cumulant.
-    """
-    across, ahead, by_across, by_ahead = first[0], first[1], each[0], each[1]
-    bend, thinning, shift = path
-    narrow, middle, quadratic = profile[0], profile[1] * (1.0 + 3.0 * profile[2]), profile[1] * profile[2]
-    for k in range(count):
-        aside, s = across + k * by_across, ahead + k * by_ahead
-        squeeze = min(max(bend * aside, -0.5), 0.5)
-        bent = 0.5 * bend * s
-        s /= 1.0 - squeeze
-        aside -= bent * s
-        u = narrow * aside * aside
-        pixels[0, begin + k], pixels[1, begin + k], pixels[2, begin + k] = aside, s + shift, -0.5 * u
-        thinned = (1.0 + squeeze * (0.5 + 0.375 * squeeze)) * (1.0 - s * thinning)
-        pixels[3, begin + k] = thinned * ((u - 6.0) * u * quadratic + middle)
-
-
-@loop_helper
-def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> None:
+def _fill(out: Float32Array, pixels: Float32Array, exponential: Float32Array) -> None:
     """Set `out[0]` to the counts of an infinitely long streak, and initialise the images `out[3:7]`."""
-    for k in range(len(exponential)):
-        out[0, k] = exponential[k] * pixels[3, k]
-        out[3, k], out[4, k], out[5, k], out[6, k] = 0.0, 0.0, 0.0, 1.0
+    for k in range(out.shape[1]):
+        out[0, k] = exponential[k] * pixels[_FACTOR, k]
+    out[3:6] = 0.0
+    out[6] = 1.0
 
 
 @loop_helper
-def _from_end(pixels: FloatArray, pace: FloatArray, width: float, sign: float, later: float) -> None:
-    """Compute the distances `pixels[3]` (point-spread widths) of a line of pixels from one streak end.
+def _reaches_end(of_lines: FloatArray, width: float, sign: float, later: float) -> bool:
+    """Return whether a streak end is so near to a line of a block that it may affect the counts.
 
-    The `sign` is 1 for the start and -1 for the stop of the exposure. The argument `pace` contains the speed
-    of the star, its acceleration along the path, the time at which it crosses the line, the difference of
-    this time from the time at the centre of the block, and the exposure delay of the first pixel. The delay
-    increases by `later` from pixel to pixel.
+    The `sign` is 1 for the start and -1 for the stop of the exposure. The rows of `of_lines` contain the
+    speed of the star at a line, its acceleration along the path, the time at which it crosses the line, the
+    time at the centre of the block, and the exposure delay of the first pixel. The delay of the last pixel is
+    larger by `later`.
     """
-    speed, gained, time, end = pace[0], pace[1], pace[2], -0.5 * sign
-    shift = (time - pace[3] - end - pace[4]) * speed - 0.5 * gained * (time - end) ** 2
-    slope, scale = later * speed, sign / width
-    for k in range(pixels.shape[1]):
-        u = (pixels[1, k] + shift - k * slope) * scale
-        pixels[3, k], pixels[2, k] = u, -0.5 * u * u
+    for i in range(len(of_lines)):
+        speed, time, late = of_lines[i, 0], of_lines[i, 2], of_lines[i, 4]
+        edge = max(late, late + later) if sign > 0.0 else min(late, late + later)
+        if 0.5 + sign * (time - edge) < (_ENDS + _OBLIQUE) * width / speed:
+            return True
+    return False
+
+
+@loop_helper
+def _from_end(pixels: Float32Array, of_lines: FloatArray, width: float, sign: float, later: float) -> None:
+    """Compute the distances of all pixels from one streak end, in point-spread widths, and exponents.
+
+    The arguments are described in `_reaches_end`; the delay increases by `later` from pixel to pixel.
+    """
+    scale, half = np.float32(sign / width), np.float32(-0.5)
+    for i in range(len(of_lines)):
+        speed, time, centre, late = of_lines[i, 0], of_lines[i, 2], of_lines[i, 3], of_lines[i, 4]
+        from_end = time + 0.5 * sign
+        shift = np.float32((centre + 0.5 * sign - late) * speed - 0.5 * of_lines[i, 1] * from_end**2)
+        slope = np.float32(later * speed)
+        for k in range(pixels.shape[2]):
+            u = (pixels[_ALONG, i, k] + shift - np.float32(np.int32(k)) * slope) * scale
+            pixels[_DISTANCE, i, k], pixels[_EXPONENT, i, k] = u, half * u * u
 
 
 @loop_helper
 def _draw_end(
-    out: Float32Array,
-    distance: FloatArray,
-    exponential: FloatArray,
-    width: float,
-    sign: float,
-    pace: FloatArray,
+    out: Float32Array, pixels: Float32Array, exponential: Float32Array, width: float, sign: float
 ) -> None:
-    """Remove the counts beyond one streak end from a line of pixels, see `_ends`."""
-    image, scale, thinned = 3 if sign > 0.0 else 4, _BELL / width, sign * width**2 * pace[1] / pace[0] ** 2
-    for k in range(len(distance)):
-        u = distance[k]
-        bell = exponential[k] * scale * out[0, k]
-        out[image, k] = bell
-        out[5, k] -= bell * u
-        lit = 1.0 if u > _ENDS else (0.0 if u < -_ENDS else 0.5 * math.erfc(-u * _ROOT_HALF))
-        out[0, k] = out[0, k] * lit - thinned * bell
+    """Remove the counts beyond one streak end from a block of pixels, see `_ends`.
+
+    The cumulative normal distribution is the approximation 26.2.17 of Abramowitz and Stegun, Handbook of
+    Mathematical Functions (1964), with an error below 1e-7.
+    """
+    image, scale, thinned = 3 if sign > 0.0 else 4, np.float32(_BELL / width), np.float32(sign * width**2)
+    zero, one, bell_one, p = np.float32(0.0), np.float32(1.0), np.float32(_BELL), np.float32(0.2316419)
+    b1, b2, b3 = np.float32(0.319381530), np.float32(-0.356563782), np.float32(1.781477937)
+    b4, b5 = np.float32(-1.821255978), np.float32(1.330274429)
+    for k in range(out.shape[1]):
+        u = pixels[_DISTANCE, k]
+        t = one / (one + p * abs(u))
+        tail = bell_one * exponential[k] * t * (b1 + t * (b2 + t * (b3 + t * (b4 + t * b5))))
+        pixels[_FACTOR, k] = one - tail if u > zero else tail
+    for k in range(out.shape[1]):
+        out[image, k] = exponential[k] * scale * out[0, k]
+    for k in range(out.shape[1]):
+        out[5, k] -= out[image, k] * pixels[_DISTANCE, k]
+    for k in range(out.shape[1]):
+        out[0, k] = out[0, k] * pixels[_FACTOR, k] - thinned * pixels[_THINNING, k] * out[image, k]
 
 
 @loop_helper
-def _draw_moments(out: Float32Array, pixels: FloatArray, width: float) -> None:
+def _draw_moments(out: Float32Array, pixels: Float32Array, width: float) -> None:
     """Compute the images of a block of pixels that depend on the counts within the exposure."""
-    narrow, cubed, inverse = 1.0 / width**2, 1.0 / width**3, 1.0 / width
+    narrow, cubed = np.float32(1.0 / width**2), np.float32(1.0 / width**3)
+    inverse = np.float32(1.0 / width)
     for k in range(out.shape[1]):
-        light, across = out[0, k], pixels[0, k]
-        by_aside = across * narrow * light
-        out[1, k] = by_aside
-        out[2, k] = pixels[1, k] * by_aside + across * (out[3, k] - out[4, k])
-        out[5, k] += (across * across * cubed - inverse) * light
+        out[1, k] = pixels[_ACROSS, k] * narrow * out[0, k]
+    for k in range(out.shape[1]):
+        out[2, k] = pixels[_ALONG, k] * out[1, k] + pixels[_ACROSS, k] * (out[3, k] - out[4, k])
+    for k in range(out.shape[1]):
+        across = pixels[_ACROSS, k]
+        out[5, k] += (across * across * cubed - inverse) * out[0, k]
 
 
 def _wide(line: FloatArray) -> Float32Array:
