@@ -405,12 +405,19 @@ class FitWindows:
     on_patches: BlockPixels
     shared: int
 
-    def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
+    def total(
+        self, images: Float32Array, spots: FloatArray, light: FloatArray, sky: FloatArray
+    ) -> Float32Array:
         """Return the sum of the counts of all stars on each fitted pixel, as an array (m + 1,).
 
-        The last element is the sum of the counts on pixels outside the frame.
+        The first of the `images` (b, .., LINES, k) of each block and the images `spots` (n, p, p) are those
+        of stars of unit flux. The arrays `light` (n,) and `sky` (n,) contain the flux and the sky level of
+        each star. The last element of the result is the sum of the counts on pixels outside the frame.
         """
-        return _summed(self.slot, on_strips.reshape(-1), on_patches.reshape(-1), len(self.pixels) + 1)
+        star = self.long[self.strips.star]
+        blocks = images.reshape(*images.shape[:2], math.prod(images.shape[2:])), light[star], sky[star]
+        patches = spots.reshape(len(spots), math.prod(spots.shape[1:])), light[self.spot], sky[self.spot]
+        return _summed(self.slot, blocks, patches, len(self.pixels) + 1)
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
         """Return the fit windows reduced to the pixels selected by the masks `on_strips` and `on_patches`."""
@@ -419,22 +426,34 @@ class FitWindows:
         return replace(self, on_strips=strips, on_patches=patches)
 
 
-def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
-    """Return the sums (count,) of the counts in `first` and `second` that belong to each fitted pixel.
+_Blocks = tuple[Float32Array, FloatArray, FloatArray]
+_Spots = tuple[FloatArray, FloatArray, FloatArray]
+"""Images of a star of unit flux on each block or patch, and the star's flux and sky level."""
 
-    The array `slot` contains the index of the pixel for each value of `first`, and then of `second`.
+
+def _summed_numpy(slot: IntArray, blocks: _Blocks, patches: _Spots, count: int) -> Float32Array:
+    """Return the sums (count,) of the counts on `blocks` and `patches` that belong to each fitted pixel.
+
+    The array `slot` contains the index of the pixel for each pixel of the blocks, and then of the patches.
     """
-    light = np.concatenate([first, second.astype(np.float32)])
-    return np.bincount(slot, light, count).astype(np.float32)
+    (images, light, sky), (spots, spot_light, spot_sky) = blocks, patches
+    streaks = images[:, 0] * light[:, None] + sky[:, None]
+    counts = streaks.reshape(-1), (spots * spot_light[:, None] + spot_sky[:, None]).reshape(-1)
+    return np.bincount(slot, np.concatenate(counts), count).astype(np.float32)
 
 
 @compiled_form_of(_summed_numpy)
-def _summed(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
-    total, begin = np.zeros(count), len(first)
-    for p in range(begin):
-        total[slot[p]] += first[p]
-    for p in range(len(second)):
-        total[slot[begin + p]] += second[p]
+def _summed(slot: IntArray, blocks: _Blocks, patches: _Spots, count: int) -> Float32Array:
+    (images, light, sky), (spots, spot_light, spot_sky) = blocks, patches
+    total, size = np.zeros(count), images.shape[2]
+    strips = slot[: len(images) * size].reshape(len(images), size)
+    for b in range(len(images)):
+        for p in range(size):
+            total[strips[b, p]] += images[b, 0, p] * light[b] + sky[b]
+    squares = slot[len(images) * size :].reshape(spots.shape)
+    for n in range(len(spots)):
+        for p in range(spots.shape[1]):
+            total[squares[n, p]] += spots[n, p] * spot_light[n] + spot_sky[n]
     return total.astype(np.float32)
 
 

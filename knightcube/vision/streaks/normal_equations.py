@@ -105,23 +105,17 @@ def evaluate(
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows)
     of_block = windows.long[strips.star]
-    streak_light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
-    streak_light += scene.sky[of_block, None, None].astype(np.float32)
-    spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
-    total = windows.total(streak_light, spot_light)
+    total = windows.total(images, spots, scene.light, scene.sky)
     n, size = len(scene.stars), SHARED + ALONE
     sums = np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n)
     out = Evaluation(*sums, [], windows.shared, [])
-    # The coefficients `matrix` combine the images of a block into the derivatives of the counts.
-    long, light = scene.stars[windows.long], scene.light[of_block, None, None]
+    long = scene.stars[windows.long]
     geometry = streak_model.coefficients(pinhole, scene.motion, shutter, long, strips, growing)
-    matrix = np.zeros((len(strips.star), streak_model.IMAGES, size))
-    matrix[:, :, :6] = geometry[:, :, :6] * light
-    matrix[:, 5, 6] = light[:, 0, 0]
-    matrix[:, :, 7:9] = geometry[:, :, 6:] * light
-    matrix[:, 0, 9] = matrix[:, 6, 10] = 1.0
-    matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
+    matrix = _matrices(geometry, scene.light[of_block], scene.trusted[of_block])
     _add(out, of_block, windows.on_strips, images, matrix, total, clip)
+    if not len(windows.spot):
+        out.kept.append(windows.on_patches.inside)
+        return out
     spot_images = _spot_images(scene, windows, spots, change)
     matrix = np.tile(np.eye(size), (len(windows.spot), 1, 1))
     matrix[:, :, :SHARED] *= scene.trusted[windows.spot, None, None]
@@ -129,11 +123,39 @@ def evaluate(
     return out
 
 
+def _matrices_numpy(geometry: FloatArray, light: FloatArray, trusted: BoolArray) -> FloatArray:
+    """Return the coefficients (b, IMAGES, SHARED + ALONE) that combine images into derivatives of the counts.
+
+    The coefficients `geometry` (b, IMAGES, 8) are those of `streak_model.coefficients`. The arrays `light`
+    (b,) and `trusted` (b,) are the flux of the star of each block, and whether it contributes to the fit of
+    the shared parameters.
+    """
+    out = np.zeros((*geometry.shape[:2], SHARED + ALONE))
+    out[:, :, :6] = geometry[:, :, :6] * light[:, None, None]
+    out[:, 5, 6] = light
+    out[:, :, 7:9] = geometry[:, :, 6:] * light[:, None, None]
+    out[:, 0, 9] = out[:, 6, 10] = 1.0
+    out[:, :, :SHARED] *= trusted[:, None, None]
+    return out
+
+
+@compiled_form_of(_matrices_numpy)
+def _matrices(geometry: FloatArray, light: FloatArray, trusted: BoolArray) -> FloatArray:
+    out = np.zeros((geometry.shape[0], geometry.shape[1], _PARAMETERS))
+    for b in range(len(out)):
+        shared = light[b] if trusted[b] else 0.0
+        for i in range(geometry.shape[1]):
+            for k in range(6):
+                out[b, i, k] = geometry[b, i, k] * shared
+            out[b, i, 7], out[b, i, 8] = geometry[b, i, 6] * light[b], geometry[b, i, 7] * light[b]
+        out[b, 5, 6], out[b, 0, 9], out[b, 6, 10] = shared, 1.0, 1.0
+    return out
+
+
 def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
     """Return the modelled counts (m,) of all stars of `scene` on the m fitted pixels, without sky level."""
     images, spots, _ = model_images(pinhole, shutter, scene, windows)
-    streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
-    return windows.total(streaks, spots * scene.light[windows.spot, None, None])[:-1]
+    return windows.total(images, spots, scene.light, np.zeros_like(scene.sky))[:-1]
 
 
 def model_images(
@@ -303,7 +325,10 @@ def _scalar_product(a: Any, b: Any) -> Any:
 def _multiply_images(
     gram: FloatArray, images: Float32Array, weights: Float32Array, weighted: Float32Array
 ) -> None:
-    """Compute the products `gram` (i, i), with the `weights` (p,), of i images (i, p); `weighted` is scratch."""
+    """Compute the products `gram` (i, i), with the `weights` (p,), of i images (i, p).
+
+    The array `weighted` (p,) is overwritten.
+    """
     count, size = images.shape
     for i in range(count):
         square = np.float32(0.0)

@@ -617,7 +617,7 @@ def _mixtures(change: FloatArray, velocity: FloatArray, spread: IntArray) -> Flo
 
 
 @loop_helper
-def _tangent(velocity: FloatArray) -> _Three:
+def _tangent(velocity: FloatArray) -> tuple[float, float, float]:
     """Return the direction (x, y) of a velocity (2,), and its magnitude."""
     speed = max(math.sqrt(velocity[0] ** 2 + velocity[1] ** 2), _SLOWEST)
     return velocity[0] / speed, velocity[1] / speed, speed

@@ -56,11 +56,11 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
     of_block = windows.long[windows.strips.star]
     light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
     peak = light.max(axis=2, keepdims=True, initial=0.0)
-    light += scene.sky[of_block, None, None].astype(np.float32)
-    spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
     view = windows.on_strips
     pixels = view.slot, view.inside, view.signal, view.floor, view.ceiling
-    weight, residual = residuals(windows.total(light, spot_light), pixels, (view.gain, 0.0))
+    weight, residual = residuals(
+        windows.total(images, spots, scene.light, scene.sky), pixels, (view.gain, 0.0)
+    )
     with np.errstate(divide="ignore"):
         foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
     weight[foreign] = 0.0

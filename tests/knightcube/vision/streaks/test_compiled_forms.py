@@ -43,6 +43,7 @@ _FUNCTIONS = (
     (normal_equations, "_sum_products", 2e-5),
     (normal_equations, "_eliminated", 1e-6),
     (streak_model, "_mixtures", 1e-9),
+    (normal_equations, "_matrices", 1e-12),
     (normal_equations, "_at_pixels", 1e-9),
     (fit_windows, "_summed", 1e-6),
     (faint_stars, "less_boxes", 2e-6),
