@@ -146,11 +146,12 @@ def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, th
 @compiled_form_of(_significant_numpy)
 def _significant(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
     found, count = np.empty(len(sums), dtype=np.int64), 0
-    lowest = np.float32(threshold * math.sqrt(least))
+    lowest, square = np.float32(threshold * math.sqrt(least)), threshold * threshold
+    # Each index is stored without a branch, because the processor could not predict a branch.
     for pixel in range(len(sums)):
-        if sums[pixel] > lowest and sums[pixel] > threshold * math.sqrt(floor[pixel]):
-            found[count] = pixel
-            count += 1
+        own = float(sums[pixel])
+        found[count] = pixel
+        count += (own > lowest) & (own * own > square * floor[pixel])
     return found[:count].copy()
 
 

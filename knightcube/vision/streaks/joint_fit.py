@@ -180,12 +180,14 @@ class FitProblem:
 class StreakFit:
     """A fitted scene with the solution and the normal equations of the last step.
 
+    The normal equations are those of the scene `before` the last step.
     The last step of the shared parameters, in standard deviations, is 0 if the fit is converged. The mask
     `free` (SHARED,) selects the fitted parameters among the shared parameters. The stars `hidden` on the
     fitted pixels were subtracted instead of fitted; None without any.
     """
 
     scene: StreakScene
+    before: StreakScene
     solution: Solution
     evaluation: Evaluation
     last_step: float
@@ -234,14 +236,14 @@ def iterate(
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
     widest = _WIDER * scene.width if how.clipped else _WIDEST
-    solution, evaluation = None, None
+    before_step, solution, evaluation = scene, None, None
     for turn in range(how.rounds):
         evaluation = None  # The old normal equations, tens of MB, are freed before the next evaluation.
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
             return None
-        scene, wanted = _stepped(scene, solution, camera.pinhole)
+        before_step, (scene, wanted) = scene, _stepped(scene, solution, camera.pinhole)
         valid = 0.3 < scene.width < _WIDEST and scene.width <= widest
         valid &= bool(np.all(np.isfinite(scene.stars)))
         if not valid or not np.linalg.norm(scene.motion.rotation) <= np.pi:
@@ -267,7 +269,7 @@ def iterate(
             windows = whole.only(*evaluation.kept)
     if solution is None or evaluation is None:
         return None
-    return StreakFit(scene, solution, evaluation, last_step, whole, free)
+    return StreakFit(scene, before_step, solution, evaluation, last_step, whole, free)
 
 
 def _stepped(scene: StreakScene, solution: Solution, pinhole: Pinhole) -> tuple[StreakScene, float]:
@@ -722,7 +724,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
         done = iterate(camera, done.scene, camera.free, LAST, done.windows)
     if done is None or _excessive(done.scene.motion):
         return None
-    scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
+    scene, windows = _with_majority(camera, done), [done.windows]
     del done  # The old fit is deleted and its windows are removed from the list, which frees tens of MB.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
@@ -777,6 +779,22 @@ def _excessive(motion: CameraMotion) -> bool:
     if motion.higher_terms.any():
         return False
     return float(np.linalg.norm(motion.acceleration)) > _MOST_CHANGE * float(np.linalg.norm(motion.rate))
+
+
+def _with_majority(camera: FitProblem, rough: StreakFit) -> StreakScene:
+    """Return the scene of a fit whose last step is repeated with the stars that agree with the majority.
+
+    The step with fewer stars is computed from the normal equations of `rough`, which saves an evaluation.
+    """
+    trusted = _trusted(camera, rough)
+    rejected = rough.scene.trusted & ~trusted
+    if not rejected.any():
+        return rough.scene
+    start = replace(rough.before, trusted=trusted)
+    solution = solve(rough.evaluation.without(rejected), start, rough.free, ROUGH.conjugate)
+    if solution is None:
+        return replace(rough.scene, trusted=trusted)
+    return _stepped(start, solution, camera.pinhole)[0]
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:

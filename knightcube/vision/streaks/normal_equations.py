@@ -18,7 +18,7 @@ belong to each of the n stars.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,6 +75,17 @@ class Evaluation:
     crowds: list[SharedPixels]
     shared: int
     kept: list[BoolArray]
+
+    def without(self, rejected: BoolArray) -> Evaluation:
+        """Return the normal equations if the stars `rejected` (n,) do not affect the shared parameters."""
+        information, gradient = self.information.copy(), self.gradient.copy()
+        information[rejected, :SHARED] = information[rejected, :, :SHARED] = gradient[rejected, :SHARED] = 0.0
+        crowds = []
+        for crowd in self.crowds:
+            matrix = crowd.matrix.copy()
+            matrix[rejected[crowd.star], :, :SHARED] = 0.0
+            crowds.append(crowd._replace(matrix=matrix))
+        return replace(self, information=information, gradient=gradient, crowds=crowds)
 
 
 class SharedPixels(NamedTuple):

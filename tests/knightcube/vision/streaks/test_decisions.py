@@ -204,7 +204,7 @@ def _fit() -> StreakFit:
     evaluation = Evaluation(information, np.zeros((5, 11)), chi2, np.full(5, 105.0), [], 0, [])
     scene = _scene(_STARS, _LIGHT, 2)
     camera = _problem()
-    return StreakFit(scene, solution, evaluation, 0.0, camera.windows(scene), camera.free)
+    return StreakFit(scene, scene, solution, evaluation, 0.0, camera.windows(scene), camera.free)
 
 
 def test_the_result_contains_the_fitted_stars_and_their_streaks() -> None:

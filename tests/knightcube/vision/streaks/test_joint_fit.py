@@ -22,7 +22,15 @@ from knightcube.vision.streaks.geometry import (
     paths,
     positions,
 )
-from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, WorkBudget, find_light_ends, stretched
+from knightcube.vision.streaks.joint_fit import (
+    ROUGH,
+    FitProblem,
+    StreakFit,
+    WorkBudget,
+    find_light_ends,
+    iterate,
+    stretched,
+)
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
     SHARED,
@@ -141,6 +149,25 @@ def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.Mon
     done = joint_fit.joint_fit(camera, scene)
     assert done is not None
     assert len(done.scene.light) == _TRUSTED
+
+
+def test_a_step_without_rejected_stars_needs_no_further_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step that is repeated without rejected stars is the first step of a fit without these stars."""
+    camera, scene = _taken(1.1, 60.0)
+    once = replace(ROUGH, rounds=1)
+    rough = iterate(camera, scene, camera.free, once)
+    assert rough is not None
+    trusted = scene.trusted.copy()
+    monkeypatch.setattr(joint_fit, "_trusted", lambda *_: trusted)
+    assert joint_fit._with_majority(camera, rough) is rough.scene
+    trusted[1] = False
+    found = joint_fit._with_majority(camera, rough)
+    expected = iterate(camera, replace(scene, trusted=trusted), camera.free, once)
+    assert expected is not None
+    np.testing.assert_array_equal(found.trusted, trusted)
+    assert not np.array_equal(found.motion.rate, rough.scene.motion.rate)
+    np.testing.assert_allclose(found.motion.rate, expected.scene.motion.rate, rtol=1e-9)
+    np.testing.assert_allclose(found.stars, expected.scene.stars, rtol=1e-9)
 
 
 def test_a_fit_with_a_much_wider_point_spread_is_rejected() -> None:
@@ -268,9 +295,8 @@ def _grows(evaluation: Evaluation) -> bool:
     scene = StreakScene(motion, 1.1, np.zeros((n, 2)), np.ones(n), np.zeros(n), np.ones(n, dtype=np.bool_))
     camera = _small_problem()
     windows = camera.windows(_small_scene())
-    return StreakFit(
-        scene, _solution([0.0] * 7, np.zeros((3, 4))), evaluation, 0.0, windows, camera.free
-    ).grows()
+    still = _solution([0.0] * 7, np.zeros((3, 4)))
+    return StreakFit(scene, scene, still, evaluation, 0.0, windows, camera.free).grows()
 
 
 def test_the_rate_changes_if_the_stars_agree_on_a_change() -> None:
@@ -422,7 +448,8 @@ def test_the_search_for_faint_stars_is_repeated_once(
         camera.work.passed(10_000_000_000)
     windows = camera.windows(scene)
     evaluation = _evaluation(3, np.zeros((3, SHARED)))
-    start = StreakFit(scene, _solution([0.0] * 7, np.zeros((3, 4))), evaluation, 0.0, windows, camera.free)
+    still = _solution([0.0] * 7, np.zeros((3, 4)))
+    start = StreakFit(scene, scene, still, evaluation, 0.0, windows, camera.free)
     done, faint = joint_fit.final_fit(camera, start)
     assert (None if done is None else int(done.last_step)) == expected
     assert len(made) == len(fits)

@@ -236,6 +236,21 @@ def _derivatives(scene: StreakScene, windows: FitWindows, growing: bool) -> Floa
     return out
 
 
+def test_equations_without_some_stars_are_those_of_a_scene_that_rejects_them() -> None:
+    scene, windows = _crossing_scene(growing=False)
+    scene, rejected = replace(scene, trusted=np.ones(len(scene.light), dtype=np.bool_)), np.arange(6) == 3
+    found = evaluate(_CAMERA, _SHUTTER, scene, windows, 0.0, growing=False).without(rejected)
+    other = replace(scene, trusted=~rejected)
+    expected = evaluate(_CAMERA, _SHUTTER, other, windows, 0.0, growing=False)
+    one, two = solve(found, scene, _FREE, 20), solve(expected, other, _FREE, 20)
+    assert one is not None
+    assert two is not None
+    np.testing.assert_allclose(one.shared, two.shared, rtol=1e-9)
+    np.testing.assert_allclose(one.alone, two.alone, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.information, expected.information, rtol=1e-12)
+    np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-12)
+
+
 @pytest.mark.parametrize("growing", [False, True])
 def test_the_information_is_that_of_numerical_derivatives(growing: bool) -> None:
     """Products of the coupled information matrix equal those of numerical derivatives of the model.
