@@ -174,8 +174,9 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Number of iterations that invert the lens errors; each iteration reduces the error to a few per cent.
-_BEND_STEPS = 8
+# Maximum number of iterations that invert the lens errors, and step (px) below which they end.
+# Each iteration reduces the error to a few per cent.
+_BEND_STEPS, _LEAST_STEP = 8, 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,7 +212,10 @@ class SkyMap:
         wanted = self.camera.project(directions @ attitude_matrix(self.quaternion).T)
         points = wanted
         for _ in range(_BEND_STEPS if self.bend.any() else 0):
-            points = points + wanted - self.camera.project(bent(self.camera.unit_vectors(points), self.bend))
+            step = wanted - self.camera.project(bent(self.camera.unit_vectors(points), self.bend))
+            points = points + step
+            if not np.any(np.abs(step) > _LEAST_STEP):
+                break
         return self._exchanged(points)
 
     def _exchanged(self, points: FloatArray) -> FloatArray:
