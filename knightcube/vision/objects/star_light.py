@@ -647,34 +647,30 @@ def _add_scaled(values: FloatArray, factor: float, total: FloatArray) -> None:
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
     """Return the paths (m, 2), px, of the stars in a patch, and the counts (rows, columns) without stars."""
-    middles: list[FloatArray] = []
-    left = patch.signal
     rows, columns = patch.signal.shape
+    middles, paths, left = np.empty((0, 2)), np.empty((0, 1, 2)), patch.signal
     centre = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
-    path = star_path(centre, rotation, pinhole)
-    # The offsets are points of a star's path relative to the midpoint of the path, and include both ends.
-    every = max(1, round(2.0 * patch.psf_sigma))
-    offsets = path[np.unique(np.append(np.arange(0, len(path), every), len(path) - 1))] - centre
+    steps, factor = _steps_along(star_path(centre, rotation, pinhole) - centre, patch.psf_sigma)
     while len(middles) < _MOST_STARS:
-        middle = _brightest_star(patch, left, offsets)
+        middle = _brightest_star(patch, left, steps, factor)
         if middle is None:
             break
-        middles.append(patch.corner + middle)
-        middles, left = _fit_together(patch, middles, rotation, pinhole)
-    return [star_path(middle, rotation, pinhole) for middle in middles], left
+        middles = np.concatenate([middles, patch.corner + middle[None]])
+        middles, paths, left = _fit_together(patch, middles, rotation, pinhole)
+    return list(paths), left
 
 
 # Number of points of a star's path that are tested first, for each pixel that may be the middle of the path.
 _FIRST_OFFSETS = 9
 
 
-def _brightest_star(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray | None:
-    """Return the position (x, y) in the patch of the brightest possible star, or None if there is none.
+def _steps_along(offsets: FloatArray, psf_sigma: float) -> tuple[IntArray, FloatArray]:
+    """Return the pixels (x, y) at which a star's path is tested (k, 2), and factors of the image there (k,).
 
-    The brightness of a star centred on a pixel is at most the minimum of the smoothed image `left` (rows,
-    columns) along the star's path, which is given by `offsets` (k, 2), px, from the pixel.
+    The pixels are relative to the middle of the path, as are the points `offsets` (m, 2), px, of the path.
     """
-    steps = np.rint(offsets).astype(np.int64)
+    every = max(1, round(2.0 * psf_sigma))
+    steps = np.rint(offsets[np.unique(np.append(np.arange(0, len(offsets), every), len(offsets) - 1))])
     # At the end of a streak, the smoothed brightness is half the brightness along the streak.
     factor = np.ones(len(steps))
     factor[[0, -1]] = 2.0
@@ -682,9 +678,18 @@ def _brightest_star(patch: Patch, left: FloatArray, offsets: FloatArray) -> Floa
     first = np.unique(np.linspace(0, len(steps) - 1, _FIRST_OFFSETS).astype(int))
     order = np.concatenate([first[len(first) // 2 :], first[: len(first) // 2]])
     order = np.concatenate([order, np.setdiff1d(np.arange(len(steps)), order)])
-    threshold, seen = _STAR_SIGMAS * patch.smoothed_noise, patch.smoothed(left)
-    best, column, row = _brightest_path(seen, steps[order], factor[order], patch.beyond, threshold)
-    return np.array([column, row], dtype=float) if best >= threshold else None
+    return steps[order].astype(np.int64), factor[order]
+
+
+def _brightest_star(patch: Patch, left: FloatArray, steps: IntArray, factor: FloatArray) -> FloatArray | None:
+    """Return the position (x, y) in the patch of the brightest possible star, or None if there is none.
+
+    The brightness of a star centred on a pixel is at most the minimum of the smoothed image `left` (rows,
+    columns) along the star's path (see `_steps_along`).
+    """
+    threshold = _STAR_SIGMAS * patch.smoothed_noise
+    found = _brightest_path(patch.smoothed(left), steps, factor, patch.beyond, threshold)
+    return np.array(found[1:], dtype=float) if found[0] >= threshold else None
 
 
 def _brightest_path_numpy(
@@ -751,31 +756,39 @@ def _brightest_path(
 
 
 def _fit_together(
-    patch: Patch, middles: list[FloatArray], rotation: FloatArray, pinhole: Pinhole
-) -> tuple[list[FloatArray], FloatArray]:
-    """Return the path midpoints (2,), px, of stars fitted together, and the counts without these stars."""
+    patch: Patch, middles: FloatArray, rotation: FloatArray, pinhole: Pinhole
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return midpoints (n, 2) and paths (n, m, 2), px, of stars fitted together, and the counts without them.
+
+    The argument `middles` (n, 2), px, is the initial guess of the midpoints.
+    """
     rows, columns = patch.signal.shape
-    paths = [star_path(middle, rotation, pinhole) - patch.corner for middle in middles]
-    pixels = pixels_near(np.concatenate(paths), _WIDE_REACH * patch.psf_sigma, rows, columns)
+    paths = _paths_through(middles, rotation, pinhole)
+    points = (paths - patch.corner).reshape(-1, 2)
+    pixels = pixels_near(points, _WIDE_REACH * patch.psf_sigma, rows, columns)
     flat = pixels[:, 1] * columns + pixels[:, 0]
-    signal, weight = patch.signal.reshape(-1)[flat], patch.weight.reshape(-1)[flat]
+    weight = patch.weight.reshape(-1)[flat]
+    target = patch.signal.reshape(-1)[flat] * weight
     theirs = np.ones(len(flat), dtype=np.bool_)
     for _ in range(3):
         # The array `images` (n, 3, p) contains the images of the stars and their derivatives.
-        images = np.concatenate([streak_images(pixels, path[None], patch.psf_sigma, True) for path in paths])
-        share = weight * theirs
-        solution = least_squares((images.reshape(-1, len(flat)) * share).T, signal * share).reshape(-1, 3)
+        images = streak_images(pixels, paths - patch.corner, patch.psf_sigma, True)
+        images *= weight
+        solution = least_squares(images.reshape(-1, len(flat)).T, target, theirs).reshape(-1, 3)
         flux = np.maximum(solution[:, 0], 1e-9)
-        steps = np.clip(solution[:, 1:] / flux[:, None], -_LARGEST_STEP, _LARGEST_STEP)
-        middles = [middle + step for middle, step in zip(middles, steps, strict=True)]
-        paths = [star_path(middle, rotation, pinhole) - patch.corner for middle in middles]
-        theirs = (signal - flux @ images[:, 0]) * weight < _NOT_THEIRS
-    lights = np.stack([streak_at(pixels, path, patch.psf_sigma) for path in paths])
-    share = weight * theirs
-    flux = np.maximum(least_squares((lights * share).T, signal * share), 0.0)
+        middles = middles + np.clip(solution[:, 1:] / flux[:, None], -_LARGEST_STEP, _LARGEST_STEP)
+        paths = _paths_through(middles, rotation, pinhole)
+        theirs = target - flux @ images[:, 0] < _NOT_THEIRS
+    lights = streak_images(pixels, paths - patch.corner, patch.psf_sigma, False)[:, 0]
+    flux = np.maximum(least_squares((lights * weight).T, target, theirs), 0.0)
     left = patch.signal.copy()
     left.reshape(-1)[flat] -= flux @ lights
-    return middles, left
+    return middles, paths, left
+
+
+def _paths_through(middles: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+    """Return the paths (n, m, 2), px, of stars that are at `middles` (n, 2), px, at mid-exposure."""
+    return star_paths(pinhole.unit_vectors(middles), rotation, np.full(len(middles), 0.5), pinhole)
 
 
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:

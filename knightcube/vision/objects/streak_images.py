@@ -391,12 +391,20 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
     near &= (v > across.min() - room - 1.0) & (v < across.max() + room + 1.0)
     chosen = np.flatnonzero(near)
     u, v = u[chosen], v[chosen]
-    bend, pace = np.interp(u, middles, slope), np.interp(u, middles, spacing)
-    beyond = u - np.clip(u, along[0], along[-1])
-    off = v - np.interp(u, along, across) - beyond * bend
+    # The curve of the path is tabulated at every pixel along the chord.
+    first = -math.ceil(room) - 1
+    grid = np.arange(first, math.ceil(length + room) + 3, dtype=float)
+    beyond = grid - np.clip(grid, along[0], along[-1])
+    bends, paces = np.interp(grid, middles, slope), np.interp(grid, middles, spacing)
+    centres = np.interp(grid, along, across) + beyond * bends
+    arcs = np.interp(grid, along, arc) + beyond * np.sqrt(1.0 + bends**2)
+    k = np.floor(u).astype(np.int64) - first
+    part = u - grid[k]
+    off = v - centres[k] - part * (centres[k + 1] - centres[k])
+    bend, pace = 0.5 * (bends[k] + bends[k + 1]), 0.5 * (paces[k] + paces[k + 1])
     cosine = 1.0 / np.sqrt(1.0 + bend**2)
     n = off * cosine
-    s = np.interp(u, along, arc) + (beyond + off * bend * cosine**2) / cosine
+    s = arcs[k] + part * (arcs[k + 1] - arcs[k]) + off * bend * cosine
     light = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * pace * len(path))
     # The ends of the streak affect only nearby pixels.
     covered, sloping = np.ones(len(s)), np.zeros(len(s))
@@ -482,33 +490,15 @@ def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: 
 
 
 @loop_helper
-def _interval(x: float, grid: FloatArray, guess: int) -> int:
-    """Return the index of the interval of an ascending grid that contains, or is nearest to, the value `x`.
-
-    The search starts at the interval with the index `guess`.
-    """
-    last = len(grid) - 2
-    k = min(max(guess, 0), last)
-    while k > 0 and x < grid[k]:
-        k -= 1
-    while k < last and x >= grid[k + 1]:
-        k += 1
-    return k
-
-
-@loop_helper
 def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
-    """Return coordinates and derivatives (9, c) at c nodes of a path (m, 2), px.
-
-    The chord of the path has the unit vector (`x`, `y`).
+    """Return coordinates (6, c) of c nodes of a path (m, 2), px, whose chord has the unit vector (`x`, `y`).
 
     The first three rows are the coordinates along and across the chord and the arc length. The next three
-    rows are the middle, slope and spacing of the c - 1 intervals between nodes. The last three rows are the
-    derivatives of arc length, slope and spacing with respect to the coordinate along the chord.
+    rows are the middle, slope and spacing of the points of the c - 1 intervals between nodes.
     """
     m = len(path)
     count = min(_NODES, m)
-    nodes = np.zeros((9, count))
+    nodes = np.zeros((6, count))
     before = 0
     for k in range(count):
         place = k * (m - 1) // (count - 1)
@@ -520,13 +510,35 @@ def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
             nodes[2, k] = nodes[2, k - 1] + step
             nodes[3, k - 1] = nodes[0, k - 1] + 0.5 * along
             nodes[4, k - 1], nodes[5, k - 1] = across / along, step / (place - before)
-            nodes[6, k - 1] = step / along
         before = place
-    for k in range(count - 2):
-        gap = nodes[3, k + 1] - nodes[3, k]
-        nodes[7, k] = (nodes[4, k + 1] - nodes[4, k]) / gap
-        nodes[8, k] = (nodes[5, k + 1] - nodes[5, k]) / gap
     return nodes
+
+
+@loop_helper
+def _curve_of(nodes: FloatArray, first: int, count: int) -> FloatArray:
+    """Return a table (4, count) of a path, one column for each pixel of the coordinate along its chord.
+
+    The coordinate begins at `first`, px. The rows are the coordinate across the chord, the arc length, the
+    slope, and the spacing of the points of the path. The array `nodes` (6, c) is that of `_nodes_of`.
+    """
+    last = nodes.shape[1] - 1
+    along, middles, table = nodes[0], nodes[3, :last], np.empty((4, count))
+    k, j = 0, 0
+    for i in range(count):
+        inside = min(max(float(first + i), 0.0), along[last])
+        centred = min(max(float(first + i), middles[0]), middles[last - 1])
+        while k < last - 1 and inside >= along[k + 1]:
+            k += 1
+        while j < last - 2 and centred >= middles[j + 1]:
+            j += 1
+        share = (centred - middles[j]) / (middles[j + 1] - middles[j])
+        for row in range(2):
+            table[2 + row, i] = nodes[4 + row, j] + share * (nodes[4 + row, j + 1] - nodes[4 + row, j])
+        share, beyond, bend = (inside - along[k]) / (along[k + 1] - along[k]), first + i - inside, table[2, i]
+        table[0, i] = nodes[1, k] + share * (nodes[1, k + 1] - nodes[1, k]) + beyond * bend
+        table[1, i] = nodes[2, k] + share * (nodes[2, k + 1] - nodes[2, k])
+        table[1, i] += beyond * math.sqrt(1.0 + bend * bend)
+    return table
 
 
 @loop_helper
@@ -549,11 +561,15 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
     x0, y0, light = path[0, 0], path[0, 1], image[0]
     x, y = path[m - 1, 0] - x0, path[m - 1, 1] - y0
     length = math.hypot(x, y)
-    x, y = x / length, y / length
+    x, y, first = x / length, y / length, -math.ceil(room) - 1
     nodes = _nodes_of(path, x, y)
     last = nodes.shape[1] - 1
-    along, middles = nodes[0], nodes[3, :last]
-    rate, share = last / along[last], narrow / m
+    curve = _curve_of(nodes, first, math.ceil(length + room) + 3 - first)
+    centres, arcs, steps = curve[0], curve[1], curve[:, 1:] - curve[:, :-1]
+    # Slope, cosine of its angle, and brightness change little within 1 px.
+    bends, paces = curve[2:, :-1] + 0.5 * steps[2:]
+    cosines = 1.0 / np.sqrt(1.0 + bends * bends)
+    brightness = narrow / (m * paces)
     low, high = nodes[1].min() - room - 1.0, nodes[1].max() + room + 1.0
     begin, end = 0.5 * nodes[5, 0], nodes[2, last] + 0.5 * nodes[5, last - 1]
     top, bottom = path[:, 1].min() - room - 2.0, path[:, 1].max() + room + 2.0
@@ -562,23 +578,13 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
         u, v = dx * x + dy * y, dy * x - dx * y
         if u <= -room - 1.0 or u >= length + room + 1.0 or v <= low or v >= high:
             continue
-        inside = min(max(u, 0.0), along[last])
-        k = _interval(inside, along, int(inside * rate))
-        step = inside - along[k]
-        centre = min(max(u, middles[0]), middles[last - 1])
-        j = _interval(centre, middles, k)
-        bend = nodes[4, j] + nodes[7, j] * (centre - middles[j])
-        pace = nodes[5, j] + nodes[8, j] * (centre - middles[j])
-        beyond = u - inside
-        off = v - nodes[1, k] - nodes[4, k] * step - beyond * bend
-        if abs(off) > _DARK * width * (1.0 + abs(bend)):
+        k = int(u - first)
+        part, bend, cosine = u - first - k, bends[k], cosines[k]
+        n = (v - centres[k] - part * steps[0, k]) * cosine
+        if abs(n) > _DARK * width:
             continue
-        root = math.sqrt(1.0 + bend * bend)
-        inverse = 1.0 / (root * pace)
-        cosine = pace * inverse
-        n = off * cosine
-        s = nodes[2, k] + nodes[6, k] * step + beyond * root + off * bend * cosine
-        whole = _bell(n * narrow) * share * root * inverse
+        s = arcs[k] + part * steps[1, k] + n * bend
+        whole = _bell(n * narrow) * brightness[k]
         covered, sloping = 1.0, 0.0
         if s + begin < room:
             covered, sloping = _area((s + begin) * narrow), _bell((s + begin) * narrow) * narrow
@@ -636,12 +642,16 @@ _COVERED = 8.5
 _RIDGE = 1e-6
 
 
-def least_squares(images: FloatArray, target: FloatArray) -> FloatArray:
-    """Return the least-squares coefficients (k,) of `images` (p, k), slightly regularised."""
-    normal = images.T @ images
+def least_squares(images: FloatArray, target: FloatArray, used: BoolArray | None = None) -> FloatArray:
+    """Return the least-squares coefficients (k,) of `images` (p, k), slightly regularised.
+
+    Only the rows in the mask `used` (p,) are used, if it is given.
+    """
+    chosen = images.T if used is None else images.T * used
+    normal = chosen @ images
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     normal = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
-    return np.asarray(np.linalg.solve(normal, (images.T @ target) / scale) / scale)
+    return np.asarray(np.linalg.solve(normal, (chosen @ target) / scale) / scale)
 
 
 def _fitted_line_numpy(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float) -> FloatArray:

@@ -269,7 +269,7 @@ def test_all_forms_find_the_same_corners_of_regions(half_width: int, upright: bo
     kernels = gaussian_kernel(1.0, 3), gaussian_derivative_kernel(1.0, 3), gaussian_kernel(1.5, 5)
     limits = 0.15, 0.005, half_width
     given = signal.astype(np.float32), labels, regions.boxes, regions.label, kernels, limits
-    assert_forms_agree(_corners_of_regions, *given)
+    assert_forms_agree(_corners_of_regions, *given, relative=1e-6)
     assert _corners_of_regions(*given)[1].sum() > 1
 
 
