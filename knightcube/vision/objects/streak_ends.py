@@ -303,7 +303,7 @@ def _harris_corners(segmented: Segmented, settings: EndpointSettings) -> list[Fl
     return np.split(corners, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-_Kernels = tuple[FloatArray, FloatArray, FloatArray]
+_Kernels = tuple[Image, Image, Image]
 """Kernels: Gaussian normal to the gradient, Gaussian derivative, and Gaussian window of the tensor."""
 _Limits = tuple[float, float, int]
 """Harris constant k, minimum response of a corner (fraction), half-width of the centre of intensity (px)."""
@@ -334,17 +334,17 @@ def _corners_of_regions(
     argument `signal` (rows, columns) contains the counts above the background. The labels at each pixel, the
     bounding boxes and the labels of the regions are those of `Regions`.
     """
-    largest, most, half_width = 0, 0, limits[2]
-    # The response is computed in single precision, which takes half the time.
-    k, single = np.float32(limits[0]), np.float32
-    kernels = kernels[0].astype(single), kernels[1].astype(single), kernels[2].astype(single)
+    largest, most, (k, _, half_width) = 0, 0, limits
+    # The response is computed in single precision, which takes less time.
+    smooth, slope, window = kernels
+    single = smooth.astype(np.float32), slope.astype(np.float32), window.astype(np.float32)
     for number in range(len(boxes)):
         height, width = boxes[number, 1] - boxes[number, 0], boxes[number, 3] - boxes[number, 2]
         size = (height + 2 * _PADDING) * (width + 2 * _PADDING)
         largest, most = max(largest, size), most + size // 4
     # Peaks of the response are not adjacent, so that a region has fewer peaks than a quarter of its pixels.
     corners, counts, total = np.empty((most, 2)), np.zeros(len(label), dtype=np.int64), 0
-    scratch = np.empty((5, largest), dtype=single)
+    scratch = np.empty((5, largest), dtype=np.float32)
     for number in range(len(label)):
         box = boxes[number]
         top, bottom = max(box[0] - _PADDING, 0), min(box[1] + _PADDING, signal.shape[0])
@@ -353,12 +353,12 @@ def _corners_of_regions(
         own, spans, margin = label[number], _spans_of(around, label[number]), max(half_width, 1)
         if bottom - top <= right - left:
             wanted = _widened(spans, margin, right - left)
-            response = _response(light, around, own, wanted, kernels, k, scratch)
+            response = _response(light, around, own, wanted, single, k, scratch)
             found = _peaks(response, around, own, spans, limits, corners[total:])
         else:
             # A streak along columns is transposed, because few long rows take less time than many short ones.
             wanted = _widened(_spans_across(around, own, spans), margin, bottom - top)
-            response = _response(light.T, around.T, own, wanted, kernels, k, scratch)
+            response = _response(light.T, around.T, own, wanted, single, k, scratch)
             found = _peaks(response.T, around, own, spans, limits, corners[total:])
         corners[total : total + found] += np.array([left, top])
         counts[number] = found
@@ -416,7 +416,7 @@ def _response(
     wanted: IntArray,
     kernels: _Kernels,
     k: float,
-    scratch: FloatArray,
+    scratch: Image,
 ) -> FloatArray:
     """Return the Harris response of a region in a cut-out, within the spans `wanted` (rows, 2) only.
 
