@@ -297,13 +297,13 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
             return None
         speed = np.linalg.norm(flow[agree] @ axis, axis=-1)
         rows = equation[agree] / np.maximum(speed * tolerance[agree], 1e-9)[:, None]
-        axis = np.linalg.svd(rows)[2][-1]
+        axis = np.linalg.svd(rows, full_matrices=False)[2][-1]
     return axis, agree
 
 
 def _misalignment(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> FloatArray:
     """Return the sines (k, n) of the angles between n regions and the image flow about k `axes` (k, 3)."""
-    speed = np.linalg.norm(np.einsum("nij,kj->kni", flow, axes), axis=-1)
+    speed = np.hypot(axes @ flow[:, 0].T, axes @ flow[:, 1].T)
     return np.asarray(axes @ equation.T / np.maximum(speed, 1e-9))
 
 

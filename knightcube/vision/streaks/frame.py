@@ -124,13 +124,15 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     rank[chosen] = np.arange(len(chosen))
     kept = np.flatnonzero(rank[number] >= 0)
     owner, light = rank[number][kept], light[kept]
-    row, column = np.divmod(pixel[kept], frame.shape[1])
+    lit, pixel = len(pixel) / frame.signal.size, pixel[kept]
+    row = pixel // frame.shape[1]
+    column = pixel - row * frame.shape[1]
     found = moments(owner, column, row, light, len(chosen))
     rows, columns = frame.shape
     edge = (row < _BORDER) | (row >= rows - _BORDER) | (column < _BORDER) | (column >= columns - _BORDER)
     normal = np.stack([-np.sin(found.direction), np.cos(found.direction)], axis=-1)
     cut = np.bincount(owner, edge.astype(float), len(chosen)) > 0.0
-    shapes, lit = (found.centre, normal, found.length, found.flux, cut), len(pixel) / frame.signal.size
+    shapes = found.centre, normal, found.length, found.flux, cut
     return BrightRegions(*shapes, owner, column, row, light, lit)
 
 

@@ -53,7 +53,7 @@ from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 # Number of processed pixels per frame after which no further motion is fitted.
 # A fit in progress is completed, so that the number of processed pixels can reach twice this limit.
-_MOST_WORK = 1_600_000
+_MOST_WORK = 2_000_000
 # Fixed work of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
 # Ratio of the work per pixel in a pass over the frame to the work per pixel in a model evaluation.

@@ -475,21 +475,22 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
     The mask `free` (SHARED,) selects those shared parameters that are fitted.
     """
     kept = np.flatnonzero(free)
-    own, gain, normal = _eliminated(evaluation.information, kept)
-    scale = np.sqrt(np.diag(normal).clip(min=0.0))
-    if not np.all(np.isfinite(normal)) or not np.all(scale > 0.0):
-        return None
-    scaled = normal / np.outer(scale, scale)
-    least, most = np.linalg.eigvalsh(scaled)[[0, -1]]
-    if most > 1e10 * least:
-        return None
-    return EliminatedEquations(kept, own, gain, np.linalg.inv(scaled) / np.outer(scale, scale))
+    own, gain, inner, size = _eliminated(evaluation.information, kept)
+    return EliminatedEquations(kept, own, gain, inner) if size < _SINGULAR else None
 
 
-def _eliminated_numpy(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the attributes `own` and `gain` of `EliminatedEquations`, and the information matrix (k, k).
+# Largest element of the inverse of a regular information matrix that is scaled to a unit diagonal.
+_SINGULAR = 1e10
+
+
+def _eliminated_numpy(
+    information: FloatArray, kept: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return three attributes of `EliminatedEquations`, and a measure of how singular the equations are.
 
     The arguments are the information of `Evaluation` and the indices `kept` (k,) of the fitted parameters.
+    The attributes are `own`, `gain` and `inner`. The last returned value is the largest element of `inner`
+    for parameters scaled to a unit information, or infinity.
     """
     alone = information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
@@ -504,11 +505,18 @@ def _eliminated_numpy(information: FloatArray, kept: IntArray) -> tuple[FloatArr
     cross = information[:, kept, SHARED:]
     gain = cross @ own
     normal = (information[:, kept[:, None], kept] - gain @ cross.swapaxes(1, 2)).sum(axis=0)
-    return own, gain, normal
+    scale = np.sqrt(np.diag(normal).clip(min=0.0))
+    if not np.all(np.isfinite(normal)) or not np.all(scale > 0.0):
+        return own, gain, normal, np.inf
+    try:
+        inverse = np.linalg.inv(normal / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        return own, gain, normal, np.inf
+    return own, gain, inverse / np.outer(scale, scale), float(np.abs(inverse).max(initial=0.0))
 
 
 @compiled_form_of(_eliminated_numpy)
-def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     n, count = len(information), len(kept)
     own, gain = np.empty((n, ALONE, ALONE)), np.empty((n, count, ALONE))
     normal, unit, root = np.zeros((count, count)), np.empty((ALONE, 2 * ALONE)), np.empty(ALONE)
@@ -535,7 +543,29 @@ def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, Fl
                 normal[i, j] += information[star, kept[i], kept[j]]
                 for k in range(ALONE):
                     normal[i, j] -= gain[star, i, k] * information[star, kept[j], SHARED + k]
-    return own, gain, normal
+    return own, gain, normal, _inverted(normal)
+
+
+@loop_helper
+def _inverted(matrix: FloatArray) -> float:
+    """Replace an information matrix (k, k) by its inverse, and return the measure of `_eliminated_numpy`."""
+    count, size = len(matrix), 0.0
+    scale, pair = np.empty(count), np.zeros((count, 2 * count))
+    for i in range(count):
+        scale[i] = math.sqrt(max(matrix[i, i], 0.0))
+        if not 0.0 < scale[i] < np.inf:
+            return float(np.inf)
+    for i in range(count):
+        for j in range(count):
+            pair[i, j] = matrix[i, j] / (scale[i] * scale[j])
+        pair[i, count + i] = 1.0
+    _invert(pair)
+    for i in range(count):
+        for j in range(count):
+            inverse = pair[i, count + j]
+            matrix[i, j] = inverse / (scale[i] * scale[j])
+            size = max(size, abs(inverse)) if np.isfinite(inverse) else np.inf
+    return size
 
 
 @loop_helper

@@ -87,7 +87,8 @@ def test_windows_have_the_values_of_the_frame_and_the_pixels_that_stars_share() 
     for place, name in zip(view.crowded.tolist(), view.common.tolist(), strict=True):
         assert names[name] == index.reshape(-1)[place]
     counts = np.ones(index.shape, dtype=np.float32) * inside
-    total = windows.total(counts, np.zeros((0, 0, 0)))
+    n = len(stars)
+    total = windows.total(counts[:, None], np.zeros((0, 0, 0)), np.ones(n), np.zeros(n))
     assert total[:-1].sum() == inside.sum()
     assert np.count_nonzero(total[:-1] == 2.0) == len(both)
     fewer = windows.only(view.inside & (owner == 1), np.zeros((0, 0, 0), dtype=np.bool_))
@@ -96,11 +97,14 @@ def test_windows_have_the_values_of_the_frame_and_the_pixels_that_stars_share() 
 
 
 def test_sums_over_windows_are_those_of_each_pixel() -> None:
-    slot = np.array([0, 2, 1, 1, 3, 0, 2, 2])
-    first, second = np.arange(1.0, 6.0, dtype=np.float32), np.array([10.0, 20.0, 30.0])
-    found = fit_windows._summed(slot, first, second, 4)
-    assert found.tolist() == [1.0 + 10.0, 3.0 + 4.0, 2.0 + 20.0 + 30.0, 5.0]
-    assert_forms_agree(fit_windows._summed, slot, first, second, 4, compiled=False)
+    """The counts of two blocks of two pixels and of one patch of three pixels are added to four pixels."""
+    slot = np.array([0, 2, 1, 1, 0, 2, 3])
+    images = np.array([[[1.0, 2.0], [-9.0, -9.0]], [[3.0, 4.0], [-9.0, -9.0]]], dtype=np.float32)
+    blocks = images, np.array([10.0, 100.0]), np.array([0.5, 0.0])
+    patches = np.array([[5.0, 6.0, 7.0]]), np.array([1000.0]), np.array([-0.25])
+    found = fit_windows._summed(slot, blocks, patches, 4)
+    assert found.tolist() == [10.5 + 4999.75, 300.0 + 400.0, 20.5 + 5999.75, 6999.75]
+    assert_forms_agree(fit_windows._summed, slot, blocks, patches, 4, compiled=False)
 
 
 def test_areas_are_those_of_a_straight_strip() -> None:
