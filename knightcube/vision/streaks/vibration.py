@@ -149,6 +149,10 @@ _USUAL, _LOOSE = 1.0, 10.0
 _LOWEST, _GRID = 0.75, 0.2
 # Shortest fitted wavelength of a vibration along the streaks, in point-spread widths.
 _SHORTEST_WAVE = 6.0
+# Limits of the wavelength of an unresolved vibration along the streaks, in point-spread widths.
+_UNRESOLVED = (2.2, 6.0)
+# Number of samples of the spectrum of the residuals.
+_SPECTRUM = 4096
 # Minimum decrease of chi-square by a sinusoid.
 _LEAST_GAIN = 60.0
 # Maximum number of sinusoids, and minimum difference (cycles per exposure) between their frequencies.
@@ -201,19 +205,61 @@ def fit_vibration(
 
 
 def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
-    """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
+    """Return the covariance (3, 3), rad^2, that vibrations add to the rotation over the exposure.
 
     The point spread function averages a vibration whose wavelength along the streaks is short. The model of
     the streaks neglects this averaging, so that the fitted amplitudes are too small. The covariance includes
-    the corresponding error of the streak ends.
+    the corresponding error of the streak ends. The covariance also includes the displacement of the streak
+    ends by a fast vibration that is not fitted but is significant in the spectrum of the residuals.
     """
     vibration = scene.motion.vibration
-    if not vibration.exists or not len(left.star):
+    if not len(left.star):
         return np.zeros((3, 3))
-    added = _improved(_rotation_sums(camera, scene, left), vibration)[1]
-    wave = _median_length(camera, scene) / vibration.frequency
-    lost = 1.0 - np.exp(-0.5 * (2.0 * np.pi * scene.width / wave) ** 2)
-    return added + np.eye(3) * float(np.sum((_LOST_SHARE * lost * vibration.amplitude) ** 2))
+    sums, length = _rotation_sums(camera, scene, left), _median_length(camera, scene)
+    fast = _unresolved_amplitude(sums, vibration, length / scene.width) ** 2 * np.eye(3)
+    if not vibration.exists:
+        return fast
+    kept = _kept_share(vibration.frequency, length / scene.width)
+    lost = np.maximum(_LOST_SHARE * (1.0 - kept), 1.0 / kept - 1.0)
+    return fast + _improved(sums, vibration)[1] + np.eye(3) * float(np.sum((lost * vibration.amplitude) ** 2))
+
+
+def _kept_share(frequency: FloatArray, length: float) -> FloatArray:
+    """Return the fraction of the amplitude that remains after averaging over the point spread function.
+
+    The streaks have a `length` in point-spread widths, and the frequencies are in cycles per exposure.
+    """
+    return np.asarray(np.exp(-0.5 * (2.0 * np.pi * frequency / length) ** 2))
+
+
+def _unresolved_amplitude(sums: _RotationSums, known: Vibration, length: float) -> float:
+    """Return the amplitude, rad, of the most significant unresolved vibration, or 0 if none is significant.
+
+    The streaks have a `length` in point-spread widths. The point spread function reduces the amplitude in the
+    residuals, and the returned amplitude is corrected for this reduction. The spectrum neglects correlations
+    between sine and cosine and between the vibration and errors of the smooth motion.
+    """
+    step = sums.time[1] - sums.time[0]
+    frequency = np.fft.rfftfreq(_SPECTRUM, step)
+    chosen = (frequency > length / _UNRESOLVED[1]) & (frequency < length / _UNRESOLVED[0])
+    chosen &= (np.abs(frequency[:, None] - known.frequency) >= _LEAST_APART).all(axis=1)
+    frequency = frequency[chosen]
+    if not len(frequency):
+        return 0.0
+    angular = 2.0 * np.pi * frequency[:, None]
+    value, slope = (np.fft.rfft(sums.score[:, i], _SPECTRUM, axis=0)[chosen] for i in (0, 1))
+    # The transform of the slope's gradient corresponds to the derivative of a complex exponential.
+    score = value - 1j * angular * slope
+    constant, square = (0.5 * sums.information[:, i, :, i].sum(axis=0) for i in (0, 1))
+    information = constant + angular[..., None] ** 2 * square
+    information = information + (sums.focal_length / _USUAL) ** 2 * np.eye(3)
+    amplitude = np.linalg.solve(information, score[..., None])[..., 0]
+    gain = np.sum((score.conj() * amplitude).real, axis=1)
+    best = int(np.argmax(gain))
+    if gain[best] <= _LEAST_GAIN:
+        return 0.0
+    shown = float(np.linalg.norm(amplitude[best]))
+    return min(shown / float(_kept_share(frequency, length)[best]), _LARGEST / sums.focal_length)
 
 
 def _median_length(camera: FitProblem, scene: StreakScene) -> float:
