@@ -398,7 +398,8 @@ class RotationUncertainty:
         covariance: covariance (3, 3) of `rotation`, rad^2.
         model_error: uncertainty from model errors, as a fraction of the rotation. If the type of shutter is
             unspecified, the uncertainty of the line time is included only in `covariance`.
-        common_motion: deviation from the smooth motion that is common to all streaks, such as vibration.
+        common_motion: deviation from the smooth motion that is common to all streaks, such as vibration; 0 if
+            `covariance` includes an unresolved vibration.
         aside: displacement of streaks across their paths that would explain the residuals, px.
     """
 
@@ -431,7 +432,11 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if agreed <= _UNCHECKED[0]:
         spread *= _UNCHECKED[1]
     residuals = residuals_of_fit(camera, whole)
+    vibration, fast = vibration_covariance(camera, whole.scene, residuals)
     common_motion = find_common_motion(camera, whole.scene, residuals)
+    if fast > 0.0:
+        # The covariance of the unresolved vibration replaces the limits on the motion common to all streaks.
+        common_motion = CommonMotion()
     end = _end_uncertainty(residuals, whole.scene, settings.psf_sigma, result.misfit)
     shaken = _END_COMMON * max(common_motion.across, common_motion.along)
     ends = float(np.sqrt(2.0) * np.hypot(end, shaken) / result.length)
@@ -442,7 +447,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
-    covariance = covariance + spread * vibration_covariance(camera, whole.scene, residuals)
+    covariance = covariance + spread * vibration
     sides = side_displacement(residuals, whole.scene)
     model_error, aside = float(np.sqrt(unmodelled / (rotation @ rotation))), sides.shown if sides else 0.0
     return RotationUncertainty(rotation, covariance, model_error, common_motion, aside)

@@ -204,24 +204,31 @@ def fit_vibration(
         fit = replace(fit, scene=replace(fit.scene, motion=motion))
 
 
-def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
-    """Return the covariance (3, 3), rad^2, that vibrations add to the rotation over the exposure.
+def vibration_covariance(
+    camera: FitProblem, scene: StreakScene, left: StreakResiduals
+) -> tuple[FloatArray, float]:
+    """Return the covariance (3, 3), rad^2, that vibrations add, and the amplitude of an unresolved one, rad.
+
+    The covariance applies to the rotation over the exposure.
 
     The point spread function averages a vibration whose wavelength along the streaks is short. The model of
     the streaks neglects this averaging, so that the fitted amplitudes are too small. The covariance includes
     the corresponding error of the streak ends. The covariance also includes the displacement of the streak
-    ends by a fast vibration that is not fitted but is significant in the spectrum of the residuals.
+    ends by a fast vibration that is not fitted but is significant in the spectrum of the residuals. The
+    amplitude of this fast vibration is 0 if none is significant.
     """
     vibration = scene.motion.vibration
     if not len(left.star):
-        return np.zeros((3, 3))
+        return np.zeros((3, 3)), 0.0
     sums, length = _rotation_sums(camera, scene, left), _median_length(camera, scene)
-    fast = _unresolved_amplitude(sums, vibration, length / scene.width) ** 2 * np.eye(3)
+    amplitude = _unresolved_amplitude(sums, vibration, length / scene.width)
+    fast = amplitude**2 * np.eye(3)
     if not vibration.exists:
-        return fast
+        return fast, amplitude
     kept = _kept_share(vibration.frequency, length / scene.width)
     lost = np.maximum(_LOST_SHARE * (1.0 - kept), 1.0 / kept - 1.0)
-    return fast + _improved(sums, vibration)[1] + np.eye(3) * float(np.sum((lost * vibration.amplitude) ** 2))
+    added = _improved(sums, vibration)[1] + np.eye(3) * float(np.sum((lost * vibration.amplitude) ** 2))
+    return fast + added, amplitude
 
 
 def _kept_share(frequency: FloatArray, length: float) -> FloatArray:

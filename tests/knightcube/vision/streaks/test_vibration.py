@@ -410,13 +410,13 @@ def test_a_fast_vibration_adds_the_amplitude_lost_in_the_point_spread(
     camera, scene = _plain_camera()
     star, nothing = np.zeros(1, np.int64), np.zeros((1, 7, LINES, 3), np.float32)
     left = StreakResiduals(star, np.zeros((1, LINES)), nothing, nothing[:, 0], nothing[:, 0])
-    assert not vibration.vibration_covariance(camera, scene, left).any()
+    assert not vibration.vibration_covariance(camera, scene, left)[0].any()
     shaking = Vibration(np.array([3.0, 7.0]), 1e-4 * np.eye(3)[:2], 2e-4 * np.eye(3)[1:])
     shaken = replace(scene, motion=replace(scene.motion, vibration=shaking))
     added = np.diag([1e-9, 2e-9, 3e-9])
-    monkeypatch.setattr(vibration, "_rotation_sums", lambda *_: None)
     monkeypatch.setattr(vibration, "_improved", lambda *_: (shaking, added))
-    found = vibration.vibration_covariance(camera, shaken, left)
+    found, fast = vibration.vibration_covariance(camera, shaken, left)
+    assert fast == 0.0
     length = 0.06 * 1200.0  # of streaks along a row, in px
     lost = 1.0 - np.exp(-0.5 * (2.0 * np.pi * 1.1 * np.array([3.0, 7.0]) / length) ** 2)
     amplitude = np.sqrt(5.0) * 1e-4
@@ -424,4 +424,24 @@ def test_a_fast_vibration_adds_the_amplitude_lost_in_the_point_spread(
     assert found == pytest.approx(added + expected * np.eye(3), rel=0.1)
     assert found[0, 1] == 0.0
     none = StreakResiduals(star[:0], left.time[:0], nothing[:0], nothing[:0, 0], nothing[:0, 0])
-    assert not vibration.vibration_covariance(camera, shaken, none).any()
+    assert not vibration.vibration_covariance(camera, shaken, none)[0].any()
+
+
+@pytest.mark.parametrize("cycles", [20.0, 34.0])
+def test_the_spectrum_shows_the_true_amplitude_of_an_unresolved_vibration(cycles: float) -> None:
+    """The point spread reduces the residuals of a vibration; the stated amplitude is the true one."""
+    length, amplitude, focal = 90.0, np.array([2e-4, -1e-4, 3e-5]), 1200.0
+    time = 0.56 * (2.0 * (np.arange(512) + 0.5) / 512 - 1.0)
+    information = np.zeros((512, 4, 3, 4, 3))
+    within = np.abs(time) < 0.5
+    information[within, 1, :, 1, :] = 4e5 * np.eye(3)
+    kept = np.exp(-0.5 * (2.0 * np.pi * cycles / length) ** 2)
+    slope = 2.0 * np.pi * cycles * np.cos(2.0 * np.pi * cycles * time + 0.7) * within
+    score = np.zeros((512, 4, 3))
+    score[:, 1] = 4e5 * kept * slope[:, None] * amplitude
+    sums = vibration._RotationSums(time, information, score, focal)
+    found = vibration._unresolved_amplitude(sums, Vibration(), length)
+    assert found == pytest.approx(np.linalg.norm(amplitude), rel=0.1)
+    weak = vibration._RotationSums(time, information, 1e-3 * score, focal)
+    assert vibration._unresolved_amplitude(weak, Vibration(), length) == 0.0
+    assert vibration._unresolved_amplitude(sums, Vibration(), 2.0) == 0.0
