@@ -220,7 +220,9 @@ def vibration_covariance(
     vibration = scene.motion.vibration
     if not len(left.star):
         return np.zeros((3, 3)), 0.0
-    sums, length = _rotation_sums(camera, scene, left), _median_length(camera, scene)
+    # The amplitude of an unresolved vibration requires no rotations at start and end of the exposure.
+    sums = _rotation_sums(camera, scene, left, 4 if vibration.exists else 2)
+    length = _median_length(camera, scene)
     amplitude = _unresolved_amplitude(sums, vibration, length / scene.width)
     fast = amplitude**2 * np.eye(3)
     if not vibration.exists:
@@ -297,10 +299,13 @@ class _RotationSums:
         return information, np.einsum("fbi,bik->fk", functions, self.score, optimize=True).reshape(n)
 
 
-def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> _RotationSums:
+def _rotation_sums(
+    camera: FitProblem, scene: StreakScene, left: StreakResiduals, rows: int = 4
+) -> _RotationSums:
     """Return the normal equations of a common rotation of the stars as a function of time.
 
-    The weight of a star is limited by the scatter of its residuals, which includes model errors.
+    Of the four rotations and rates of each time bin, the first `rows` are computed. The weight of a star is
+    limited by the scatter of its residuals, which includes model errors.
     """
     time, star = left.time.reshape(-1), np.repeat(left.star, LINES)
     path = paths(camera.pinhole, scene.motion, scene.stars[star], time)
@@ -313,13 +318,13 @@ def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals
     squares = np.sum(left.weight * left.residual * left.residual, axis=2).reshape(-1)
     scatter = np.bincount(star, squares) / np.maximum(np.bincount(star, used), 1)
     trust = 1.0 / np.maximum(scatter, 1.0)[star]
-    images = left.images[:, [1, 0, 3, 4]]
+    images = left.images[:, [1, 0, 3, 4][:rows]]
     light = scene.light[star]
     weighted = (images * left.weight[:, None]).transpose(0, 2, 1, 3)
-    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, 4, 4)
+    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, rows, rows)
     gram = gram * (trust * light**2)[:, None, None]
-    score = (weighted @ left.residual[..., None]).reshape(-1, 4) * (trust * light)[:, None]
-    design = np.stack([across, -along / speed[:, None], -along, along], axis=1)
+    score = (weighted @ left.residual[..., None]).reshape(-1, rows) * (trust * light)[:, None]
+    design = np.stack([across, -along / speed[:, None], -along, along][:rows], axis=1)
     place = np.clip(((time / _RANGE + 1.0) * 0.5 * _FINE_BINS).astype(np.int64), 0, _FINE_BINS - 1)
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(_FINE_BINS))
