@@ -17,6 +17,7 @@ plausible.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -356,7 +357,7 @@ class StreamWatch:
         begin_ns = now_ns - self._window_ns
         if begin_ns < self._since_ns:
             return float("nan")
-        count = sum(1 for time_ns in self._times if time_ns > begin_ns)
+        count = len(self._times) - bisect_right(self._times, begin_ns)
         return count / (self._window_ns * _SECOND)
 
     def state(self, now_ns: int) -> StreamState:

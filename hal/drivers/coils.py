@@ -304,6 +304,8 @@ class CoilOutputs:
         self.error = ""
         self._pca, self._clock, self._settings, self._lock = pca, clock, settings, lock
         self._blocks = settings.blocks()
+        # The newest counts and brakes, and the blocks that contain them.
+        self._placed: tuple[tuple[Counts, Axes], list[tuple[int, tuple[PwmCounts, ...]]]] | None = None
         self._retry_ns = round(settings.retry_wait * 1e9)
         self._check_ns = 0
 
@@ -392,12 +394,15 @@ class CoilOutputs:
     def _postpone_check(self) -> None:
         self._check_ns = self._clock.now_ns() + _CHECK_PERIOD_NS
 
-    def _channel_blocks(self, counts: Counts, braked: Axes) -> list[tuple[int, list[PwmCounts]]]:
+    def _channel_blocks(self, counts: Counts, braked: Axes) -> list[tuple[int, tuple[PwmCounts, ...]]]:
         """Return the first channel and the PWM counts of each block of consecutive channels."""
-        pins: list[PwmCounts] = []
-        for axis, value in enumerate(counts):
-            pins += BRAKED if axis in braked else inputs_for(value)
-        return [(first, [pins[member] for member in members]) for first, members in self._blocks]
+        if self._placed is None or self._placed[0] != (counts, braked):
+            pins: list[PwmCounts] = []
+            for axis, value in enumerate(counts):
+                pins += BRAKED if axis in braked else inputs_for(value)
+            blocks = [(first, tuple(pins[member] for member in members)) for first, members in self._blocks]
+            self._placed = (counts, braked), blocks
+        return self._placed[1]
 
     def _record(self, counts: Counts, braked: Axes) -> None:
         """Record acknowledged PWM counts and braked bridges; equal values do not change the recorded time."""
@@ -432,6 +437,8 @@ class PwmTorqueCoils:
         self._wire = threading.RLock()
         self._serving = False
         self._served = -1  # number of the last written request
+        # The newest command (A), its signed PWM counts, and whether any current was limited.
+        self._converted: tuple[tuple[float, ...], Counts, bool] = ((), (), False)
         # Newest state of the driver, and the values of which this state consists.
         self._state: CoilState
         self._state_key: tuple[object, ...] = ()
@@ -468,18 +475,12 @@ class PwmTorqueCoils:
                 ticker.kick()
             raise problem
         command: tuple[float, ...] = tuple(values.tolist())
-        counts: list[int] = []
-        saturated = False
-        for current, step, largest, sign in zip(
-            command, self._steps, self._largest, self._signs, strict=True
-        ):
-            count, limited = counts_for(current, step, largest)
-            counts.append(count * sign)
-            saturated = saturated or limited
+        if command != self._converted[0]:
+            self._converted = command, *self._counts(command)
         with self._mailbox.lock:
             if ticker is None or not self._running:
                 raise Refused(DEVICE, "currents cannot be commanded before start() or after close()")
-            self._mailbox.put(command, tuple(counts), saturated)
+            self._mailbox.put(command, *self._converted[1:])
         ticker.kick()
 
     def brake(self, axes: Axes) -> None:
@@ -531,6 +532,15 @@ class PwmTorqueCoils:
             ticker.stop()
         if was_running or self._outputs.failing or any(self._outputs.written):
             self.off()
+
+    def _counts(self, command: tuple[float, ...]) -> tuple[Counts, bool]:
+        """Return the signed PWM counts of currents (n,), A, and whether any current was limited."""
+        found = [
+            counts_for(current, step, largest)
+            for current, step, largest in zip(command, self._steps, self._largest, strict=True)
+        ]
+        counts = tuple(count * sign for (count, _), sign in zip(found, self._signs, strict=True))
+        return counts, any(limited for _, limited in found)
 
     def _problem(self, values: FloatArray) -> OutOfRange | None:
         if values.shape != (number := len(self._steps),):

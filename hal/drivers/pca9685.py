@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused, answering
 from hal.interfaces.wires import Clock, I2cBus
@@ -114,14 +115,9 @@ class Pca9685:
         counts without a defined effect, such as equal on and off counts, and NotResponding if the chip does
         not answer.
         """
-        if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
-            raise OutOfRange(self.name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")
-        for on, off in counts:
-            if on == off or not (0 <= on <= COUNTS and 0 <= off <= COUNTS):
-                quantity = f"OFF count (must differ from ON count {on})"
-                raise OutOfRange(self.name, quantity, off, 0, COUNTS, "counts")
+        values = _checked_values(self.name, first, tuple(counts))
         with answering(self.name):
-            self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))
+            self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, values)
 
     def all_off(self) -> None:
         """Switch all outputs off, in any state of the chip. Raises NotResponding if the chip does not answer.
@@ -148,6 +144,22 @@ class Pca9685:
     def _write(self, register: int, value: int) -> None:
         with answering(self.name):
             self._bus.write_byte_data(self._address, register, value)
+
+
+@lru_cache(maxsize=8)
+def _checked_values(name: str, first: int, counts: tuple[PwmCounts, ...]) -> tuple[int, ...]:
+    """Return the register values of `counts` for the channels from `first` on.
+
+    Raises OutOfRange, with the `name` of the chip, for counts without a defined effect. The values of the
+    newest blocks are kept, because most cycles write the same block.
+    """
+    if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
+        raise OutOfRange(name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")
+    for on, off in counts:
+        if on == off or not (0 <= on <= COUNTS and 0 <= off <= COUNTS):
+            quantity = f"OFF count (must differ from ON count {on})"
+            raise OutOfRange(name, quantity, off, 0, COUNTS, "counts")
+    return tuple(_values(counts))
 
 
 def _values(counts: Sequence[PwmCounts]) -> list[int]:

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from enum import Enum
+from functools import lru_cache
 from itertools import islice, pairwise
 from typing import NamedTuple
 
@@ -49,20 +50,25 @@ class Bridge(NamedTuple):
         """Return the signed number of PWM counts per period in which the coil is driven."""
         return self.a[1] - self.b[1]
 
-    def driven(self) -> list[tuple[int, int]]:
+    def driven(self) -> tuple[tuple[int, int], ...]:
         """Return the spans [begin, end) of PWM counts in which the coil is driven."""
-        if self.a == self.b:
-            return []
-        edges = {0, COUNTS}
-        for first, length in self:
-            edges |= {first, (first + length) % COUNTS}
-        ordered = sorted(edges)
-        spans = []
-        for begin, end in pairwise(ordered):
-            a, b = ((begin - first) % COUNTS < length for first, length in self)
-            if a != b:
-                spans.append((begin, end))
-        return spans
+        return _driven(self)
+
+
+@lru_cache(maxsize=64)
+def _driven(bridge: Bridge) -> tuple[tuple[int, int], ...]:
+    """Return the spans of `Bridge.driven`, which are kept because commands last for seconds."""
+    if bridge.a == bridge.b:
+        return ()
+    edges = {0, COUNTS}
+    for first, length in bridge:
+        edges |= {first, (first + length) % COUNTS}
+    spans = []
+    for begin, end in pairwise(sorted(edges)):
+        a, b = ((begin - first) % COUNTS < length for first, length in bridge)
+        if a != b:
+            spans.append((begin, end))
+    return tuple(spans)
 
 
 class Chopping(NamedTuple):
@@ -82,14 +88,15 @@ class Chopping(NamedTuple):
 
     def charge(self, start_ns: int, end_ns: int) -> float:
         """Return the charge (A ns) drawn from the supply between two times."""
-        periods = [divmod((time_ns - self.origin_ns) / self.period_ns, 1.0) for time_ns in (start_ns, end_ns)]
-        (whole_0, part_0), (whole_1, part_1) = periods
+        whole_0, part_0 = divmod((start_ns - self.origin_ns) / self.period_ns, 1.0)
+        whole_1, part_1 = divmod((end_ns - self.origin_ns) / self.period_ns, 1.0)
         total = 0.0
         for bridge, current in self.drawn:
             if not current or bridge.a == bridge.b:
                 continue
             for begin, end in bridge.driven():
-                at_0, at_1 = (min(max(part * COUNTS - begin, 0.0), end - begin) for part in (part_0, part_1))
+                at_0 = min(max(part_0 * COUNTS - begin, 0.0), end - begin)
+                at_1 = min(max(part_1 * COUNTS - begin, 0.0), end - begin)
                 total += current * ((whole_1 - whole_0) * (end - begin) + at_1 - at_0)
         return total * self.period_ns / COUNTS
 
@@ -219,10 +226,12 @@ class CoilCircuit:
         draws = list(islice(self._draws, count)) if written else [0.5] * count
         for axis, ((channel_a, channel_b), channels, step, limit) in enumerate(self._coils):
             stuck_a, stuck_b = self._stuck[axis]
-            bridge = Bridge(stuck_a or high(channel_a), stuck_b or high(channel_b))
-            if bridge == self._bridges[axis] and not written & channels:
+            a, b = stuck_a or high(channel_a), stuck_b or high(channel_b)
+            bridge = self._bridges[axis]
+            if a != bridge.a or b != bridge.b:
+                self._bridges[axis] = bridge = Bridge(a, b)
+            elif not written & channels:
                 continue
-            self._bridges[axis] = bridge
             counts = bridge.net_counts()
             current, drawn = 0.0, abs(step) * COUNTS
             if counts:

@@ -76,6 +76,7 @@ class EmulatedPca9685:
         self._now_ns = now_ns
         self._registers = bytearray()
         self._addresses: set[int] = set()
+        self._high: dict[int, tuple[int, int]] = {}  # results of `high` since the last change of the registers
         self._halted = 0  # bit mask of channels that sleep mode has stopped until RESTART or a new write
         self._power_on()
 
@@ -87,6 +88,7 @@ class EmulatedPca9685:
     def upset(self, register: int, value: int) -> None:
         """Overwrite a register in any mode of the chip, as radiation can do."""
         self._registers[register] = value
+        self._high.clear()
         self._find_addresses()
         self._stop(_ALL_CHANNELS)
 
@@ -116,10 +118,13 @@ class EmulatedPca9685:
         """Return the part of a PWM period in which an output is high: first count and number of counts."""
         if not self.output_enable:
             return 0, 0
-        start, length = self._pulse(channel)
-        if self._registers[MODE2] & _INVERT:
-            return (start + length) % COUNTS, COUNTS - length
-        return start, length
+        found = self._high.get(channel)
+        if found is None:
+            start, length = found = self._pulse(channel)
+            if self._registers[MODE2] & _INVERT:
+                found = (start + length) % COUNTS, COUNTS - length
+            self._high[channel] = found
+        return found
 
     def duty(self, channel: int) -> float:
         """Return the duty cycle of an output, from 0 to 1."""
@@ -144,12 +149,15 @@ class EmulatedPca9685:
             written = self._store_run(pointer, data[1:])
         else:
             written = 0
+            self._high.clear()
             for value in data[1:]:
                 written |= self._store(self._pointer, value)
                 self._advance()
         # A write to a channel acts like RESTART, but with the OCH bit it must contain all four registers.
         if written and (count >= 4 or not self._registers[MODE2] & _UPDATE_ON_ACK):
-            self._halted &= ~written
+            if self._halted:
+                self._halted &= ~written
+                self._high.clear()
             self._restart = False
         self._stop(written)
 
@@ -163,6 +171,7 @@ class EmulatedPca9685:
 
     def _power_on(self) -> None:
         self._registers = bytearray(_POWER_ON)
+        self._high.clear()
         self._pointer = 0
         self._restart = False
         self._halted = 0
@@ -188,8 +197,10 @@ class EmulatedPca9685:
         end = pointer + len(values)
         # All bytes are masked at once as one long integer, which is faster than a loop.
         writable = int.from_bytes(_WRITABLE[pointer:end], "big")
-        kept = int.from_bytes(values, "big") & writable
-        self._registers[pointer:end] = kept.to_bytes(len(values), "big")
+        kept = (int.from_bytes(values, "big") & writable).to_bytes(len(values), "big")
+        if self._registers[pointer:end] != kept:
+            self._registers[pointer:end] = kept
+            self._high.clear()
         self._pointer = end if end < _LED_END else 0
         first, last = (pointer - LED0_ON_L) >> 2, (end - 1 - LED0_ON_L) >> 2
         return (1 << last + 1) - (1 << first)

@@ -251,9 +251,8 @@ class SolarCellsModel:
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
         """Return the currents (...) relative to normal incidence, for `cosines` (...) of incidence angles."""
-        grazing = math.sin(self.grazing)
-        dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
-        return np.asarray(np.maximum(dimmed, 0.0))
+        grazing, lit = math.sin(self.grazing), np.maximum(cosines, 0.0)
+        return np.asarray(lit * np.minimum(lit / grazing, 1.0)) if grazing > 0.0 else lit
 
 
 @lru_cache(maxsize=8)
