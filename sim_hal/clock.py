@@ -72,6 +72,10 @@ class TimedSimulation:
             if device.next_event_ns() <= event_ns:
                 device.advance(event_ns)
 
+    def pass_to(self, time_ns: int) -> None:
+        """Advance the world to `time_ns`, up to which no event is due."""
+        self._advance_world(time_ns)
+
     def advance_to(self, time_ns: int) -> None:
         """Process all events up to `time_ns` in order."""
         while (event_ns := self.next_event_ns()) <= time_ns:
@@ -88,8 +92,8 @@ class TimedWorld(Protocol):
     def run_events(self, event_ns: int) -> None:
         """Process the events at `event_ns`, which is the time of the next event."""
 
-    def advance_to(self, time_ns: int) -> None:
-        """Process all events up to `time_ns`."""
+    def pass_to(self, time_ns: int) -> None:
+        """Advance to `time_ns`, up to which no event is due."""
 
 
 class SimClock:
@@ -119,8 +123,7 @@ class SimClock:
         while self._now_ns < deadline_ns:
             next_ns = deadline_ns
             if not self._running_jobs:
-                for ticker in self.tickers:
-                    next_ns = min(next_ns, ticker.due_ns)
+                next_ns = min([deadline_ns, *[ticker.due_ns for ticker in self.tickers]])
             self._advance_world(max(next_ns, self._now_ns))
             if not self._running_jobs:
                 self._run_due_jobs()
@@ -141,7 +144,7 @@ class SimClock:
             while (event_ns := world.next_event_ns()) <= time_ns:
                 self._now_ns = max(self._now_ns, event_ns)
                 world.run_events(event_ns)
-            world.advance_to(time_ns)
+            world.pass_to(time_ns)
         self._now_ns = max(self._now_ns, time_ns)
 
     def _run_due_jobs(self) -> None:

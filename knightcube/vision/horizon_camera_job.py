@@ -137,7 +137,9 @@ def _blocks(image: Image | FloatArray) -> FloatArray:
     rows, columns = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -columns % _BLOCK)), mode="edge")
     m, n = padded.shape[0] // _BLOCK, padded.shape[1] // _BLOCK
-    return np.asarray(padded.reshape(m, _BLOCK, n, _BLOCK).mean(axis=(1, 3), dtype=float))
+    # Two sums are several times faster than a mean over two axes.
+    lines = padded.reshape(m, _BLOCK, -1).sum(axis=1, dtype=float)
+    return np.asarray(lines.reshape(m, n, _BLOCK).sum(axis=2) / _BLOCK**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ class Beeper:
             self._notes.append(("beep", self._next))
             self._next += 10 * MS
 
-    run_events = advance_to
+    run_events = pass_to = advance_to
 
 
 def test_sleeping_takes_the_world_and_the_tickers_along_in_order() -> None:

@@ -83,7 +83,7 @@ class _World:
     def advance_to(self, time_ns: int) -> None:
         self._camera.advance(time_ns)
 
-    run_events = advance_to
+    run_events = pass_to = advance_to
 
 
 def emulated_rig() -> Rig:

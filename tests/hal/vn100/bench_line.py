@@ -49,7 +49,7 @@ class Alone:
         """Advance the unit to a time."""
         self.unit.advance(time_ns)
 
-    run_events = advance_to
+    run_events = pass_to = advance_to
 
 
 @dataclass(frozen=True, slots=True)
