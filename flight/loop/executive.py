@@ -182,24 +182,19 @@ Task = Callable[[Cycle], None]
 
 
 class RateGroup:
-    """A periodic task, its period, and the statistics of its cycles."""
+    """A periodic task, its period, and the statistics of its cycles; the next slot is due at `due_ns`, ns."""
 
     def __init__(self, name: str, period_ns: int, task: Task) -> None:
         if period_ns <= 0:
             raise FlightError(f"rate group {name}: a period of {period_ns} ns is not positive")
         self.name, self.period_ns, self.task = name, period_ns, task
         self.cycles = self.completed = self.slips = self.overruns = self.total_execution_ns = 0
-        self.max_execution_ns = self._slot = self._epoch_ns = 0
+        self.max_execution_ns = self._slot = self._epoch_ns = self.due_ns = 0
 
     def begin(self, epoch_ns: int) -> None:
         """Start the grid of slots, of which slot 0 is due at `epoch_ns`."""
-        self._epoch_ns = epoch_ns
+        self._epoch_ns = self.due_ns = epoch_ns
         self._slot = 0
-
-    @property
-    def due_ns(self) -> int:
-        """Time (ns) at which the next slot is due."""
-        return self._epoch_ns + self._slot * self.period_ns
 
     @property
     def mean_execution_ns(self) -> float:
@@ -219,6 +214,7 @@ class RateGroup:
             slot = self._slot + skipped
             cycle = Cycle(slot, self._epoch_ns + slot * self.period_ns, now_ns)
         self._slot += skipped + (cycle is not None)
+        self.due_ns = self._epoch_ns + self._slot * self.period_ns
         self.slips += skipped
         return cycle, skipped
 
@@ -270,13 +266,13 @@ class CyclicExecutive:
         for group in self._groups:
             group.begin(epoch_ns)
         while not self._stop:
-            due_ns = min(group.due_ns for group in self._groups)
+            due_ns = min([group.due_ns for group in self._groups])
             if due_ns >= until_ns:
                 self._clock.sleep_until_ns(until_ns)
                 return
             self._clock.sleep_until_ns(due_ns)
             for group in self._groups:
-                if not self._stop:
+                if not self._stop and group.due_ns <= self._clock.now_ns():
                     self._serve(group)
 
     def _serve(self, group: RateGroup) -> None:

@@ -187,14 +187,12 @@ class Packer:
         try:
             for name, text_size, items, end in layout.fields:
                 value: Any = given[name]
-                if text_size:
+                if items > 1:
+                    flat += value if type(value) is list and len(value) == items else _to_items(value, items)
+                elif text_size:
                     flat.append(_to_bytes(value, text_size))
-                elif end and value >= end:
-                    flat.append(value % end)
-                elif items == 1:
-                    flat.append(value)
                 else:
-                    flat += _to_items(value, items)
+                    flat.append(value % end if end and value >= end else value)
             body = layout.body.pack(*flat)
         except (KeyError, TypeError, ValueError, OverflowError, struct.error) as error:
             raise _explain(layout, time_ns, given) from error

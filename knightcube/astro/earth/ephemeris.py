@@ -96,12 +96,12 @@ class Ephemeris:
         step = float(self.times[1] - self.times[0])
         position = (times - self.times[0]) / step
         last = len(self.times) - 2
-        if not (np.all(position >= -1e-6) and np.all(position <= last + 1.0 + 1e-6)):
+        if not (position.min(initial=0.0) >= -1e-6 and position.max(initial=0.0) <= last + 1.0 + 1e-6):
             raise OrbitError(
                 f"{times[0]:.0f} .. {times[-1]:.0f} s: the orbit is predicted for "
                 f"{self.times[0]:.0f} .. {self.times[-1]:.0f} s"
             )
-        before = np.clip(position.astype(np.int64), 0, last)
+        before = np.minimum(np.maximum(position.astype(np.int64), 0), last)
         return before, position - before, step
 
 
