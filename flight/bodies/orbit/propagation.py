@@ -74,7 +74,8 @@ class DipoleHistory:
         """Return the mean dipole (3,), A m^2, between two times; it is zero before the first record."""
         if to_ns <= from_ns:
             return np.array(self._dipoles[-1] if self._dipoles else _NOTHING)
-        return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
+        (a, b, c), (x, y, z), span = self._sum(to_ns), self._sum(from_ns), to_ns - from_ns
+        return np.array(((a - x) / span, (b - y) / span, (c - z) / span))
 
     def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
         """Return the mean over t of the integral (3,), A m^2 s, of the dipole from a time t to `to_ns`.

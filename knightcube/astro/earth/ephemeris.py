@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.earth.geomagnetism import field, fields
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, propagated
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial, terrestrial_time
@@ -26,6 +26,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 
 STEP = 10.0
 """Default time step of an ephemeris, s."""
+_Index = slice | IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,19 +52,17 @@ class Ephemeris:
 
     def position_at(self, times: FloatArray) -> FloatArray:
         """Return the positions (m, 3), m, at times (m,), s. Raises OrbitError outside the prediction."""
-        before, share, span = self._interval(times)
-        s = share[:, None]
-        start, end = self.position[before], self.position[before + 1]
-        out, into = span * self.velocity[before], span * self.velocity[before + 1]
+        low, high, s, span = self._interval(times)
+        start, end = self.position[low], self.position[high]
+        out, into = span * self.velocity[low], span * self.velocity[high]
         bend = (1.0 - s) * (out - (end - start)) + s * ((end - start) - into)
         return np.asarray(start + s * (end - start) + s * (1.0 - s) * bend)
 
     def velocity_at(self, times: FloatArray) -> FloatArray:
         """Return the velocities (m, 3), m/s, at times (m,), s, as the derivative of `position_at`."""
-        before, share, span = self._interval(times)
-        s = share[:, None]
-        start, end = self.position[before], self.position[before + 1]
-        out, into = self.velocity[before], self.velocity[before + 1]
+        low, high, s, span = self._interval(times)
+        start, end = self.position[low], self.position[high]
+        out, into = self.velocity[low], self.velocity[high]
         mean = (end - start) / span
         return np.asarray(
             (1.0 - 4.0 * s + 3.0 * s * s) * out + (3.0 * s * s - 2.0 * s) * into + 6.0 * s * (1.0 - s) * mean
@@ -84,25 +83,28 @@ class Ephemeris:
 
     def interpolated(self, values: FloatArray, times: FloatArray) -> FloatArray:
         """Return values (m, k) at times (m,), s, interpolated linearly between values (n, k) at `times`."""
-        before, share, _ = self._interval(times)
-        s = share[:, None]
-        return np.asarray((1.0 - s) * values[before] + s * values[before + 1])
+        low, high, s, _ = self._interval(times)
+        return np.asarray((1.0 - s) * values[low] + s * values[high])
 
-    def _interval(
-        self, times: FloatArray
-    ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], FloatArray, float]:
-        """Return interval index (m,) and fraction (m,) within the interval of each time, and the step, s."""
+    def _interval(self, times: FloatArray) -> tuple[_Index, _Index, FloatArray, float]:
+        """Return the nodes before and after each time (m,), the fractions (m, 1) between them, and the step.
+
+        The nodes are index arrays (m,) or, for a single time, slices, which numpy applies four times as fast.
+        """
         times = np.atleast_1d(times)
-        step = float(self.times[1] - self.times[0])
-        position = (times - self.times[0]) / step
-        last = len(self.times) - 2
+        first, last = float(self.times[0]), len(self.times) - 2
+        step = float(self.times[1]) - first
+        position = (times - first) / step
         if not (position.min(initial=0.0) >= -1e-6 and position.max(initial=0.0) <= last + 1.0 + 1e-6):
             raise OrbitError(
                 f"{times[0]:.0f} .. {times[-1]:.0f} s: the orbit is predicted for "
                 f"{self.times[0]:.0f} .. {self.times[-1]:.0f} s"
             )
-        before = np.minimum(np.maximum(position.astype(np.int64), 0), last)
-        return before, position - before, step
+        if len(times) == 1:
+            place = min(max(int(position[0]), 0), last)
+            return slice(place, place + 1), slice(place + 1, place + 2), position[:, None] - place, step
+        before = np.clip(position.astype(np.int64), 0, last)
+        return before, before + 1, (position - before)[:, None], step
 
 
 def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris:
