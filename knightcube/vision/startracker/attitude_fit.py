@@ -606,6 +606,31 @@ def _distorted_fit(
     """
     direction, reference = field.direction[observed], sky.stars.direction[star]
     weight = 1.0 / (field.sigma[observed] * pose.scale)
+    start = np.ascontiguousarray(pose.matrix), float(pose.scale), float(pose.distortion)
+    try:
+        settled, *found, normal, squares = _fit_distorted(direction, reference, weight, *start, corner)
+    except np.linalg.LinAlgError:
+        return None
+    return (_DistortedPose(*found), normal, squares) if settled else None
+
+
+_Distorted = tuple[bool, FloatArray, float, float, FloatArray, FloatArray]
+
+
+def _fit_distorted_numpy(
+    direction: FloatArray,
+    reference: FloatArray,
+    weight: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    distortion: float,
+    corner: float,
+) -> _Distorted:
+    """Return whether the fit converged, matrix, scale, distortion, normal matrix and chi-squares (n,).
+
+    Raises LinAlgError if the normal matrix is singular.
+    """
+    pose = _DistortedPose(matrix, scale, distortion)
     for _ in range(_DISTORTION_STEPS):
         ratio = pose.ratio(direction, corner)
         seen = stretched(direction, pose.scale * ratio)
@@ -623,16 +648,90 @@ def _distorted_fit(
         normal[4, 4] += PRIOR**-2
         gradient = flat.T @ residual.ravel()
         gradient[4] += pose.distortion / PRIOR**2
-        try:
-            step = -np.linalg.solve(normal, gradient)
-        except np.linalg.LinAlgError:
-            return None
+        step = -np.linalg.solve(normal, gradient)
         distortion = pose.distortion + float(step[4])
         if not float(np.abs(step).max()) < 1.0 or abs(distortion) > _MOST:
-            return None
+            return False, pose.matrix, pose.scale, pose.distortion, normal, np.zeros(len(weight))
         turn = np.asarray(step[:3], dtype=np.float64)
         pose = _DistortedPose(turned(pose.matrix, turn), pose.scale * math.exp(float(step[3])), distortion)
         if np.abs(step).max() < _DISTORTION_SETTLED:
             break
     missed = weight[:, None] * (pose.true(direction, corner) - reference @ pose.matrix.T)
-    return pose, np.asarray(normal), np.einsum("ij,ij->i", missed, missed)
+    squares = np.einsum("ij,ij->i", missed, missed)
+    return True, pose.matrix, pose.scale, pose.distortion, np.asarray(normal), squares
+
+
+@compiled_form_of(_fit_distorted_numpy)
+def _fit_distorted(
+    direction: FloatArray,
+    reference: FloatArray,
+    weight: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    distortion: float,
+    corner: float,
+) -> _Distorted:
+    """See `_fit_distorted_numpy`."""
+    matrix, slope, off = matrix.copy(), np.zeros((3, 5)), np.empty(3)
+    normal, gradient, squares = np.empty((5, 5)), np.empty(5), np.zeros(len(direction))
+    for _ in range(_DISTORTION_STEPS):
+        normal[:], gradient[:] = 0.0, 0.0
+        for star in range(len(direction)):
+            _write_distorted(direction[star], reference[star], matrix, scale, distortion, corner, slope, off)
+            squared = weight[star] * weight[star]
+            for i in range(5):
+                for axis in range(3):
+                    gradient[i] += squared * slope[axis, i] * off[axis]
+                    for j in range(5):
+                        normal[i, j] += squared * slope[axis, i] * slope[axis, j]
+        normal[4, 4] += PRIOR**-2
+        gradient[4] += distortion / PRIOR**2
+        step = -np.linalg.solve(normal, gradient)
+        longest = float(np.abs(step).max())
+        if not longest < 1.0 or abs(distortion + step[4]) > _MOST:
+            return False, matrix, scale, distortion, normal, squares
+        _turn(matrix, step)
+        scale *= math.exp(step[3])
+        distortion += step[4]
+        if longest < _DISTORTION_SETTLED:
+            break
+    for star in range(len(direction)):
+        _write_distorted(direction[star], reference[star], matrix, scale, distortion, corner, slope, off)
+        for axis in range(3):
+            squares[star] += (weight[star] * off[axis]) ** 2
+    return True, matrix, scale, distortion, normal, squares
+
+
+@loop_helper
+def _write_distorted(
+    direction: FloatArray,
+    reference: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    distortion: float,
+    corner: float,
+    slope: FloatArray,
+    off: FloatArray,
+) -> None:
+    """Write the residual of one star (3,) to `off`, and its derivatives (3, 5) to `slope`, not weighted."""
+    (x, y, z), ratio = direction, 1.0
+    tangent = (x * x + y * y) / (z * z * corner * corner)
+    squared = distortion * tangent
+    for _ in range(4):
+        ratio -= (ratio * (1.0 + squared * ratio * ratio) - 1.0) / (1.0 + 3.0 * squared * ratio * ratio)
+    factor = scale * ratio
+    shrink = 1.0 / math.sqrt(factor * factor + (1.0 - factor * factor) * z * z)
+    x, y, z = x * factor * shrink, y * factor * shrink, z * shrink
+    px, py, pz = (
+        matrix[0, 0] * reference[0] + matrix[0, 1] * reference[1] + matrix[0, 2] * reference[2],
+        matrix[1, 0] * reference[0] + matrix[1, 1] * reference[1] + matrix[1, 2] * reference[2],
+        matrix[2, 0] * reference[0] + matrix[2, 1] * reference[1] + matrix[2, 2] * reference[2],
+    )
+    off[0], off[1], off[2] = x - px, y - py, z - pz
+    slope[0, 1], slope[0, 2] = pz, -py
+    slope[1, 0], slope[1, 2] = -pz, px
+    slope[2, 0], slope[2, 1] = py, -px
+    slope[0, 3], slope[1, 3], slope[2, 3] = x * z * z, y * z * z, z * z * z - z
+    share = tangent * ratio * ratio
+    for axis in range(3):
+        slope[axis, 4] = -slope[axis, 3] * share / (1.0 + 3.0 * distortion * share)

@@ -186,6 +186,8 @@ class _Seen:
     before: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
+        for name in ("observed", "reference"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
         # The `whitener` is a pseudo-inverse, because a direction has no error along the line of sight.
         spread = self.slopes @ np.linalg.cholesky(self.covariance)
         across = np.swapaxes(spread, -1, -2)
@@ -206,9 +208,9 @@ class _Seen:
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
         try:
             agreed, matrix, scale, held, inverse = _fitted(
-                np.ascontiguousarray(self.observed),
+                self.observed,
                 self.whitener,
-                np.ascontiguousarray(self.reference),
+                self.reference,
                 self.late,
                 weight,
                 known,
@@ -225,18 +227,55 @@ class _Seen:
         bend[:bends] = held[:bends]
         return _FittedPose(matrix, scale, bend, float(held[bends:].sum()), inverse)
 
-    def directions(self, pose: _FittedPose) -> FloatArray:
-        """Return observed unit vectors (n, 3) at mid-exposure, corrected for the lens errors of a pose."""
-        seen = bent(stretched(self.observed, pose.scale), pose.bend)
-        return seen - pose.delay * self.late if len(self.late) else seen
-
     def squares(self, pose: _FittedPose) -> FloatArray:
         """Return the chi-square of each star (n,) for a pose, with two degrees of freedom."""
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, self.missed(pose)) ** 2, axis=1))
 
     def missed(self, pose: _FittedPose) -> FloatArray:
         """Return the difference between observed and predicted unit vector of each star (n, 3)."""
-        return self.directions(pose) - self.reference @ pose.matrix.T
+        scale, delay = float(pose.scale), float(pose.delay)
+        matrix = np.ascontiguousarray(pose.matrix)
+        return _missed(self.observed, self.reference, self.late, matrix, scale, pose.bend, delay)
+
+
+def _missed_numpy(
+    observed: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    bend: FloatArray,
+    delay: float,
+) -> FloatArray:
+    """Return the difference between observed and predicted unit vector of each star (n, 3).
+
+    The observed unit vectors are corrected for the lens errors `bend` and for the delay of the shutter.
+    """
+    seen = bent(stretched(observed, scale), bend)
+    seen = seen - delay * late if len(late) else seen
+    return np.asarray(seen - reference @ matrix.T)
+
+
+@compiled_form_of(_missed_numpy)
+def _missed(
+    observed: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    bend: FloatArray,
+    delay: float,
+) -> FloatArray:
+    """See `_missed_numpy`."""
+    out = np.empty_like(observed)
+    for star in range(len(observed)):
+        _see(observed[star], scale, bend, out[star])
+        for axis in range(3):
+            if len(late):
+                out[star, axis] -= delay * late[star, axis]
+            for k in range(3):
+                out[star, axis] -= matrix[axis, k] * reference[star, k]
+    return out
 
 
 def _fitted_numpy(

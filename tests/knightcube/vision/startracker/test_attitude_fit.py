@@ -22,6 +22,7 @@ from knightcube.vision.startracker.attitude_fit import (
     DistortedFit,
     Refinement,
     StarField,
+    _fit_distorted,
     _refined,
     fit_with_distortion,
     inflation,
@@ -260,3 +261,17 @@ def test_all_forms_of_the_fit_give_the_same_attitude(free_scale: bool) -> None:
         assert_forms_agree(_refined, noisy, seen, sigma, turn, 1.01, free_scale, relative=1e-6)
     same = np.repeat(directions(1), 4, axis=0)
     assert_forms_agree(_refined, same, same, np.full(4, SIGMA), np.eye(3), 1.0, free_scale)
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.03, 0.2])
+def test_the_compiled_fit_of_the_distortion_equals_that_in_numpy(distortion: float) -> None:
+    rng = np.random.default_rng(12)
+    for count in (4, 40):
+        reference = directions(count, seed=count)
+        turn = attitude_matrix(from_rotation_vector(rng.normal(0.0, 0.01, 3)))
+        seen = stretched(reference @ turn.T, np.full(count, 1.02))
+        seen = np.asarray(normalise(seen + rng.normal(0.0, SIGMA, seen.shape)))
+        weight = rng.uniform(0.5, 2.0, count) / SIGMA
+        assert_forms_agree(
+            _fit_distorted, seen, reference, weight, np.eye(3), 0.99, distortion, 0.2, relative=1e-6
+        )
