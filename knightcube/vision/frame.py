@@ -26,7 +26,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 
 _CLIP, _CLIPPED_SIGMA = 3.0, 0.98658
@@ -161,7 +161,8 @@ def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None
     down, across = max(1, rows // block), max(1, columns // block)
     height, width = rows // down, columns // across
     first = stride // 2
-    values = in_blocks(pixels, down, across, first, stride).astype(np.float64)
+    # A float32 holds the sum of 16 pixels of 16 bits exactly.
+    values = in_blocks(pixels, down, across, first, stride).astype(np.float32)
     known = np.zeros((down, across))
     if coarse is not None:
         row, column = np.arange(down)[:, None] * height, np.arange(across)[:, None] * width
@@ -170,7 +171,7 @@ def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None
             interpolation_weights(side, blocks)[place.ravel()]
             for side, blocks, place in zip(coarse.shape, coarse.level.shape, sampled, strict=True)
         )
-        values -= in_blocks(of_row @ coarse.level @ of_column.T, down, across)
+        values -= in_blocks((of_row @ coarse.level @ of_column.T).astype(np.float32), down, across)
         middle = np.broadcast_arrays(column.T + 0.5 * (width - 1), row + 0.5 * (height - 1))
         known = among_blocks(coarse.level, coarse.shape, *middle)
     level, variance = _clipped_moments(values)
@@ -209,7 +210,7 @@ def _is_uneven(background: Background) -> bool:
     return float(np.mean(steep)) > _LEAST_UNEVEN
 
 
-def _clipped_moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _clipped_moments(values: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Return mean and variance (down, across) of the values (down, across, k) without outliers."""
     median = _median_of_blocks(values)
     off = values - median
@@ -218,11 +219,11 @@ def _clipped_moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     kept = apart <= _CLIP * np.maximum(MAD_TO_SIGMA * _median_of_blocks(apart), 0.5)
     count = np.count_nonzero(kept, axis=-1)
     off *= kept
-    mean = off.sum(axis=-1) / count
+    mean = off.sum(axis=-1, dtype=np.float64) / count
     return median[..., 0] + mean, np.einsum("ijk,ijk->ij", off, off) / count - mean**2
 
 
-def _median_of_blocks(values: FloatArray) -> FloatArray:
+def _median_of_blocks(values: Float32Array) -> Float32Array:
     """Return the medians (down, across, 1) of finite values (down, across, k).
 
     Sorting a few hundred values with vector instructions is faster than a partition.

@@ -6,12 +6,14 @@ that are not stars. `measure_near` reads only small windows around predicted pos
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntFlag
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.frame import MAD_TO_SIGMA, label_pixels, saturation_level
 from knightcube.vision.startracker.measurement import (
     FrameSpread,
@@ -178,15 +180,35 @@ def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
 
 def on_wings(peaks: Peaks) -> BoolArray:
     """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
-    x, y = peaks.place.T.astype(np.float32)
+    return _on_wings(peaks.place, peaks.height, peaks.core)
+
+
+def _on_wings_numpy(place: IntArray, height: FloatArray, core: FloatArray) -> BoolArray:
+    """See `on_wings`; the highest peak is first."""
+    x, y = place.T
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
     # Only peaks closer than 60 px are compared: at 60 px, the wings are a millionth of the peak.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
     # The wings of a saturated star begin at the edge of its saturated disc.
-    apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
+    apart = np.maximum(np.sqrt(square[lower, higher]) - core[higher], 0.0)
     wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
-    hidden = peaks.height[lower] < peaks.height[higher] * wing
+    hidden = height[lower] < height[higher] * wing
     return np.bincount(lower[hidden], minlength=len(x)) > 0
+
+
+@compiled_form_of(_on_wings_numpy)
+def _on_wings(place: IntArray, height: FloatArray, core: FloatArray) -> BoolArray:
+    """See `_on_wings_numpy`."""
+    hidden = np.zeros(len(place), dtype=np.bool_)
+    for lower in range(len(place)):
+        for higher in range(lower):
+            across, down = place[lower, 0] - place[higher, 0], place[lower, 1] - place[higher, 1]
+            square = across * across + down * down
+            if square < _WINGS_END**2:
+                apart = max(math.sqrt(square) - core[higher], 0.0)
+                wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
+                hidden[lower] |= height[lower] < height[higher] * wing
+    return hidden
 
 
 def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
@@ -311,9 +333,10 @@ def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
 
     The sources are at `points` (n, 2), px. The mask `odd` (n,) marks the sources that do not look like stars.
     """
-    near = np.sum((points[:, None] - points) ** 2, axis=-1) < _ABOUT**2
-    strange = near @ odd.astype(float)
-    return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))
+    x, y = points.T
+    near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < _ABOUT**2
+    strange = np.count_nonzero(near & odd, axis=1)
+    return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * np.count_nonzero(near, axis=1)))
 
 
 def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:

@@ -164,9 +164,9 @@ def single_pixels(windows: StarWindows) -> BoolArray:
 
 def crowded(middle: IntArray) -> BoolArray:
     """Return which stars (n,) have another star in their window of the first fit."""
-    apart = np.abs(middle[:, None] - middle).max(axis=-1)
-    np.fill_diagonal(apart, _APART)
-    return np.asarray(apart.min(axis=1) < _APART)
+    x, y = middle.T
+    near = (np.abs(x[:, None] - x) < _APART) & (np.abs(y[:, None] - y) < _APART)
+    return np.asarray(np.count_nonzero(near, axis=1) > 1)
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
@@ -178,7 +178,7 @@ def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatA
     place = middle[chosen] - middle.min(axis=0)
     column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
     cell = row * 4 + column
-    rank = np.array([np.count_nonzero(cell[:k] == cell[k]) for k in range(len(cell))])
+    rank = np.count_nonzero(np.tril(cell[:, None] == cell, -1), axis=1)
     first = rank < _MOST_OF_CELL
     count = np.bincount(cell[first], minlength=16)
     return chosen[first], 1.0 / count[cell[first]]

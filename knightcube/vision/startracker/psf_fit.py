@@ -480,12 +480,12 @@ def _solve(
     normal, gradient = np.empty((count, count)), np.empty(count)
     for star in range(stars):
         value, counts, off, expected = values[star], modelled[star], residual[star], variance[star]
-        usable = good[star].reshape(area)
+        usable, seen = good[star].reshape(area), light[star].reshape(area)
         for step in range(steps + 1):
             _derivatives(value, shift[:, star], share, size, jacobian)
             for pixel in range(area):
                 counts[pixel] = value[FLUX] * jacobian[FLUX, pixel]
-                off[pixel] = light[star, pixel // size, pixel % size] - counts[pixel] - value[SKY]
+                off[pixel] = seen[pixel] - counts[pixel] - value[SKY]
             # In the last steps, pixels with residuals above a limit are excluded (see `_solve_numpy`).
             limit = _CLIP**2 if step >= steps - _CLIP_FROM_END else np.inf
             _weights(counts, off, usable, noise[star], model, limit, expected, weight)
@@ -503,12 +503,8 @@ def _solve(
                 value[X] = min(max(value[X], -half), half)
                 value[Y] = min(max(value[Y], -half), half)
                 value[WIDTH] = min(max(value[WIDTH], NARROWEST), WIDEST, half)
+        _write_leverage(jacobian, covariance[star], weight, leverage[star])
         for pixel in range(area):
-            square = 0.0
-            for i in range(count):
-                for j in range(count):
-                    square += jacobian[i, pixel] * covariance[star, i, j] * jacobian[j, pixel]
-            leverage[star, pixel] = weight[pixel] * square
             chi2[star] += weight[pixel] * off[pixel] ** 2
             number[star] += weight[pixel] > 0.0
             if weight[pixel] == 0.0:
@@ -531,6 +527,7 @@ def _derivatives(
     """Write the derivatives (5, k * k) of one star's counts with respect to its parameters `value` (5,)."""
     across, down = np.empty((3, size)), np.empty((3, size))
     jacobian[:] = 0.0
+    jacobian[SKY] = 1.0
     for node in range(len(share)):
         _profile(value[X] + shift[node, 0], value[WIDTH], across)
         _profile(value[Y] + shift[node, 1], value[WIDTH], down)
@@ -539,11 +536,11 @@ def _derivatives(
             of_x, of_y, of_flux = flux * down[0, row], flux * down[1, row], share[node] * down[0, row]
             of_width, pixel = flux * down[2, row], row * size
             for column in range(size):
+                one = across[0, column]
                 jacobian[X, pixel + column] += of_x * across[1, column]
-                jacobian[Y, pixel + column] += of_y * across[0, column]
-                jacobian[FLUX, pixel + column] += of_flux * across[0, column]
-                jacobian[SKY, pixel + column] += share[node]
-                jacobian[WIDTH, pixel + column] += of_x * across[2, column] + of_width * across[0, column]
+                jacobian[Y, pixel + column] += of_y * one
+                jacobian[FLUX, pixel + column] += of_flux * one
+                jacobian[WIDTH, pixel + column] += of_x * across[2, column] + of_width * one
 
 
 @loop_helper
@@ -569,6 +566,21 @@ def _weights(
         largest = limit * (variance[pixel] + (_TOLERATED * counts[pixel]) ** 2)
         kept = usable[pixel] and off[pixel] * off[pixel] <= largest
         weight[pixel] = 1.0 / variance[pixel] if kept else 0.0
+
+
+@loop_helper
+def _write_leverage(
+    jacobian: FloatArray, covariance: FloatArray, weight: FloatArray, leverage: FloatArray
+) -> None:
+    """Write the fraction of each pixel's variance that the fit of one star has absorbed."""
+    leverage[:] = 0.0
+    for i in range(len(covariance)):
+        for j in range(i + 1):
+            share = covariance[i, j] if i == j else 2.0 * covariance[i, j]
+            for pixel in range(len(weight)):
+                leverage[pixel] += share * jacobian[i, pixel] * jacobian[j, pixel]
+    for pixel in range(len(weight)):
+        leverage[pixel] *= weight[pixel]
 
 
 @loop_helper
@@ -696,12 +708,13 @@ def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int
     The overlap of two star images at the distance d is exp(-d^2 / 4 sigma^2), where sigma is the standard
     deviation of the PSF. An overlap below 1 % is set to 0.
     """
-    apart = points[:, None] - points
+    x, y = points.T
+    across, down = x[:, None] - x, y[:, None] - y
     reach = half + _BEYOND * psf_sigma
-    near = (np.abs(apart) < reach).all(axis=-1) & (flux > 0.0)
+    near = (np.abs(across) < reach) & (np.abs(down) < reach) & (flux > 0.0)
     np.fill_diagonal(near, val=False)
     first, second = np.nonzero(near)
-    square = np.sum(apart[first, second] ** 2, axis=-1)
+    square = across[first, second] ** 2 + down[first, second] ** 2
     each = np.minimum(np.exp(-square / (4.0 * psf_sigma**2)), _MOST_OVERLAP)
     overlap = np.zeros(len(points))
     np.maximum.at(overlap, first, np.where(each > _LEAST_OVERLAP, each, 0.0))

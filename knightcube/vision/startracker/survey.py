@@ -546,7 +546,7 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     return found
 
 
-def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
+def _local_maxima_numpy(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
     """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last is a maximum.
 
     The array `index` (m,) contains the increasing indices of the bright pixels in the flattened frame. Pixels
@@ -563,6 +563,21 @@ def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArra
     best = np.ones(len(smooth), dtype=bool)
     best[first[smooth[first] <= smooth[second]]] = False
     best[second[smooth[second] < smooth[first]]] = False
+    return best
+
+
+@compiled_form_of(_local_maxima_numpy)
+def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
+    """See `_local_maxima_numpy`."""
+    best = np.ones(len(smooth), dtype=np.bool_)
+    for step in (1, columns - 1, columns, columns + 1):
+        other = 0
+        for k in range(len(index)):
+            while other < len(index) and index[other] < index[k] + step:
+                other += 1
+            if other < len(index) and index[other] == index[k] + step:
+                best[k] &= smooth[k] > smooth[other]
+                best[other] &= smooth[other] >= smooth[k]
     return best
 
 

@@ -15,13 +15,14 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.detect import Quality, detect, measure_near
+from knightcube.vision.startracker.detect import Quality, _on_wings, detect, measure_near
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Method, survey
 from knightcube.vision.streaks.geometry import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 from tests.support.centroid_bound import compare, frame_of, matched, point_bound, star_places
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_bound import star_information
 
 SMALL = StarCameraModel(columns=320, rows=256, field_of_view=np.radians(6.25))
@@ -382,3 +383,10 @@ def test_leaves_are_not_among_the_stars() -> None:
 def test_a_noisy_raw_frame_gives_few_false_stars_and_a_dark_one_too() -> None:
     for name in ("may8_50ms_gain40_0.png", "may8_100ms_gain12_3.png"):
         assert 5 <= len(detect(read_image(SKY / name)).stars()) <= 60
+
+
+def test_the_compiled_search_of_peaks_on_wings_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(4)
+    place, height = draw.integers(0, 200, (60, 2)), -np.sort(-(10.0 ** draw.uniform(1.0, 5.0, 60)))
+    core = np.where(draw.uniform(size=60) < 0.2, draw.uniform(1.0, 6.0, 60), 0.0)
+    assert_forms_agree(_on_wings, place, height, core)

@@ -23,6 +23,7 @@ from knightcube.vision.startracker.survey import (
     FrameKind,
     Surface,
     _bright_indices,
+    _local_maxima,
     _smoothed_above,
     _smoothed_at,
     cluttered,
@@ -446,3 +447,11 @@ def test_the_sky_is_measured_before_and_after_smoothing() -> None:
     clipped = measure_sky(np.clip(np.rint(2.0 + white), 0.0, None).astype(np.uint16))
     assert clipped.pixel_noise.at(100.0, 80.0) == pytest.approx(8.0, rel=0.35)
     assert clipped.pixel_noise.values == pytest.approx(clipped.noise.values)
+
+
+def test_the_compiled_search_of_local_maxima_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(3)
+    inner = np.pad(draw.integers(0, 3, (30, 38)), 1)
+    index = np.flatnonzero(inner)
+    assert_forms_agree(_local_maxima, index, inner.ravel()[index].astype(np.float64), inner.shape[1])
+    assert_forms_agree(_local_maxima, index[:0], np.zeros(0), inner.shape[1])
