@@ -48,12 +48,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, cross_matrix, cross_product
-from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
+from knightcube.astro.quaternion import compose, inverse, matrix, times
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
@@ -125,7 +126,7 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatA
     Each component is clipped separately at the limit of its body axis, because each coil removes momentum
     independently of the other coils.
     """
-    return np.clip(-cross_product(field, costate), -limit, limit)
+    return np.asarray(np.minimum(np.maximum(cross_product(costate, field), -limit), limit))
 
 
 def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArray:
@@ -135,8 +136,7 @@ def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArra
     dipole moment. The argument `grows` has at most two elements. No component of the result is larger than
     the largest component of the given dipole moment.
     """
-    tried = [dipole, *(_orthogonal(dipole, vector) for vector in grows)]
-    for one in tried:
+    for one in chain([dipole], (_orthogonal(dipole, vector) for vector in grows)):
         limits = [_ROUNDING * math.sqrt(float(one @ one) * float(vector @ vector)) for vector in grows]
         if all(float(one @ vector) <= limit for vector, limit in zip(grows, limits, strict=True)):
             return one
@@ -520,8 +520,10 @@ class FieldDetumbler:
                 found.rotation,
             )
         # The costate is constant in inertial axes, so it is rotated into the present body axes.
-        since = attitude_matrix(multiply(found.rotation, conjugate(self._planned_rotation)))
-        return np.asarray(since @ self._plan.costate)
+        a, b, c, d = found.rotation.tolist()
+        e, f, g, h = self._planned_rotation.tolist()
+        x, y, z = self._plan.costate.tolist()
+        return np.array(times(matrix(compose((a, b, c, d), inverse((e, f, g, h)))), (x, y, z)))
 
     def _planned(self, now_ns: int) -> MomentumPlan:
         """Return a momentum plan in the present body axes."""
