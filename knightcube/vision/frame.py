@@ -155,8 +155,6 @@ def estimate_background(
 
 def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None) -> Background:
     """Return the background in blocks; if `coarse` is given, from the pixels minus this background."""
-    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
-
     rows, columns = pixels.shape
     down, across = max(1, rows // block), max(1, columns // block)
     height, width = rows // down, columns // across
@@ -176,8 +174,7 @@ def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None
         known = among_blocks(coarse.level, coarse.shape, *middle)
     level, variance = _clipped_moments(values)
     noise = np.sqrt(np.maximum(variance / _CLIPPED_SIGMA**2, _ROUNDING_VARIANCE))
-    noise = ndimage.median_filter(noise, size=3, mode="nearest")
-    return Background(known + level, noise, (rows, columns), coarse is not None)
+    return Background(known + level, median_of_neighbours(noise), (rows, columns), coarse is not None)
 
 
 def in_blocks(pixels: Image, down: int, across: int, first: int = 0, stride: int = 1) -> Image:
@@ -190,6 +187,30 @@ def in_blocks(pixels: Image, down: int, across: int, first: int = 0, stride: int
     blocks = pixels[: down * height, : across * width].reshape(down, height, across, width)
     blocks = blocks[:, first::stride, :, first::stride].transpose(0, 2, 1, 3)
     return np.ascontiguousarray(blocks).reshape(down, across, -1)
+
+
+def median_of_neighbours(grid: FloatArray) -> FloatArray:
+    """Return the median of the 3 x 3 values around each value of a grid (down, across).
+
+    A value beyond the border is replaced by the nearest value of the grid. The median of nine values in three
+    columns is the median of the largest minimum, the median of the medians and the smallest maximum of the
+    columns.
+    """
+    wide = np.concatenate([grid[:1], grid, grid[-1:]])
+    wide = np.concatenate([wide[:, :1], wide, wide[:, -1:]], axis=1)
+    low, middle, high = _sorted_three(wide[:-2], wide[1:-1], wide[2:])
+    low = np.maximum(np.maximum(low[:, :-2], low[:, 1:-1]), low[:, 2:])
+    high = np.minimum(np.minimum(high[:, :-2], high[:, 1:-1]), high[:, 2:])
+    middle = _sorted_three(middle[:, :-2], middle[:, 1:-1], middle[:, 2:])[1]
+    return _sorted_three(low, middle, high)[1]
+
+
+def _sorted_three(
+    one: FloatArray, two: FloatArray, three: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return minimum, median and maximum of the elements of three arrays of the same shape."""
+    less, more = np.minimum(one, two), np.maximum(one, two)
+    return np.minimum(less, three), np.maximum(less, np.minimum(more, three)), np.maximum(more, three)
 
 
 def _is_uneven(background: Background) -> bool:

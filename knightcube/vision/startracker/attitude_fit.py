@@ -608,10 +608,12 @@ def _distorted_fit(
     weight = 1.0 / (field.sigma[observed] * pose.scale)
     start = np.ascontiguousarray(pose.matrix), float(pose.scale), float(pose.distortion)
     try:
-        settled, *found, normal, squares = _fit_distorted(direction, reference, weight, *start, corner)
+        settled, matrix, scale, distortion, normal, squares = _fit_distorted(
+            direction, reference, weight, *start, corner
+        )
     except np.linalg.LinAlgError:
         return None
-    return (_DistortedPose(*found), normal, squares) if settled else None
+    return (_DistortedPose(matrix, scale, distortion), normal, squares) if settled else None
 
 
 _Distorted = tuple[bool, FloatArray, float, float, FloatArray, FloatArray]
@@ -673,7 +675,8 @@ def _fit_distorted(
 ) -> _Distorted:
     """See `_fit_distorted_numpy`."""
     matrix, slope, off = matrix.copy(), np.zeros((3, 5)), np.empty(3)
-    normal, gradient, squares = np.empty((5, 5)), np.empty(5), np.zeros(len(direction))
+    normal, gradient, step = np.empty((5, 5)), np.empty(5), np.empty(5)
+    squares = np.zeros(len(direction))
     for _ in range(_DISTORTION_STEPS):
         normal[:], gradient[:] = 0.0, 0.0
         for star in range(len(direction)):
@@ -686,7 +689,7 @@ def _fit_distorted(
                         normal[i, j] += squared * slope[axis, i] * slope[axis, j]
         normal[4, 4] += PRIOR**-2
         gradient[4] += distortion / PRIOR**2
-        step = -np.linalg.solve(normal, gradient)
+        step[:] = -np.linalg.solve(normal, gradient)
         longest = float(np.abs(step).max())
         if not longest < 1.0 or abs(distortion + step[4]) > _MOST:
             return False, matrix, scale, distortion, normal, squares

@@ -202,8 +202,11 @@ class _Seen:
         before = self.before * np.diagonal(pose.covariance)[3 + int(self.unknowns.scale) :]
         return len(pose.covariance) - float(before.sum())
 
-    def fitted(self, start: _FittedPose, weight: FloatArray) -> _FittedPose:
-        """Return the pose with the smallest sum of the stars' chi-squares, weighted with `weight` (n,)."""
+    def fitted(self, start: _FittedPose, weight: FloatArray, steps: int = _MOST_STEPS) -> _FittedPose:
+        """Return the pose with the smallest sum of the stars' chi-squares, weighted with `weight` (n,).
+
+        The fit ends after at most `steps` Gauss-Newton steps.
+        """
         bends, known = len(self.unknowns.bend), self.before
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
         try:
@@ -218,6 +221,7 @@ class _Seen:
                 float(start.scale),
                 held,
                 self.unknowns.scale,
+                steps,
             )
         except np.linalg.LinAlgError as error:
             raise AttitudeError(f"{len(weight)} stars are too close together for an attitude") from error
@@ -289,6 +293,7 @@ def _fitted_numpy(
     scale: float,
     held: FloatArray,
     free_scale: bool,
+    steps: int,
 ) -> _Fitted:
     """Return whether the fit converged, the matrix, the scale, lens errors and delay, and the covariance.
 
@@ -299,7 +304,7 @@ def _fitted_numpy(
     whitener = whitener * np.sqrt(weight)[:, None, None]
     bend, first, bends = np.zeros(BENDS), 3 + int(free_scale), len(held) - int(len(late) > 0)
     last = first + np.arange(len(known))
-    for _ in range(_MOST_STEPS):
+    for _ in range(steps):
         bend[:bends] = held[:bends]
         seen = bent(stretched(observed, scale), bend)
         if len(late):
@@ -354,12 +359,13 @@ def _fitted(
     scale: float,
     held: FloatArray,
     free_scale: bool,
+    steps: int,
 ) -> _Fitted:
     first = 4 if free_scale else 3
     count = first + len(known)
     matrix, held, step = matrix.copy(), held.copy(), np.empty(count)
     normal, gradient, inverse = np.empty((count, count)), np.empty(count), np.empty((count, count))
-    for _ in range(_MOST_STEPS):
+    for _ in range(steps):
         _write_normal(
             observed, whitener, reference, late, weight, matrix, scale, held, free_scale, normal, gradient
         )
@@ -515,7 +521,8 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     scatter of the residuals is computed.
     """
     for _ in range(_HUBER_ROUNDS):
-        pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
+        # One step for each set of weights suffices, because only the residuals of the last fit are used.
+        pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL), steps=1)
         squares = seen.squares(pose)
     # A star agrees with the fit if its residual is within the scatter of the majority of stars.
     # All stars are used if too few stars agree.

@@ -478,11 +478,13 @@ def _solve(
     leverage, modelled = np.empty((stars, area)), np.empty((stars, area))
     jacobian, weight, weighted = np.empty((5, area)), np.empty(area), np.empty(area)
     normal, gradient = np.empty((count, count)), np.empty(count)
+    # All passes share their arrays, because an allocation takes as long as the arithmetic of a row.
+    profiles, factor = np.empty((2, 3, size)), np.empty((count + 1, count))
     for star in range(stars):
         value, counts, off, expected = values[star], modelled[star], residual[star], variance[star]
         usable, seen = good[star].reshape(area), light[star].reshape(area)
         for step in range(steps + 1):
-            _derivatives(value, shift[:, star], share, size, jacobian)
+            _derivatives(value, shift[:, star], share, profiles, jacobian)
             for pixel in range(area):
                 counts[pixel] = value[FLUX] * jacobian[FLUX, pixel]
                 off[pixel] = seen[pixel] - counts[pixel] - value[SKY]
@@ -495,7 +497,7 @@ def _solve(
                 gradient[i] = _inner(weighted, off)
                 for j in range(i + 1):
                     normal[i, j] = _inner(weighted, jacobian[j])
-            _invert(normal, covariance[star])
+            _invert(normal, factor, covariance[star])
             if step < steps:
                 for i in range(count):
                     longest = _LONGEST_STEP if i < FLUX else (_WIDEST_STEP if i == WIDTH else np.inf)
@@ -522,10 +524,13 @@ def _solve(
 
 @loop_helper
 def _derivatives(
-    value: FloatArray, shift: FloatArray, share: FloatArray, size: int, jacobian: FloatArray
+    value: FloatArray, shift: FloatArray, share: FloatArray, profiles: FloatArray, jacobian: FloatArray
 ) -> None:
-    """Write the derivatives (5, k * k) of one star's counts with respect to its parameters `value` (5,)."""
-    across, down = np.empty((3, size)), np.empty((3, size))
+    """Write the derivatives (5, k * k) of one star's counts with respect to its parameters `value` (5,).
+
+    The array `profiles` (2, 3, k) is overwritten.
+    """
+    (across, down), size = (profiles[0], profiles[1]), profiles.shape[2]
     jacobian[:] = 0.0
     jacobian[SKY] = 1.0
     for node in range(len(share)):
@@ -609,14 +614,16 @@ def _profile(offset: float, sigma: float, out: FloatArray) -> None:
 
 
 @loop_helper
-def _invert(normal: FloatArray, out: FloatArray) -> None:
-    """Write the inverse of one normal matrix (p, p), given by its lower triangle, to `out`."""
+def _invert(normal: FloatArray, factor: FloatArray, out: FloatArray) -> None:
+    """Write the inverse of one normal matrix (p, p), given by its lower triangle, to `out`.
+
+    The array `factor` (p + 1, p) is overwritten.
+    """
     count = len(normal)
-    scale = np.empty(count)
+    scale = factor[count]
     for i in range(count):
         scale[i] = math.sqrt(max(normal[i, i], 1e-30))
     # The Cholesky factor of the scaled matrix is computed first, and is then inverted.
-    factor = np.zeros((count, count))
     for i in range(count):
         for j in range(i + 1):
             value = normal[i, j] / (scale[i] * scale[j]) + (_RIDGE if i == j else 0.0)

@@ -31,6 +31,7 @@ from knightcube.vision.frame import (
     in_blocks,
     interpolation_weights,
     label_pixels,
+    median_of_neighbours,
     moments,
     saturation_of_bright,
 )
@@ -41,6 +42,8 @@ LEAST_SIDE = 16
 # Noise (counts) to which a floating-point frame is scaled.
 _FLOATING_NOISE = 16.0
 _BAND = 32
+# Number of pixels of a row that are first compared with their limit without branches.
+_SEGMENT = 64
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
@@ -327,14 +330,16 @@ def _smoothed_above(pixels: Image, down: Float32Array, across: Float32Array) -> 
             above, own = np.float32(pixels[row - 1, column]), np.float32(pixels[row, column])
             twice[column] = (above + own) + (own + np.float32(pixels[row + 1, column]))
             bound[column] = one * across[first, column] + other * across[second, column]
-        some = False
         for column in range(1, columns - 1):
             smooth[column] = (twice[column - 1] + twice[column]) + (twice[column] + twice[column + 1])
-            some |= smooth[column] > bound[column]
-        if some:
-            for column in range(1, columns - 1):
-                if smooth[column] > bound[column]:
-                    index[count], found[count] = row * columns + column, smooth[column]
+        for start in range(1, columns - 1, _SEGMENT):
+            stop, some = min(start + _SEGMENT, columns - 1), False
+            part, limit = smooth[start:stop], bound[start:stop]
+            for k in range(len(part)):
+                some |= part[k] > limit[k]
+            for k in range(len(part) if some else 0):
+                if part[k] > limit[k]:
+                    index[count], found[count] = row * columns + start + k, part[k]
                     count += 1
     return index[:count].copy(), found[:count].copy()
 
@@ -374,15 +379,13 @@ def _tails(sample: Image, level: FloatArray, noise: FloatArray) -> tuple[FloatAr
     beside it has no long tail. The length of the upper noise tail is relative to that of a normal
     distribution, and is at least 1.
     """
-    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
-
     (rows, columns), (down, across) = sample.shape, level.shape
     last = (rows // down) * (columns // across) - 1
     high = min(last, int(TAIL_PART * (last + 1)))
     ordered = np.sort(in_blocks(sample, down, across), axis=-1)
     tail = np.maximum(1.0, 0.5 * (ordered[..., high] - level) / noise)
-    reach = ndimage.median_filter((level - ordered[..., last - high]) / noise, size=3, mode="nearest")
-    return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest")), one_sided(reach * noise, noise)
+    reach = median_of_neighbours((level - ordered[..., last - high]) / noise)
+    return median_of_neighbours(tail), one_sided(reach * noise, noise)
 
 
 Method = Literal["psf", "window", "weighted", "gaussian", "iterative"]

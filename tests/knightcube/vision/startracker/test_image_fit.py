@@ -282,10 +282,10 @@ def test_the_compiled_fit_equals_that_in_numpy(scale: bool, bends: int, delayed:
     known = draw.uniform(1.0, 4.0, bends + delayed)
     late = 1e-3 * draw.normal(size=(30 if delayed else 0, 3))
     given = observed, 1e4 * across, reference, late, draw.uniform(0.0, 1.0, 30), known
-    assert_forms_agree(_fitted, *given, np.eye(3), 1.01, 1e-3 * known, scale, relative=1e-7)
+    assert_forms_agree(_fitted, *given, np.eye(3), 1.01, 1e-3 * known, scale, 8, relative=1e-7)
     bend = 1e-2 * draw.normal(size=8) if bends else np.zeros(8)
     assert_forms_agree(_missed, observed, reference, late, np.eye(3), 1.01, bend, 0.3)
-    agreed, matrix, *_ = _fitted.numpy_form(*given, np.eye(3), 1.01, 1e-3 * known, scale)
+    agreed, matrix, *_ = _fitted.numpy_form(*given, np.eye(3), 1.01, 1e-3 * known, scale, 8)
     assert agreed
     assert np.abs(np.mean(observed - reference @ matrix.T, axis=0)).max() < 1e-2
 

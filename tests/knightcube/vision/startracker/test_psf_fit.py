@@ -303,7 +303,7 @@ def test_normal_matrices_of_different_units_are_inverted() -> None:
     out = np.empty((5, 5))
     for one, found in zip(normal, psf_fit._inverse(normal), strict=True):
         assert found == pytest.approx(np.linalg.inv(one), rel=1e-5)
-        psf_fit._invert(np.tril(one), out)
+        psf_fit._invert(np.tril(one), np.empty((6, 5)), out)
         assert out == pytest.approx(found, rel=1e-4)
     assert psf_fit._inverse(np.zeros((1, 4, 4)))[0].shape == (4, 4)
 
