@@ -94,37 +94,43 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
     """See `_subtracted_numpy`."""
     (rows, columns), (down, across) = pixels.shape, level.shape
     signal, floor = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
-    height, width = rows // down, columns // across
-    of_row = np.empty((2, across + 1), np.float32)
+    levels, variances = np.empty((down, columns), np.float32), np.empty((down, columns), np.float32)
+    for column in range(columns):
+        left, right, share = _place(column, columns, across)
+        for block in range(down):
+            levels[block, column] = (1.0 - share) * level[block, left] + share * level[block, right]
+            variances[block, column] = (1.0 - share) * variance[block, left] + share * variance[block, right]
     for row in range(rows):
-        place = min(max((row - 0.5 * (height - 1)) / height, 0.0), down - 1.0)
-        top = int(place)
-        bottom, share = min(top + 1, down - 1), place - top
-        for block in range(across + 1):
-            of = min(block, across - 1)
-            of_row[0, block] = (1.0 - share) * level[top, of] + share * level[bottom, of]
-            of_row[1, block] = (1.0 - share) * variance[top, of] + share * variance[bottom, of]
-        for block in range(-1, across):
-            # Each pass covers the columns from the centre of one block to the next centre.
-            # The first pass covers the columns before the first block centre.
-            first = max(math.ceil(block * width + 0.5 * (width - 1)), 0)
-            last = columns if block == across - 1 else math.ceil((block + 1) * width + 0.5 * (width - 1))
-            _fill_row(signal[row], floor[row], pixels[row], of_row, max(block, 0), width, first, last)
+        top, bottom, share = _place(row, rows, down)
+        _fill_row(signal[row], pixels[row], levels[top], levels[bottom], np.float32(share))
+        _interpolate(floor[row], variances[top], variances[bottom], np.float32(share))
     return signal, floor
 
 
 @loop_helper
-def _fill_row(
-    signal: Image, floor: Image, pixels: Image, of_row: Image, block: int, width: int, first: int, last: int
-) -> None:
-    """Write signal and variance of the columns `first` to `last` of a row from block values `of_row`."""
-    centre, scale = np.float32(block * width + 0.5 * (width - 1)), np.float32(1.0 / width)
-    level, slope = of_row[0, block], of_row[0, block + 1] - of_row[0, block]
-    variance, rise = of_row[1, block], of_row[1, block + 1] - of_row[1, block]
-    for column in range(first, last):
-        share = max((np.float32(np.int32(column)) - centre) * scale, np.float32(0.0))
-        signal[column] = np.float32(pixels[column]) - (level + share * slope)
-        floor[column] = variance + share * rise
+def _place(pixel: int, pixels: int, blocks: int) -> tuple[int, int, float]:
+    """Return the indices of the two blocks around one pixel of a side, and the weight of the second block.
+
+    The side has `pixels` pixels, which are divided into `blocks`.
+    """
+    size = pixels // blocks
+    place = min(max((pixel - 0.5 * (size - 1)) / size, 0.0), blocks - 1.0)
+    return int(place), min(int(place) + 1, blocks - 1), place - int(place)
+
+
+@loop_helper
+def _fill_row(signal: Image, pixels: Image, above: Image, below: Image, share: np.float32) -> None:
+    """Write the `pixels` of a row minus the level, interpolated between the values `above` and `below`."""
+    for column in range(len(signal)):
+        level = above[column] + share * (below[column] - above[column])
+        signal[column] = np.float32(pixels[column]) - level
+
+
+@loop_helper
+def _interpolate(out: Image, above: Image, below: Image, share: np.float32) -> None:
+    """Write the values of a row, interpolated between the values `above` and `below`."""
+    for column in range(len(out)):
+        out[column] = above[column] + share * (below[column] - above[column])
 
 
 # Minimum fraction of blocks with a smooth, significant change of the level if the frame has stray light.

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -304,24 +305,31 @@ def _sum_along(
     for g in range(len(parts)):
         left, wide = parts[g, 2], parts[g, 3] - parts[g, 2]
         low, high = max(left - after + 1, 0), min(parts[g, 3] + before, columns)
-        first = low - left + width - before
+        first, around = low - left + width - before, turning[:, left : left + wide].copy()
         for row in range(parts[g, 0], parts[g, 1]):
-            _pixel_indices(index[:wide], turning, left, rising[:, row], camera)
-            start, stop, seen = wide, -1, 0
+            _pixel_indices(index[:wide], around, rising[:, row], camera)
             for k in range(wide):
                 rounded = np.float32(flat[abs(index[k])] * np.float32(per_count)) + _ROUND - _ROUND
                 sample[0, k], sample[1, k] = np.int32(rounded), np.int32(index[k] > 0)
-                if index[k] > 0:
-                    start, stop, seen = min(start, k), k, seen + 1
             for which in range(2):
                 _sum_up(total[which], sample[which], wide, width, full and wide == columns)
-            for k in range(high - low):
-                response[row, low + k] = (total[0, first + k + width] - total[0, first + k]) * unit
-                count[row, low + k] = total[1, first + k + width] - total[1, first + k]
-            if seen == 0:
-                start, stop = 0, wide - 1
+            _subtract(response[row, low:high], total[0, first:], width, np.float32(unit))
+            _subtract(count[row, low:high], total[1, first:], width, np.int32(1))
+            start, stop, seen = 0, wide - 1, sample[1, :wide].sum()
+            while seen and index[start] <= 0:
+                start += 1
+            while seen and index[stop] <= 0:
+                stop -= 1
             if seen == stop - start + 1:
                 span[row, 0], span[row, 1] = left + start - 0.5, left + stop + 0.5
+
+
+@loop_helper
+def _subtract(out: Any, total: Int32Array, width: int, unit: Any) -> None:
+    """Set `out` (m,) to the differences between cumulative sums that are `width` samples apart, in `unit`."""
+    ahead = total[width:]
+    for k in range(len(out)):
+        out[k] = (ahead[k] - total[k]) * unit
 
 
 @loop_helper
@@ -345,13 +353,8 @@ def _sum_up(total: Int32Array, sample: Int32Array, wide: int, width: int, around
 
 
 @loop_helper
-def _pixel_indices(
-    index: Int32Array, turning: Float32Array, left: int, rising: Float32Array, camera: _Camera
-) -> None:
-    """Compute the flat pixel index of each sample of a circle, which is negative outside the detector.
-
-    The argument `left` is the index of the azimuth of the first sample.
-    """
+def _pixel_indices(index: Int32Array, turning: Float32Array, rising: Float32Array, camera: _Camera) -> None:
+    """Compute the flat pixel index of each sample of a circle, which is negative outside the detector."""
     view, shape = camera
     columns, rows = np.int32(shape[0]), np.int32(shape[1])
     zero, one, half = np.float32(0.0), np.int32(1), np.float32(0.5)
@@ -360,9 +363,9 @@ def _pixel_indices(
     focal, nearest = np.float32(view[0]), np.float32(1e-3)
     across, down, deep = rising[0], rising[1], rising[2]
     for k in range(len(index)):
-        scale = focal / max(turning[2, left + k] + deep, nearest)
-        column = np.int32(min(max((turning[0, left + k] + across) * scale + x, zero), right))
-        row = np.int32(min(max((turning[1, left + k] + down) * scale + y, zero), bottom))
+        scale = focal / max(turning[2, k] + deep, nearest)
+        column = np.int32(min(max((turning[0, k] + across) * scale + x, zero), right))
+        row = np.int32(min(max((turning[1, k] + down) * scale + y, zero), bottom))
         inside = (column > 0) & (column < columns - one) & (row > 0) & (row < rows - one)
         index[k] = row * columns + column if inside else -(row * columns + column)
 
