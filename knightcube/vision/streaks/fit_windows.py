@@ -210,18 +210,63 @@ def _pixels(pinhole: Pinhole, lines: _Lines, path: StarPaths, width: float, part
     bounds = (np.ascontiguousarray(parts[0]), np.ascontiguousarray(parts[1]), parts[2])
     within = np.empty((*line.shape, 2 * half + 1), dtype=np.bool_)
     _select_pixels(within, corner, points, lines, bounds, (pinhole.columns, pinhole.rows, float(width)))
-    # Blocks of lines without any usable pixel are dropped.
+    step = np.where(along, [[0, 1]], [[1, 0]])
+    used, begin, index, inside = _kept_pixels(within, corner, step, pinhole.columns)
+    step = step[used]
+    return Strips(
+        lines.star[used], lines.time[used], corner[used] + begin * step[:, None], step, index, inside
+    )
+
+
+def _kept_pixels_numpy(
+    within: BoolArray, corner: IntArray, step: IntArray, columns: int
+) -> tuple[IntArray, int, IntArray, BoolArray]:
+    """Return the blocks (u,) with usable pixels, and their pixels without unusable margins of the lines.
+
+    The arguments are the mask of the usable pixels `within` (b, LINES, k), the first pixel and the step of
+    each line, see `Strips`, and the number of columns of the frame. The last three returned values are the
+    number of pixels omitted at the start of each line, and `index` and `inside` of `Strips`.
+    """
     crossed = np.flatnonzero(within.any(axis=(0, 1)))
     used = np.flatnonzero(within.any(axis=(1, 2)))
     begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
     inside = np.ascontiguousarray(within[used, :, begin:end])
-    step = np.where(along[used], [[0, 1]], [[1, 0]])
-    corner = corner[used] + begin * step[:, None]
-    first = corner[..., 1] * pinhole.columns + corner[..., 0]
-    next_pixel = (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
-    index = first[..., None] + np.arange(end - begin) * next_pixel
+    first = corner[used, :, 1] * columns + corner[used, :, 0]
+    next_pixel = (step[used, 1] * columns + step[used, 0])[:, None, None]
+    index = first[..., None] + np.arange(begin, end) * next_pixel
     index *= inside
-    return Strips(lines.star[used], lines.time[used], corner, step, index, inside)
+    return used, begin, index, inside
+
+
+@compiled_form_of(_kept_pixels_numpy)
+def _kept_pixels(
+    within: BoolArray, corner: IntArray, step: IntArray, columns: int
+) -> tuple[IntArray, int, IntArray, BoolArray]:
+    blocks, lines, count = within.shape
+    crossed, used, found = np.zeros(count, np.bool_), np.empty(blocks, np.int64), 0
+    for b in range(blocks):
+        any_pixel = False
+        for i in range(lines):
+            for k in range(count):
+                crossed[k] |= within[b, i, k]
+                any_pixel |= within[b, i, k]
+        used[found] = b
+        found += any_pixel
+    begin, end = 0, 0
+    for k in range(count):
+        if crossed[k]:
+            begin, end = (k if end == 0 else begin), k + 1
+    index = np.zeros((found, lines, end - begin), np.int64)
+    inside = np.zeros((found, lines, end - begin), np.bool_)
+    for u in range(found):
+        b = used[u]
+        next_pixel = step[b, 1] * columns + step[b, 0]
+        for i in range(lines):
+            first = corner[b, i, 1] * columns + corner[b, i, 0]
+            for k in range(begin, end):
+                if within[b, i, k]:
+                    index[u, i, k - begin], inside[u, i, k - begin] = first + k * next_pixel, True
+    return used[:found].copy(), begin, index, inside
 
 
 def _select_pixels_numpy(

@@ -114,26 +114,58 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     """Return up to `most` of the brightest regions with 3 x 3 sums above `sigmas` standard deviations."""
     pixel = _significant(frame.sums, frame.floor, float(frame.floor.min()), 3.0 * sigmas)
     number, count = label_pixels(pixel, frame.shape[1])
-    light = np.maximum(frame.signal[pixel], 0.0).astype(np.float64)
     area = np.bincount(number, minlength=count)
-    flux = np.bincount(number, light, count)
+    flux = np.bincount(number, np.maximum(frame.signal[pixel], np.float32(0.0)), count)
     flux[area < _LEAST_AREA] = 0.0
     chosen = np.argsort(-flux, kind="stable")[:most]
     chosen = chosen[flux[chosen] > 0.0]
     rank = np.full(count, -1)
     rank[chosen] = np.arange(len(chosen))
-    kept = np.flatnonzero(rank[number] >= 0)
-    owner, light = rank[number][kept], light[kept]
-    lit, pixel = len(pixel) / frame.signal.size, pixel[kept]
-    row = pixel // frame.shape[1]
-    column = pixel - row * frame.shape[1]
+    owner, column, row, light, cut = _region_pixels(pixel, number, rank, frame.signal, frame.shape)
     found = moments(owner, column, row, light, len(chosen))
-    rows, columns = frame.shape
-    edge = (row < _BORDER) | (row >= rows - _BORDER) | (column < _BORDER) | (column >= columns - _BORDER)
     normal = np.stack([-np.sin(found.direction), np.cos(found.direction)], axis=-1)
-    cut = np.bincount(owner, edge.astype(float), len(chosen)) > 0.0
-    shapes = found.centre, normal, found.length, found.flux, cut
-    return BrightRegions(*shapes, owner, column, row, light, lit)
+    shapes, lit = (found.centre, normal, found.length, found.flux), len(pixel) / frame.signal.size
+    return BrightRegions(*shapes, cut[: len(chosen)], owner, column, row, light, lit)
+
+
+_RegionPixels = tuple[IntArray, IntArray, IntArray, FloatArray, BoolArray]
+"""Attributes `owner`, `column`, `row` and `light` of `BrightRegions`, and a mask of truncated regions."""
+
+
+def _region_pixels_numpy(
+    pixel: IntArray, number: IntArray, rank: IntArray, signal: Float32Array, shape: tuple[int, int]
+) -> _RegionPixels:
+    """Return the pixels of the chosen regions; the border of the frame truncates the regions of the mask.
+
+    The arguments are the flat index and the region of each bright pixel (p,), the place of each of n regions
+    among the chosen regions, or -1, and the counts and the shape of the frame.
+    """
+    rows, columns = shape
+    kept = np.flatnonzero(rank[number] >= 0)
+    owner, chosen = rank[number[kept]], pixel[kept]
+    row, column = np.divmod(chosen, columns)
+    edge = (row < _BORDER) | (row >= rows - _BORDER) | (column < _BORDER) | (column >= columns - _BORDER)
+    cut = np.bincount(owner, edge.astype(float), len(rank)) > 0.0
+    return owner, column, row, np.maximum(signal[chosen], 0.0).astype(np.float64), cut
+
+
+@compiled_form_of(_region_pixels_numpy)
+def _region_pixels(
+    pixel: IntArray, number: IntArray, rank: IntArray, signal: Float32Array, shape: tuple[int, int]
+) -> _RegionPixels:
+    (rows, columns), places, count = shape, np.empty((3, len(pixel)), np.int64), 0
+    light, cut = np.empty(len(pixel)), np.zeros(len(rank), np.bool_)
+    owner, column, row = places[0], places[1], places[2]
+    for p in range(len(pixel)):
+        region = rank[number[p]]
+        if region >= 0:
+            y = pixel[p] // columns
+            x = pixel[p] - y * columns
+            owner[count], column[count], row[count] = region, x, y
+            light[count] = max(float(signal[pixel[p]]), 0.0)
+            count += 1
+            cut[region] |= min(x, y, columns - 1 - x, rows - 1 - y) < _BORDER
+    return owner[:count].copy(), column[:count].copy(), row[:count].copy(), light[:count].copy(), cut
 
 
 def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:

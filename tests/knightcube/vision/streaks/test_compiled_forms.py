@@ -30,9 +30,11 @@ from tests.support.compiled_forms import assert_forms_agree
 
 _FUNCTIONS = (
     (fit_windows, "_select_pixels", 1e-9),
+    (fit_windows, "_kept_pixels", 1e-9),
     (fit_windows, "_numbered", 1e-9),
     (fit_windows, "_frame_values", 1e-6),
     (streak_frame, "_significant", 1e-9),
+    (streak_frame, "_region_pixels", 1e-9),
     (first_guess, "_arcs", 1e-7),
     (first_guess, "_best_boxes", 1e-9),
     (joint_fit, "_band_means", 1e-6),
