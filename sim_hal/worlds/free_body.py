@@ -38,6 +38,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY
 from knightcube.astro.inertia import inertia_problem, principal_axes
+from knightcube.compiled import compiled_floats, loop_helper
 from sim_hal.clock import NEVER
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
 from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, TipOff
@@ -81,50 +82,81 @@ class Rotation:
 
         The magnetic field changes from `begin` to `end` (3,), T, inertial axes.
         """
-        middle = 0.5 * (begin[0] + end[0]), 0.5 * (begin[1] + end[1]), 0.5 * (begin[2] + end[2])
-        half = 0.5 * dt
-        first = self._slope(state, begin, loads)
-        second = self._slope(_moved(state, first, half), middle, loads)
-        third = self._slope(_moved(state, second, half), middle, loads)
-        a1, a2, a3, a4, a5, a6, a7 = self._slope(_moved(state, third, dt), end, loads)
-        b1, b2, b3, b4, b5, b6, b7 = first
-        c1, c2, c3, c4, c5, c6, c7 = second
-        d1, d2, d3, d4, d5, d6, d7 = third
-        q1, q2, q3, q4, w1, w2, w3 = state
-        sixth = dt / 6.0
-        q1 += sixth * (a1 + 2.0 * (c1 + d1) + b1)
-        q2 += sixth * (a2 + 2.0 * (c2 + d2) + b2)
-        q3 += sixth * (a3 + 2.0 * (c3 + d3) + b3)
-        q4 += sixth * (a4 + 2.0 * (c4 + d4) + b4)
-        w1 += sixth * (a5 + 2.0 * (c5 + d5) + b5)
-        w2 += sixth * (a6 + 2.0 * (c6 + d6) + b6)
-        w3 += sixth * (a7 + 2.0 * (c7 + d7) + b7)
-        unit = 1.0 / math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4)
-        return q1 * unit, q2 * unit, q3 * unit, q4 * unit, w1, w2, w3
-
-    def _slope(self, state: State, field: Floats, loads: Loads) -> State:
-        """Return the time derivative of the state in a magnetic field (3,), T, inertial axes."""
-        q1, q2, q3, q4, w1, w2, w3 = state
-        (mx, my, mz), pull, (tx, ty, tz) = loads
-        a11, a12, a13, a21, a22, a23, a31, a32, a33 = matrix(q1, q2, q3, q4)
-        x, y, z = field
-        bx, by, bz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
-        x, y, z = pull
-        gx, gy, gz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
-        i1, i2, i3 = self._of_torques
-        k1, k2, k3 = self._of_rates
-        # Gravity-gradient and gyroscopic torques have the same factors: differences of principal moments.
-        return (
-            0.5 * (w3 * q2 - w2 * q3 + w1 * q4),
-            0.5 * (w1 * q3 - w3 * q1 + w2 * q4),
-            0.5 * (w2 * q1 - w1 * q2 + w3 * q4),
-            -0.5 * (w1 * q1 + w2 * q2 + w3 * q3),
-            k1 * (w2 * w3 - gy * gz) + i1 * (tx + my * bz - mz * by),
-            k2 * (w3 * w1 - gz * gx) + i2 * (ty + mz * bx - mx * bz),
-            k3 * (w1 * w2 - gx * gy) + i3 * (tz + mx * by - my * bx),
-        )
+        return _stepped(state, dt, begin, end, *loads, self._of_rates, self._of_torques)
 
 
+@compiled_floats
+def _stepped(
+    state: State,
+    dt: float,
+    begin: Floats,
+    end: Floats,
+    dipole: Floats,
+    pull: Floats,
+    torque: Floats,
+    of_rates: Floats,
+    of_torques: Floats,
+) -> State:
+    """Return the state of `Rotation.step`.
+
+    The factors `of_rates` and `of_torques` (1/(kg m^2)) map products of rates, and torques, to accelerations.
+    """
+    middle = (0.5 * (begin[0] + end[0]), 0.5 * (begin[1] + end[1]), 0.5 * (begin[2] + end[2]))
+    half = 0.5 * dt
+    first = _slope(state, begin, dipole, pull, torque, of_rates, of_torques)
+    second = _slope(_moved(state, first, half), middle, dipole, pull, torque, of_rates, of_torques)
+    third = _slope(_moved(state, second, half), middle, dipole, pull, torque, of_rates, of_torques)
+    fourth = _slope(_moved(state, third, dt), end, dipole, pull, torque, of_rates, of_torques)
+    a1, a2, a3, a4, a5, a6, a7 = fourth
+    b1, b2, b3, b4, b5, b6, b7 = first
+    c1, c2, c3, c4, c5, c6, c7 = second
+    d1, d2, d3, d4, d5, d6, d7 = third
+    q1, q2, q3, q4, w1, w2, w3 = state
+    sixth = dt / 6.0
+    q1 += sixth * (a1 + 2.0 * (c1 + d1) + b1)
+    q2 += sixth * (a2 + 2.0 * (c2 + d2) + b2)
+    q3 += sixth * (a3 + 2.0 * (c3 + d3) + b3)
+    q4 += sixth * (a4 + 2.0 * (c4 + d4) + b4)
+    w1 += sixth * (a5 + 2.0 * (c5 + d5) + b5)
+    w2 += sixth * (a6 + 2.0 * (c6 + d6) + b6)
+    w3 += sixth * (a7 + 2.0 * (c7 + d7) + b7)
+    unit = 1.0 / math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + q4 * q4)
+    return q1 * unit, q2 * unit, q3 * unit, q4 * unit, w1, w2, w3
+
+
+@loop_helper
+def _slope(
+    state: State,
+    field: Floats,
+    dipole: Floats,
+    pull: Floats,
+    torque: Floats,
+    of_rates: Floats,
+    of_torques: Floats,
+) -> State:
+    """Return the time derivative of the state in a magnetic field (3,), T, inertial axes."""
+    q1, q2, q3, q4, w1, w2, w3 = state
+    (mx, my, mz), (tx, ty, tz) = dipole, torque
+    a11, a12, a13, a21, a22, a23, a31, a32, a33 = matrix(q1, q2, q3, q4)
+    x, y, z = field
+    bx, by, bz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
+    x, y, z = pull
+    gx, gy, gz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
+    i1, i2, i3 = of_torques
+    k1, k2, k3 = of_rates
+    # Gravity-gradient and gyroscopic torques have the same factors: differences of principal moments.
+    return (
+        0.5 * (w3 * q2 - w2 * q3 + w1 * q4),
+        0.5 * (w1 * q3 - w3 * q1 + w2 * q4),
+        0.5 * (w2 * q1 - w1 * q2 + w3 * q4),
+        -0.5 * (w1 * q1 + w2 * q2 + w3 * q3),
+        k1 * (w2 * w3 - gy * gz) + i1 * (tx + my * bz - mz * by),
+        k2 * (w3 * w1 - gz * gx) + i2 * (ty + mz * bx - mx * bz),
+        k3 * (w1 * w2 - gx * gy) + i3 * (tz + mx * by - my * bx),
+    )
+
+
+@loop_helper
 def _moved(state: State, slope: State, dt: float) -> State:
     """Return `state` + `dt` * `slope`."""
     q1, q2, q3, q4, w1, w2, w3 = state
@@ -134,6 +166,7 @@ def _moved(state: State, slope: State, dt: float) -> State:
     )  # fmt: skip
 
 
+@loop_helper
 def matrix(q1: float, q2: float, q3: float, q4: float) -> Matrix:
     """Return the attitude matrix of a quaternion as nine floats, row by row."""
     r11, r22, r33, r44 = q1 * q1, q2 * q2, q3 * q3, q4 * q4

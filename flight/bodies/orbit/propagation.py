@@ -31,7 +31,7 @@ from knightcube.astro.quaternion import (
     skew,
     times,
 )
-from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.compiled import compiled_floats, compiled_form_of, loop_helper
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Measurement, Parameters
@@ -239,12 +239,6 @@ class _Beginning:
     field: Vector
     residual: Vector
 
-    def acceleration(self, rate: Vector, dipole: Vector, field: Vector) -> Vector:
-        """Return the angular acceleration, rad/s^2, at a rate, rad/s, with a dipole, A m^2, in a field, T."""
-        momentum, torque = times(self.inertia, rate), cross(dipole, field)
-        gyroscopic = cross(momentum, rate)
-        return times(self.inverse, added(torque, gyroscopic))
-
 
 class _Motion(NamedTuple):
     """The motion from the beginning of a propagation to its end.
@@ -390,22 +384,60 @@ class EstimatePropagation:
 
 
 def _moved(begun: _Beginning, seconds: float, dipole: FloatArray) -> _Motion:
-    """Return the motion during `seconds` under a dipole (3,), A m^2, by the midpoint rule.
-
-    The code uses plain floats, because for three components numpy takes ten times as long.
-    """
+    """Return the motion during `seconds` under a dipole (3,), A m^2, by the midpoint rule."""
     x, y, z = dipole.tolist()
-    half, rate = 0.5 * seconds, begun.rate
-    whole = added(times(begun.coils, (x, y, z)), begun.residual)
-    first = begun.acceleration(rate, whole, begun.field)
+    one = begun
+    return _Motion(
+        seconds,
+        (x, y, z),
+        *_rotated(seconds, (x, y, z), one.coils, one.residual, one.inertia, one.inverse, one.rate, one.field),
+    )
+
+
+@compiled_floats
+def _rotated(
+    seconds: float,
+    dipole: Vector,
+    coils: Matrix,
+    residual: Vector,
+    inertia: Matrix,
+    inverse: Matrix,
+    rate: Vector,
+    field: Vector,
+) -> tuple[Quaternion, Vector, Vector, Vector]:
+    """Return rotation, rate at the end, middle rate and middle field of a `_Motion`; see `_Beginning`."""
+    half = 0.5 * seconds
+    whole = added(times(coils, dipole), residual)
+    first = _acceleration(inertia, inverse, rate, whole, field)
     middle = _ahead(rate, half, first)
-    field = times(matrix(exponential(*_scaled(half, _ahead(rate, 0.5 * half, first)))), begun.field)
-    second = begun.acceleration(middle, whole, field)
+    a, b, c = _scaled(half, _ahead(rate, 0.5 * half, first))
+    between = times(matrix(exponential(a, b, c)), field)
+    second = _acceleration(inertia, inverse, middle, whole, between)
     after = _ahead(rate, seconds, second)
     a, b, c = cross(rate, after)
     u, v, w = first[0] + 2.0 * second[0], first[1] + 2.0 * second[1], first[2] + 2.0 * second[2]
     mean = _ahead(rate, seconds / 6.0, (u + 0.5 * a, v + 0.5 * b, w + 0.5 * c))
-    return _Motion(seconds, (x, y, z), exponential(*_scaled(seconds, mean)), after, middle, field)
+    a, b, c = _scaled(seconds, mean)
+    return exponential(a, b, c), after, middle, between
+
+
+@loop_helper
+def _acceleration(inertia: Matrix, inverse: Matrix, rate: Vector, dipole: Vector, field: Vector) -> Vector:
+    """Return the angular acceleration, rad/s^2, at a rate, rad/s, with a dipole, A m^2, in a field, T."""
+    gyroscopic = cross(times(inertia, rate), rate)
+    return times(inverse, added(cross(dipole, field), gyroscopic))
+
+
+@loop_helper
+def _ahead(vector: Vector, seconds: float, slope: Vector) -> Vector:
+    """Return `vector` + `seconds` * `slope`."""
+    return vector[0] + seconds * slope[0], vector[1] + seconds * slope[1], vector[2] + seconds * slope[2]
+
+
+@loop_helper
+def _scaled(factor: float, vector: Vector) -> Vector:
+    """Return `factor` * `vector`."""
+    return factor * vector[0], factor * vector[1], factor * vector[2]
 
 
 def _transition(inertia: FloatArray, inverse: FloatArray, moved: _Moved) -> FloatArray:
@@ -513,13 +545,3 @@ def _spread(
                 among += grown[j % 3, k % 3] * (1.0 if j > 2 else seconds**2 / 3.0)
             spread[placed[j], placed[k]] = among
     return spread
-
-
-def _ahead(vector: Vector, seconds: float, slope: Vector) -> Vector:
-    """Return `vector` + `seconds` * `slope`."""
-    return vector[0] + seconds * slope[0], vector[1] + seconds * slope[1], vector[2] + seconds * slope[2]
-
-
-def _scaled(factor: float, vector: Vector) -> Vector:
-    """Return `factor` * `vector`."""
-    return factor * vector[0], factor * vector[1], factor * vector[2]

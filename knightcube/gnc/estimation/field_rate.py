@@ -24,6 +24,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import (
+    Matrix,
     Quaternion,
     Vector,
     added,
@@ -35,6 +36,7 @@ from knightcube.astro.quaternion import (
     skew,
     times,
 )
+from knightcube.compiled import compiled_floats, loop_helper
 from knightcube.gnc.estimation.error_state import Weighed, updated, weigh
 from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 
@@ -331,18 +333,16 @@ class FieldRate:
     def _step(self, dipole: Vector, dt: float) -> None:
         """Propagate the state by one step of the midpoint rule."""
         assert self._rate is not None
-        rate, field, change = self._rate, self._field, self._change
-        acceleration = self._acceleration(rate, field, dipole)
-        middle = _moved(rate, acceleration, 0.5 * dt)
-        half = _moved(field, _difference(change, cross(rate, field)), 0.5 * dt)
-        acceleration = self._acceleration(middle, half, dipole)
-        rotated = exponential(dt * middle[0], dt * middle[1], dt * middle[2])
-        rotation = matrix(rotated)
-        self._rate = _moved(rate, acceleration, dt)
-        # The field is rotated exactly, because the midpoint rule would change its strength within an hour.
-        self._field = _moved(times(rotation, field), times(rotation, change), dt)
-        self._change = times(rotation, change)
-        self._rotation = compose(rotated, self._rotation)
+        self._rate, self._field, self._change, self._rotation = _stepped(
+            self._rate,
+            self._field,
+            self._change,
+            self._rotation,
+            dipole,
+            self._inertia_rows,
+            self._inverse_rows,
+            dt,
+        )
 
     def _propagate_covariance(self) -> None:
         """Propagate the covariance to the time of the state, linearised at the middle of the interval."""
@@ -371,10 +371,6 @@ class FieldRate:
         walks[INERTIA] += dt * settings.inertia_walk**2
         self._covariance = covariance
 
-    def _acceleration(self, rate: Vector, field: Vector, dipole: Vector) -> Vector:
-        momentum = times(self._inertia_rows, rate)
-        return times(self._inverse_rows, _difference(cross(dipole, field), cross(rate, momentum)))
-
     def _flow(self, rate: Vector, field: Vector, change: Vector, dipole: Vector, dt: float) -> FloatArray:
         """Return the linearised change (15, 15) of the states during `dt`."""
         cross_rate = np.array(skew(rate))
@@ -394,10 +390,41 @@ class FieldRate:
         return np.asarray(dt * flow)
 
 
+@compiled_floats
+def _stepped(
+    rate: Vector,
+    field: Vector,
+    change: Vector,
+    rotation: Quaternion,
+    dipole: Vector,
+    inertia: Matrix,
+    inverse: Matrix,
+    dt: float,
+) -> tuple[Vector, Vector, Vector, Quaternion]:
+    """Return the rate, the field, its derivative and the rotation after a step of the midpoint rule."""
+    acceleration = _acceleration(inertia, inverse, rate, field, dipole)
+    middle = _moved(rate, acceleration, 0.5 * dt)
+    half = _moved(field, _difference(change, cross(rate, field)), 0.5 * dt)
+    acceleration = _acceleration(inertia, inverse, middle, half, dipole)
+    rotated = exponential(dt * middle[0], dt * middle[1], dt * middle[2])
+    turn = matrix(rotated)
+    # The field is rotated exactly, because the midpoint rule would change its strength within an hour.
+    after = _moved(times(turn, field), times(turn, change), dt)
+    return _moved(rate, acceleration, dt), after, times(turn, change), compose(rotated, rotation)
+
+
+@loop_helper
+def _acceleration(inertia: Matrix, inverse: Matrix, rate: Vector, field: Vector, dipole: Vector) -> Vector:
+    momentum = times(inertia, rate)
+    return times(inverse, _difference(cross(dipole, field), cross(rate, momentum)))
+
+
+@loop_helper
 def _moved(v: Vector, change: Vector, dt: float) -> Vector:
     return v[0] + dt * change[0], v[1] + dt * change[1], v[2] + dt * change[2]
 
 
+@loop_helper
 def _difference(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 

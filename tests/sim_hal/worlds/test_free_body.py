@@ -25,12 +25,14 @@ from sim_hal.worlds.free_body import (
     Loads,
     Rotation,
     State,
+    _stepped,
     box,
     build,
     built_craft,
     craft_model,
 )
 from sim_hal.worlds.world import World, WorldInputs, make_world
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.flights import demo_config, demo_world
 from tests.support.pointing_settings import WEIGHTS
 
@@ -284,6 +286,13 @@ def test_a_body_at_the_stable_attitude_swings_with_the_known_period() -> None:
             crossings.append(time + dt * state[1] / (state[1] - after[1]))
         state, time = after, time + dt
     assert crossings[2] - crossings[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_compiled_step_equals_the_plain_step() -> None:
+    state, field, ahead = (0.1, 0.2, 0.3, 0.9, 0.1, 0.12, -0.05), (2e-5, 1e-5, 3e-5), (2e-5, 2e-5, 3e-5)
+    loads = (0.01, -0.02, 0.03), (1e-3, -8e-4, 1e-3), (1e-8, 2e-8, -1e-8)
+    factors = (0.05, -0.1, 0.04), (900.0, 950.0, 1000.0)
+    assert_forms_agree(_stepped, state, 0.025, field, ahead, *loads, *factors, relative=1e-14)
 
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"

@@ -82,3 +82,12 @@ def test_compiled_and_interpreted_covariances_of_a_propagated_estimate_agree() -
     noise = 1e-3 * np.eye(3)
     inverse = np.linalg.inv(inertia)
     assert_forms_agree(propagation._spread, root @ root.T, inertia, inverse, moved, noise, *layout)
+
+
+def test_the_compiled_motion_of_a_propagated_estimate_equals_the_plain_motion() -> None:
+    inertia = ((1.1e-3, 1e-5, 0.0), (1e-5, 1.05e-3, 2e-5), (0.0, 2e-5, 0.99e-3))
+    inverse = ((910.0, -9.0, 0.2), (-9.0, 950.0, -19.0), (0.2, -19.0, 1010.0))
+    coils = ((1.0, 0.01, 0.0), (0.02, 0.98, 0.0), (0.0, -0.01, 1.02))
+    vectors = (0.1, 0.12, -0.05), (1e-5, 2e-5, -3e-5)
+    given = 0.2, (0.01, -0.02, 0.03), coils, (1e-4, -2e-4, 1e-4), inertia, inverse, *vectors
+    assert_forms_agree(propagation._rotated, *given, relative=1e-14)

@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, derivative, from_rotation_vector
 from knightcube.gnc.estimation.field_rate import INERTIA as INERTIA_ERROR
-from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
+from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings, _stepped
+from tests.support.compiled_forms import assert_forms_agree
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
 FIELD, TURN = np.array([1e-5, 2e-5, 3e-5]), np.array([0.0, 1.5e-3, -1.5e-3])
@@ -132,3 +133,10 @@ def test_two_samples_too_far_apart_start_nothing() -> None:
         found.advance(np.zeros(3), 1.0)
         found.measure(FIELD)
     assert not found.started
+
+
+def test_the_compiled_step_equals_the_plain_step() -> None:
+    inertia = ((1.1e-3, 1e-5, 0.0), (1e-5, 1.05e-3, 2e-5), (0.0, 2e-5, 0.99e-3))
+    inverse = ((910.0, -9.0, 0.2), (-9.0, 950.0, -19.0), (0.2, -19.0, 1010.0))
+    state = (0.1, 0.12, -0.05), (1e-5, 2e-5, -3e-5), (1e-8, -2e-8, 1e-8), (0.1, -0.5, 0.1, 0.73**0.5)
+    assert_forms_agree(_stepped, *state, (0.01, -0.02, 0.03), inertia, inverse, 0.025, relative=1e-14)
