@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST
 from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
@@ -318,21 +319,69 @@ def _rotation_sums(
     squares = np.sum(left.weight * left.residual * left.residual, axis=2).reshape(-1)
     scatter = np.bincount(star, squares) / np.maximum(np.bincount(star, used), 1)
     trust = 1.0 / np.maximum(scatter, 1.0)[star]
-    images = left.images[:, [1, 0, 3, 4][:rows]]
     light = scene.light[star]
-    weighted = (images * left.weight[:, None]).transpose(0, 2, 1, 3)
-    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, rows, rows)
-    gram = gram * (trust * light**2)[:, None, None]
-    score = (weighted @ left.residual[..., None]).reshape(-1, rows) * (trust * light)[:, None]
     design = np.stack([across, -along / speed[:, None], -along, along][:rows], axis=1)
     place = np.clip(((time / _RANGE + 1.0) * 0.5 * _FINE_BINS).astype(np.int64), 0, _FINE_BINS - 1)
-    order = np.argsort(place, kind="stable")
-    first = np.searchsorted(place[order], np.arange(_FINE_BINS))
-    of_line = np.einsum("lia,lij,ljb->liajb", design, gram, design, optimize=True)
+    pixels = left.images, left.weight, left.residual
+    information, gradient = _binned_equations(pixels, design, (light, trust, place), _FINE_BINS)
     middles = _RANGE * (2.0 * (np.arange(_FINE_BINS) + 0.5) / _FINE_BINS - 1.0)
-    information = _sums_from(of_line[order], first)
-    gradient = _sums_from((design * score[..., None])[order], first)
     return _RotationSums(middles, information, gradient, camera.pinhole.focal_length)
+
+
+# Images whose products with the residuals determine the rotation, the rate, and the rotations at both ends.
+_ROTATION_IMAGES = (1, 0, 3, 4)
+_Pixels = tuple[Float32Array, Float32Array, Float32Array]
+"""Attributes `images`, `weight` and `residual` of `StreakResiduals`."""
+_LinesInTime = tuple[FloatArray, FloatArray, IntArray]
+"""Flux of the star, weight of the star, and time bin of each line of pixels (l,)."""
+
+
+def _binned_equations_numpy(
+    pixels: _Pixels, design: FloatArray, lines: _LinesInTime, bins: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the information (bins, r, 3, r, 3) and the gradient (bins, r, 3) of `_RotationSums`.
+
+    The matrices `design` (l, r, 3) are the derivatives of each line's r displacements with respect to the
+    three components of a rotation.
+    """
+    (images, weight, residual), (light, trust, place), rows = pixels, lines, design.shape[1]
+    images = images[:, _ROTATION_IMAGES[:rows]]
+    weighted = (images * weight[:, None]).transpose(0, 2, 1, 3)
+    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, rows, rows)
+    gram = gram * (trust * light**2)[:, None, None]
+    score = (weighted @ residual[..., None]).reshape(-1, rows) * (trust * light)[:, None]
+    order = np.argsort(place, kind="stable")
+    first = np.searchsorted(place[order], np.arange(bins))
+    of_line = np.einsum("lia,lij,ljb->liajb", design, gram, design, optimize=True)
+    return _sums_from(of_line[order], first), _sums_from((design * score[..., None])[order], first)
+
+
+@compiled_form_of(_binned_equations_numpy)
+def _binned_equations(
+    pixels: _Pixels, design: FloatArray, lines: _LinesInTime, bins: int
+) -> tuple[FloatArray, FloatArray]:
+    (images, weight, residual), (light, trust, place), rows = pixels, lines, design.shape[1]
+    information, gradient = np.zeros((bins, rows, 3, rows, 3)), np.zeros((bins, rows, 3))
+    count = images.shape[2]
+    for line in range(len(place)):
+        b, of_block, at = line // count, line % count, place[line]
+        for i in range(rows):
+            one, score = _ROTATION_IMAGES[i], 0.0
+            for k in range(images.shape[3]):
+                score += weight[b, of_block, k] * residual[b, of_block, k] * images[b, one, of_block, k]
+            score *= trust[line] * light[line]
+            for c in range(3):
+                gradient[at, i, c] += design[line, i, c] * score
+            for j in range(rows):
+                other, gram = _ROTATION_IMAGES[j], 0.0
+                for k in range(images.shape[3]):
+                    product = images[b, one, of_block, k] * images[b, other, of_block, k]
+                    gram += weight[b, of_block, k] * product
+                gram *= trust[line] * light[line] ** 2
+                for c in range(3):
+                    for d in range(3):
+                        information[at, i, c, j, d] += design[line, i, c] * gram * design[line, j, d]
+    return information, gradient
 
 
 def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:

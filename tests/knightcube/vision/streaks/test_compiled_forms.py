@@ -20,6 +20,7 @@ from knightcube.vision.streaks import (
     joint_fit,
     normal_equations,
     streak_model,
+    vibration,
 )
 from knightcube.vision.streaks import frame as streak_frame
 from knightcube.vision.streaks.estimate import estimate_motion
@@ -47,6 +48,7 @@ _FUNCTIONS = (
     (streak_model, "_mixtures", 1e-9),
     (normal_equations, "_matrices", 1e-12),
     (normal_equations, "_at_pixels", 1e-9),
+    (vibration, "_binned_equations", 1e-5),
     (fit_windows, "_summed", 1e-6),
     (faint_stars, "less_boxes", 2e-6),
     (normal_equations, "solution", 1e-4),
