@@ -698,10 +698,7 @@ def _found_stars(held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: 
     samples. All passes are restricted to the samples with a significant initial response.
     """
     flat = held.light.reshape(-1)
-    place = np.flatnonzero(flat > sigmas * noise.min())
-    deviation = noise[held.count.reshape(-1)[place]] * held.excess[place // held.light.shape[1]]
-    high = flat[place] > sigmas * deviation
-    place, deviation = place[high], deviation[high]
+    place, deviation = _high_places(held.light, held.count, noise, held.excess, float(sigmas))
     left = flat[place].astype(np.float64)
     significance = np.zeros(held.light.shape, dtype=np.float32)
     row, column, height = (np.empty(0) for _ in range(3))
@@ -724,6 +721,37 @@ def _found_stars(held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: 
         _add_responses(responses, place, held.span, held.light.shape, grid.length, stars)
         left = flat[place] - responses
     return row, column, height
+
+
+def _high_places_numpy(
+    light: Float32Array, count: Int32Array, noise: FloatArray, excess: FloatArray, sigmas: float
+) -> tuple[IntArray, FloatArray]:
+    """Return the flat indices (p,) of the running sums above `sigmas` times their noise, and this noise (p,).
+
+    The arguments `light`, `count` and `excess` are attributes of `RunningSums`. The array `noise` contains
+    the noise of a running sum, indexed by its number of samples.
+    """
+    flat = light.reshape(-1)
+    place = np.flatnonzero(flat > sigmas * noise.min())
+    deviation = noise[count.reshape(-1)[place]] * excess[place // light.shape[1]]
+    high = flat[place] > sigmas * deviation
+    return place[high], deviation[high]
+
+
+@compiled_form_of(_high_places_numpy)
+def _high_places(
+    light: Float32Array, count: Int32Array, noise: FloatArray, excess: FloatArray, sigmas: float
+) -> tuple[IntArray, FloatArray]:
+    rows, columns = light.shape
+    place, deviation, found = np.empty(light.size, np.int64), np.empty(light.size), 0
+    lowest = sigmas * noise.min()
+    for row in range(rows):
+        for column in range(columns):
+            if light[row, column] > lowest:
+                own = noise[count[row, column]] * excess[row]
+                place[found], deviation[found] = row * columns + column, own
+                found += light[row, column] > sigmas * own
+    return place[:found].copy(), deviation[:found].copy()
 
 
 def _significance(held: RunningSums, noise: FloatArray, grid: PolarGrid, stars: _Peaks) -> FloatArray:

@@ -502,6 +502,36 @@ def _summed(slot: IntArray, blocks: _Blocks, patches: _Spots, count: int) -> Flo
     return total.astype(np.float32)
 
 
+def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
+    """See `at_pixels`."""
+    _, count, size = images.shape
+    block, place = np.divmod(crowded, size)
+    place += block * (count * size)
+    drawn = np.empty((count - 1, len(place)), dtype=np.float32)
+    for image in drawn:
+        image[:] = images.reshape(-1).take(place)
+        place += size
+    return block, drawn
+
+
+@compiled_form_of(_at_pixels_numpy)
+def at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
+    """Return the blocks (e,) that contain e pixels, and the values (i, e) of i images on these pixels.
+
+    The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
+    the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
+    of the given pixels in an array (b, p).
+    """
+    _, count, size = images.shape
+    block, drawn = np.empty_like(crowded), np.empty((count - 1, len(crowded)), dtype=np.float32)
+    for e in range(len(crowded)):
+        block[e] = crowded[e] // size
+        of_block, place = images[block[e]], crowded[e] - block[e] * size
+        for i in range(count - 1):
+            drawn[i, e] = of_block[i, place]
+    return block, drawn
+
+
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
     """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
 

@@ -27,7 +27,7 @@ from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArra
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows
+from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows, at_pixels
 from knightcube.vision.streaks.frame import MEDIAN_ERROR
 from knightcube.vision.streaks.geometry import Shutter, StreakScene
 
@@ -209,7 +209,7 @@ def _add(
     _sum_products(*sums, weight, flat, (star, matrix), total, pixels, limits)
     out.kept.append((weight > 0.0).reshape(view.inside.shape))
     if len(view.crowded):
-        block, drawn = _at_pixels(flat, view.crowded)
+        block, drawn = at_pixels(flat, view.crowded)
         first = np.flatnonzero(np.diff(block, prepend=-1))
         held = block[first]
         crowded = weight.reshape(-1)[view.crowded]
@@ -372,35 +372,6 @@ def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, 
                 gradient[q] += share * gram[i, images]
                 for r in range(_PARAMETERS):
                     information[q, r] += share * row[r]
-
-
-def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
-    """Return the blocks (e,) that contain e pixels, and the values (i, e) of i images on these pixels.
-
-    The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
-    the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
-    of the given pixels in an array (b, p).
-    """
-    _, count, size = images.shape
-    block, place = np.divmod(crowded, size)
-    place += block * (count * size)
-    drawn = np.empty((count - 1, len(place)), dtype=np.float32)
-    for image in drawn:
-        image[:] = images.reshape(-1).take(place)
-        place += size
-    return block, drawn
-
-
-@compiled_form_of(_at_pixels_numpy)
-def _at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
-    _, count, size = images.shape
-    block, drawn = np.empty_like(crowded), np.empty((count - 1, len(crowded)), dtype=np.float32)
-    for e in range(len(crowded)):
-        block[e] = crowded[e] // size
-        of_block, place = images[block[e]], crowded[e] - block[e] * size
-        for i in range(count - 1):
-            drawn[i, e] = of_block[i, place]
-    return block, drawn
 
 
 def _spot_images(
@@ -844,10 +815,6 @@ def _add_scaled(total: Any, factor: Any, values: Any) -> None:
 
 # Ratio of a star's Fisher information to the largest information of any star below which it is ignored.
 _NOTHING = 1e-9
-# Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.
-_KNOWN = 1e-4
-# Minimum effective number of stars (smaller for unequal weights) for an estimate of their scatter.
-_LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -911,36 +878,3 @@ def consistent_stars(
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
-
-
-def disagreement(change: FloatArray, deviation: FloatArray) -> float:
-    """Return the chi-square per degree of freedom of differences between the stars' estimates (n, k)."""
-    if len(change) < 3:
-        return 1.0
-    weight = deviation**-2
-    total = weight.sum(axis=0)
-    mean = np.sum(weight * change, axis=0) / total
-    # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
-    effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
-    found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # Without excess scatter, the largest of several reduced chi-squares exceeds 1 by one standard deviation.
-    return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
-
-
-def contradiction(alone: StarEquations) -> float:
-    """Return chi-square per degree of freedom of the differences of all stars' estimates from their solution.
-
-    In contrast to `disagreement`, this test uses all combinations of parameters that a star determines, each
-    with the noise of that star.
-    """
-    total = alone.information.sum(axis=0)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
-    information = alone.information * np.outer(scale, scale)
-    step = np.linalg.lstsq(information.sum(axis=0), alone.score.sum(axis=0) * scale, rcond=None)[0]
-    values, vectors = np.linalg.eigh(information)
-    left = np.einsum("nji,nj->ni", vectors, alone.score * scale - information @ step)
-    known = values > _KNOWN * np.maximum(values.max(axis=1, keepdims=True), 1e-300)
-    freedom = int(np.count_nonzero(known)) - len(step)
-    if freedom < 1:
-        return 1.0
-    return float(np.sum(left[known] ** 2 / values[known])) / freedom

@@ -30,8 +30,6 @@ from knightcube.vision.streaks.geometry import (
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, brightest_fit, refit
 from knightcube.vision.streaks.normal_equations import (
     StarEquations,
-    contradiction,
-    disagreement,
     estimates_of,
     rate_covariance,
     star_equations,
@@ -539,9 +537,48 @@ def _lens_effect(
     )
 
 
+# Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.
+_KNOWN = 1e-4
+# Minimum effective number of stars (smaller for unequal weights) for an estimate of their scatter.
+_LEAST_EFFECTIVE = 2.0
+
+
 def _scatter(equations: StarEquations, scene: StreakScene) -> float:
     """Return the ratio of the variance of the stars' scatter to the variance of their noise."""
     return max(disagreement(*estimates_of(equations, scene)), contradiction(equations))
+
+
+def disagreement(change: FloatArray, deviation: FloatArray) -> float:
+    """Return the chi-square per degree of freedom of differences between the stars' estimates (n, k)."""
+    if len(change) < 3:
+        return 1.0
+    weight = deviation**-2
+    total = weight.sum(axis=0)
+    mean = np.sum(weight * change, axis=0) / total
+    # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
+    effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
+    found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
+    # Without excess scatter, the largest of several reduced chi-squares exceeds 1 by one standard deviation.
+    return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
+
+
+def contradiction(alone: StarEquations) -> float:
+    """Return chi-square per degree of freedom of the differences of all stars' estimates from their solution.
+
+    In contrast to `disagreement`, this test uses all combinations of parameters that a star determines, each
+    with the noise of that star.
+    """
+    total = alone.information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+    information = alone.information * np.outer(scale, scale)
+    step = np.linalg.lstsq(information.sum(axis=0), alone.score.sum(axis=0) * scale, rcond=None)[0]
+    values, vectors = np.linalg.eigh(information)
+    left = np.einsum("nji,nj->ni", vectors, alone.score * scale - information @ step)
+    known = values > _KNOWN * np.maximum(values.max(axis=1, keepdims=True), 1e-300)
+    freedom = int(np.count_nonzero(known)) - len(step)
+    if freedom < 1:
+        return 1.0
+    return float(np.sum(left[known] ** 2 / values[known])) / freedom
 
 
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:

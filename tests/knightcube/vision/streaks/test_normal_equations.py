@@ -21,8 +21,6 @@ from knightcube.vision.streaks.normal_equations import (
     Evaluation,
     StarEquations,
     consistent_stars,
-    contradiction,
-    disagreement,
     eliminate,
     estimates_of,
     evaluate,
@@ -36,40 +34,7 @@ from tests.support.compiled_forms import assert_forms_agree
 
 _SIZE = SHARED + ALONE
 
-_STARS = 400
 _KEPT = np.array([0, 1, 2, 6])
-
-
-def _drawn(noise: float, blind: bool = False) -> StarEquations:
-    """Return the normal equations of stars with very different fluxes.
-
-    The errors of the right-hand sides are `noise` times the errors that the equations state. If `blind` is
-    set, each star has no information about two random directions.
-    """
-    rng = np.random.default_rng(3)
-    change = rng.normal(size=(_STARS, 4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (_STARS, 1, 1))
-    change *= np.array([1e3, 1e3, 1e3, 1.0])[:, None]
-    if blind:
-        change = change[:, :, :2]
-    step = np.array([1e-3, -2e-3, 0.0, 0.1])
-    information = change @ change.swapaxes(1, 2)
-    drawn = noise * rng.normal(size=(_STARS, change.shape[2], 1))
-    return StarEquations(_KEPT, information, information @ step + (change @ drawn)[..., 0])
-
-
-@pytest.mark.parametrize("blind", [False, True])
-@pytest.mark.parametrize("noise", [1.0, 3.0])
-def test_the_scatter_of_noise_is_one_per_degree_of_freedom(noise: float, blind: bool) -> None:
-    """The scatter of pure noise is one per degree of freedom.
-
-    The result depends neither on the units of the parameters nor on undetermined directions.
-    """
-    assert contradiction(_drawn(noise, blind)) == pytest.approx(noise**2, rel=0.1)
-
-
-def test_a_single_star_has_no_scatter() -> None:
-    many = _drawn(3.0)
-    assert contradiction(StarEquations(_KEPT, many.information[:1], many.score[:1])) == 1.0
 
 
 def _random_evaluation(stars: int = 5) -> Evaluation:
@@ -432,17 +397,3 @@ def test_the_median_of_the_stars_is_weighted_by_their_accuracy() -> None:
     deviations = np.array([[0.9], [0.9], [0.9], [0.1], [0.1]])
     found = consistent_stars(estimates, deviations, np.zeros(1), 3.0)
     assert found.tolist() == [False, False, False, True, True]
-
-
-def test_the_scatter_of_equally_accurate_stars_is_their_sample_variance() -> None:
-    """The scatter is the variance relative to the noise, reduced by its standard deviation."""
-    values = np.array([-3.0, -2.0, -1.0, -1.0, 0.0, 1.0, 1.0, 2.0, 3.0])
-    change = np.stack([10.0 + values, 0.1 * values], axis=1)
-    deviation = np.full((9, 2), 0.5)
-    expected = np.var(values, ddof=1) / 0.25 / (1.0 + np.sqrt(2.0 / 8.0))
-    assert disagreement(change, deviation) == pytest.approx(expected)
-    assert disagreement(change[:, ::-1], deviation) == pytest.approx(expected)
-    faint = np.append(deviation, [[500.0, 500.0]], axis=0)
-    assert disagreement(np.append(change, [[90.0, 90.0]], axis=0), faint) == pytest.approx(expected, rel=1e-2)
-    assert disagreement(change[:2], deviation[:2]) == 1.0
-    assert disagreement(change[:3], deviation[:3]) != 1.0
