@@ -319,10 +319,8 @@ def _among_blocks(
 def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
     """Return the weights (pixels, blocks) of linear interpolation between block centres along one side."""
     first, share = place_among_blocks(np.arange(pixels, dtype=float), pixels, blocks)
-    weights = np.zeros((pixels, blocks))
-    weights[np.arange(pixels), first] += 1.0 - share
-    weights[np.arange(pixels), np.minimum(first + 1, blocks - 1)] += share
-    return weights
+    # The weight of a block centre decreases linearly to zero at the adjacent centres.
+    return np.maximum(1.0 - np.abs((first + share)[:, None] - np.arange(blocks)), 0.0)
 
 
 _STRETCH = 32_768

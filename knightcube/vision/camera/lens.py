@@ -16,6 +16,7 @@ The class `Exposures` computes the exposure time at which streaks are long enoug
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Protocol, Self
 
@@ -23,6 +24,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
+from knightcube.compiled import compiled_form_of
 from knightcube.errors import FlightError
 
 
@@ -301,30 +303,55 @@ class Lens:
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return the undistorted tangents of distorted tangents (...), or NaN beyond the fold.
-
-        Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
-        that is nearer to the axis. From both initial values, Newton's method overshoots the root at most once
-        and then converges from one side.
-        """
-        k1, k2 = self.k1, self.k2
-        if k1 == k2 == 0.0:
+        """Return the undistorted tangents of distorted tangents (...), or NaN beyond the fold."""
+        if self.k1 == self.k2 == 0.0:
             return stretched
-        seen = stretched < self._limit()
-        # NaN is replaced by 0, because NaN would keep the iteration from converging.
-        target = np.where(seen, stretched, 0.0)
-        inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
-        radius = np.minimum(target, inflection)
-        slope1, slope2 = 3.0 * k1, 5.0 * k2
-        for _ in range(_MOST_STEPS):
-            square = radius * radius
-            value = radius * (1.0 + square * (k1 + square * k2)) - target
-            step = value / (1.0 + square * (slope1 + square * slope2))
-            # A Newton step from the inflection point may lead below zero, but the root is not negative.
-            radius = np.maximum(radius - step, 0.0)
-            if np.vdot(step, step) < _LAST_STEP**2:
-                break
-        return np.where(seen, radius, np.nan)
+        flat = np.ascontiguousarray(stretched).ravel()
+        found = _undistorted(flat, float(self.k1), float(self.k2), float(self._limit()))
+        return found.reshape(stretched.shape)
+
+
+def _undistorted_numpy(stretched: FloatArray, k1: float, k2: float, limit: float) -> FloatArray:
+    """Return the undistorted tangents of distorted tangents (n,), or NaN from `limit` on.
+
+    Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
+    that is nearer to the axis. From both initial values, Newton's method overshoots the root at most once and
+    then converges from one side.
+    """
+    seen = stretched < limit
+    # NaN is replaced by 0, because NaN would keep the iteration from converging.
+    target = np.where(seen, stretched, 0.0)
+    inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
+    radius = np.minimum(target, inflection)
+    slope1, slope2 = 3.0 * k1, 5.0 * k2
+    for _ in range(_MOST_STEPS):
+        square = radius * radius
+        value = radius * (1.0 + square * (k1 + square * k2)) - target
+        step = value / (1.0 + square * (slope1 + square * slope2))
+        # A Newton step from the inflection point may lead below zero, but the root is not negative.
+        radius = np.maximum(radius - step, 0.0)
+        if np.vdot(step, step) < _LAST_STEP**2:
+            break
+    return np.where(seen, radius, np.nan)
+
+
+@compiled_form_of(_undistorted_numpy)
+def _undistorted(stretched: FloatArray, k1: float, k2: float, limit: float) -> FloatArray:
+    """See `_undistorted_numpy`."""
+    out = np.full(len(stretched), np.nan)
+    inflection = math.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
+    for k in range(len(stretched)):
+        if stretched[k] < limit:
+            radius = min(stretched[k], inflection)
+            for _ in range(_MOST_STEPS):
+                square = radius * radius
+                value = radius * (1.0 + square * (k1 + square * k2)) - stretched[k]
+                step = value / (1.0 + square * (3.0 * k1 + square * 5.0 * k2))
+                radius = max(radius - step, 0.0)
+                if step * step < _LAST_STEP**2:
+                    break
+            out[k] = radius
+    return out
 
 
 def _reach(k1: float, k2: float) -> float:

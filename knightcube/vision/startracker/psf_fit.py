@@ -70,6 +70,15 @@ def cut(
     The level (n,) and noise (n,) of the sky in each window are in counts. A pixel with counts of `ceiling` or
     more is saturated and not used. The displacement of each star during the exposure is `trail` (n, 2), px.
     """
+    light, good = _cut(pixels, middle, half, level, float(ceiling))
+    path = np.zeros((len(middle), 2)) if trail is None else trail
+    return StarWindows(middle, half, light, good, noise, path)
+
+
+def _cut_numpy(
+    pixels: Image, middle: IntArray, half: int, level: FloatArray, ceiling: float
+) -> tuple[FloatArray, BoolArray]:
+    """Return the counts above the level in the windows, and the mask of the usable pixels (n, k, k)."""
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)
     column, row = middle[:, :1] + step, middle[:, 1:] + step
@@ -77,8 +86,25 @@ def cut(
     row, column = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
     counts = pixels[row[:, :, None], column[:, None, :]].astype(np.float64)
     light = np.where(good, counts - level[:, None, None], 0.0)
-    path = np.zeros((len(middle), 2)) if trail is None else trail
-    return StarWindows(middle, half, light, good & (counts < ceiling), noise, path)
+    return light, good & (counts < ceiling)
+
+
+@compiled_form_of(_cut_numpy)
+def _cut(
+    pixels: Image, middle: IntArray, half: int, level: FloatArray, ceiling: float
+) -> tuple[FloatArray, BoolArray]:
+    """See `_cut_numpy`."""
+    (rows, columns), size = pixels.shape, 2 * half + 1
+    light = np.zeros((len(middle), size, size))
+    good = np.zeros((len(middle), size, size), dtype=np.bool_)
+    for star in range(len(middle)):
+        left, top = middle[star, 0] - half, middle[star, 1] - half
+        for row in range(max(0, -top), min(size, rows - top)):
+            for column in range(max(0, -left), min(size, columns - left)):
+                counts = float(pixels[top + row, left + column])
+                light[star, row, column] = counts - level[star]
+                good[star, row, column] = counts < ceiling
+    return light, good
 
 
 def smoothed(light: FloatArray) -> FloatArray:
@@ -479,7 +505,7 @@ def _solve(
     jacobian, weight, weighted = np.empty((5, area)), np.empty(area), np.empty(area)
     normal, gradient = np.empty((count, count)), np.empty(count)
     # All passes share their arrays, because an allocation takes as long as the arithmetic of a row.
-    profiles, factor = np.empty((2, 3, size)), np.empty((count + 1, count))
+    profiles, factor = np.empty((2, 3, size + 1)), np.empty((count + 1, count))
     for star in range(stars):
         value, counts, off, expected = values[star], modelled[star], residual[star], variance[star]
         usable, seen = good[star].reshape(area), light[star].reshape(area)
@@ -528,9 +554,9 @@ def _derivatives(
 ) -> None:
     """Write the derivatives (5, k * k) of one star's counts with respect to its parameters `value` (5,).
 
-    The array `profiles` (2, 3, k) is overwritten.
+    The array `profiles` (2, 3, k + 1) is overwritten.
     """
-    (across, down), size = (profiles[0], profiles[1]), profiles.shape[2]
+    (across, down), size = (profiles[0], profiles[1]), profiles.shape[2] - 1
     jacobian[:] = 0.0
     jacobian[SKY] = 1.0
     for node in range(len(share)):
@@ -597,20 +623,39 @@ def _inner(first: FloatArray, second: FloatArray) -> float:
     return total
 
 
+# Spacing of the tabulated edges, and the farthest edge, in standard deviations of the PSF.
+_SPACING, _FARTHEST_EDGE = 1.0 / 32.0, 8.0
+_EDGES = np.arange(-_FARTHEST_EDGE, _FARTHEST_EDGE + 0.5 * _SPACING, _SPACING).tolist()
+_SHARES = np.array([0.5 * math.erfc(-edge * _ROOT_HALF) for edge in _EDGES])
+_BELLS = np.array([_BELL * math.exp(-0.5 * edge * edge) for edge in _EDGES])
+
+
 @loop_helper
 def _profile(offset: float, sigma: float, out: FloatArray) -> None:
-    """Write the three arrays that `profile` returns, for one star, to the rows of `out` (3, k)."""
-    size = out.shape[1]
-    edge = (-0.5 * size - offset) / sigma
-    whole, slope = 0.5 * math.erfc(-edge * _ROOT_HALF), _BELL * math.exp(-0.5 * edge * edge) / sigma
+    """Write the three arrays that `profile` returns, for one star, to `out` (3, k + 1), last column unused.
+
+    The normal distribution and its density are Taylor series about the nearest tabulated edge, because `erfc`
+    and `exp` would take a third of the time of a fit. The error of the series is below 1e-12.
+    """
+    size = out.shape[1] - 1
+    for k in range(size + 1):
+        edge = min(max((k - 0.5 * size - offset) / sigma, -_FARTHEST_EDGE), _FARTHEST_EDGE)
+        place = int((edge + _FARTHEST_EDGE) / _SPACING + 0.5)
+        x = place * _SPACING - _FARTHEST_EDGE
+        off, square, bell = edge - x, x * x, _BELLS[place]
+        # The coefficients of the distribution are Hermite polynomials.
+        fifth = (square * (square - 6.0) + 3.0) / 120.0 - off * x * (square * (square - 10.0) + 15.0) / 720.0
+        third = (square - 1.0) / 6.0 + off * (x * (3.0 - square) / 24.0 + off * fifth)
+        out[0, k] = _SHARES[place] + bell * off * (1.0 + off * (off * third - 0.5 * x))
+        power = -off * (x + 0.5 * off)
+        fourth = 1.0 + power / 5.0 * (1.0 + power / 6.0 * (1.0 + power / 7.0))
+        growth = 1.0 + power * (1.0 + power / 2.0 * (1.0 + power / 3.0 * (1.0 + power / 4.0 * fourth)))
+        out[1, k] = bell * growth / sigma
+        out[2, k] = edge * out[1, k]
     for k in range(size):
-        edge_after = (k + 1 - 0.5 * size - offset) / sigma
-        whole_after = 0.5 * math.erfc(-edge_after * _ROOT_HALF)
-        slope_after = _BELL * math.exp(-0.5 * edge_after * edge_after) / sigma
-        out[0, k] = whole_after - whole
-        out[1, k] = slope - slope_after
-        out[2, k] = edge * slope - edge_after * slope_after
-        edge, whole, slope = edge_after, whole_after, slope_after
+        out[0, k] = out[0, k + 1] - out[0, k]
+        out[1, k] -= out[1, k + 1]
+        out[2, k] -= out[2, k + 1]
 
 
 @loop_helper
@@ -741,9 +786,56 @@ def neighbour_light(
     The stars have middle pixels (n, 2), offsets from the middle (n, 2), px, fluxes (n,), counts, and widths
     (n,), px.
     """
-    size = 2 * windows.half + 1
-    out = np.zeros((len(middle), size, size))
     place = (middle + offset)[pairs.second] - middle[pairs.first]
-    share = light(place, width[pairs.second], windows.half, windows.trail[pairs.second])
-    np.add.at(out, pairs.first, share * np.maximum(flux, 0.0)[pairs.second, None, None])
+    shift, share = zip(*path(windows.trail[pairs.second]), strict=True)
+    counts = np.maximum(flux, 0.0)[pairs.second]
+    given = place, counts, width[pairs.second], np.array(shift), np.array(share)
+    return _summed_light(pairs.first, *given, len(middle), windows.half)
+
+
+def _summed_light_numpy(
+    own: IntArray,
+    place: FloatArray,
+    flux: FloatArray,
+    width: FloatArray,
+    shift: FloatArray,
+    share: FloatArray,
+    count: int,
+    half: int,
+) -> FloatArray:
+    """Return the sums (count, k, k) of the counts of p stars in the windows `own` (p,).
+
+    The stars have the positions `place` (p, 2) relative to the middle of the window, px. The quadrature has m
+    nodes with the displacements `shift` (m, p, 2), px, and the weights `share` (m,).
+    """
+    out = np.zeros((count, 2 * half + 1, 2 * half + 1))
+    for moved, part in zip(shift, share, strict=True):
+        x, y = (place + moved).T
+        across, down = profile(x, width, half)[0], profile(y, width, half)[0]
+        np.add.at(out, own, (part * flux)[:, None, None] * (down[:, :, None] * across[:, None, :]))
+    return out
+
+
+@compiled_form_of(_summed_light_numpy)
+def _summed_light(
+    own: IntArray,
+    place: FloatArray,
+    flux: FloatArray,
+    width: FloatArray,
+    shift: FloatArray,
+    share: FloatArray,
+    count: int,
+    half: int,
+) -> FloatArray:
+    """See `_summed_light_numpy`."""
+    size = 2 * half + 1
+    out, across, down = np.zeros((count, size, size)), np.empty((3, size + 1)), np.empty((3, size + 1))
+    for star in range(len(own)):
+        for node in range(len(share)):
+            _profile(place[star, 0] + shift[node, star, 0], width[star], across)
+            _profile(place[star, 1] + shift[node, star, 1], width[star], down)
+            for row in range(size):
+                counts = share[node] * flux[star] * down[0, row]
+                for column in range(size):
+                    out[own[star], row, column] += counts * across[0, column]
     return out

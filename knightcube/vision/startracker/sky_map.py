@@ -176,7 +176,7 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
 
 # Maximum number of iterations that invert the lens errors, and step (px) below which they end.
 # Each iteration reduces the error to a few per cent.
-_BEND_STEPS, _LEAST_STEP = 8, 1e-9
+_BEND_STEPS, _LEAST_STEP = 8, 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.lens import CameraModel, Exposures, Lens, LensError, Pinhole
+from knightcube.vision.camera.lens import CameraModel, Exposures, Lens, LensError, Pinhole, _undistorted
+from tests.support.compiled_forms import assert_forms_agree
 
 _PINHOLE = Pinhole.from_field_of_view(1024, 768, np.radians(20.0))
 
@@ -228,3 +229,9 @@ def test_points_are_exposed_as_usual_and_the_slowest_streaks_longest() -> None:
     assert EXPOSURES.at(np.radians(0.15)) == EXPOSURES.usual
     assert EXPOSURES.at(np.radians(0.2)) == EXPOSURES.most
     assert EXPOSURES.at(np.radians(90.0)) == EXPOSURES.least
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(-0.3, 0.2), (-0.2, 0.0), (0.4, -0.1), (0.1, 0.2)])
+def test_the_compiled_inversion_of_the_distortion_equals_that_in_numpy(k1: float, k2: float) -> None:
+    tangents = np.append(np.linspace(0.0, 0.9, 40), np.nan)
+    assert_forms_agree(_undistorted, tangents, k1, k2, 0.7)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -377,3 +379,28 @@ def test_the_light_of_neighbours_is_drawn_in_the_window_of_a_star() -> None:
     # If any star moves, the paths of all stars are sampled.
     assert found[1] == pytest.approx(900.0 * light(back, width[:1], 4)[0])
     assert not found[2].any()
+
+
+@pytest.mark.parametrize("sigma", [0.25, 1.1, 6.0])
+def test_the_series_of_the_profile_equals_the_normal_distribution(sigma: float) -> None:
+    for offset in np.linspace(-4.5, 4.5, 19):
+        found = np.empty((3, 10))
+        psf_fit._profile(offset, sigma, found)
+        for one, other in zip(found, profile(np.array([offset]), np.array([sigma]), 4), strict=True):
+            assert one[:-1] == pytest.approx(other[0], abs=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_the_compiled_windows_equal_those_in_numpy(dtype: type[np.number[Any]]) -> None:
+    draw = np.random.default_rng(6)
+    pixels = draw.integers(0, 200, (30, 24)).astype(dtype)
+    middle = np.concatenate([draw.integers(0, 24, (8, 2)), [[0, 0], [23, 29]]])
+    assert_forms_agree(psf_fit._cut, pixels, middle, 4, draw.uniform(0.0, 9.0, 10), 180.0)
+
+
+def test_the_compiled_light_of_neighbours_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(7)
+    place, width = draw.uniform(-6.0, 6.0, (9, 2)), draw.uniform(0.5, 2.0, 9)
+    shift, share = draw.normal(size=(4, 9, 2)), np.array([0.1, 0.4, 0.4, 0.1])
+    own = draw.integers(0, 3, 9)
+    assert_forms_agree(psf_fit._summed_light, own, place, np.arange(9.0), width, shift, share, 3, 4)
