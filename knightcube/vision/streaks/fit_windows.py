@@ -558,10 +558,7 @@ def cut_windows(
     long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
-    pixels, slot, times = _numbered(index, inside, frame.signal.size)
-    shared = times > 1
-    crowded = np.flatnonzero(np.append(shared, False).take(slot))
-    common = (np.cumsum(shared) - 1).take(slot.take(crowded))
+    pixels, slot, crowded, common, shared = _numbered(index, inside, frame.signal.size)
     of_frame = frame.signal, frame.floor, frame.counts, frame.bad
     good, signal, floor, ceiling = _frame_values(index, inside, of_frame, float(frame.top))
     cut, first = strips.index.size, int(np.searchsorted(crowded, strips.index.size))
@@ -574,15 +571,19 @@ def cut_windows(
 
     on_strips = view(strips.index.shape, 0, slice(0, first))
     on_patches = view(patches.index.shape, cut, slice(first, len(crowded)))
-    shares = int(np.count_nonzero(shared))
-    return FitWindows(long, spot, strips, patches, pixels, slot, on_strips, on_patches, shares)
+    return FitWindows(long, spot, strips, patches, pixels, slot, on_strips, on_patches, shared)
 
 
-def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the m distinct fitted pixels, the index of each pixel in this list, and occurrences (m,).
+_Numbered = tuple[IntArray, IntArray, IntArray, IntArray, int]
+"""Attributes `pixels` and `slot` of `FitWindows`, `crowded` and `common` of all blocks, and `shared`."""
+
+
+def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
+    """Return the distinct fitted pixels, the index of each pixel in this list, and the shared pixels.
 
     The pixels are given as flat indices `index` (p,) in a frame of `size` pixels, which contain repeated
-    values if windows overlap. The returned index is m for a pixel that is not `inside`.
+    values if windows overlap. For m distinct pixels, the returned index is m for a pixel that is not
+    `inside`.
     """
     named = index[inside]
     # If a pixel occurs in several windows, `number` keeps the index of the last occurrence.
@@ -595,11 +596,14 @@ def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> tuple[IntA
     place = (np.cumsum(own) - 1).take(last)
     slot = np.full(len(index), len(pixels))
     slot[inside] = place
-    return pixels, slot, np.bincount(place, minlength=len(pixels))
+    several = np.bincount(place, minlength=len(pixels)) > 1
+    crowded = np.flatnonzero(np.append(several, False).take(slot))
+    common = (np.cumsum(several) - 1).take(slot.take(crowded))
+    return pixels, slot, crowded, common, int(np.count_nonzero(several))
 
 
 @compiled_form_of(_numbered_numpy)
-def _numbered(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
+def _numbered(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
     number = np.empty(size, dtype=np.int32)
     for p in range(len(index)):
         if inside[p]:
@@ -610,12 +614,21 @@ def _numbered(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, 
             pixels[count] = index[p]
             count += 1
             number[index[p]] = -count
-    slot, times = np.full(len(index), count), np.zeros(count, dtype=np.int64)
+    slot, times = np.full(len(index), count), np.zeros(count + 1, dtype=np.int64)
     for p in range(len(index)):
         if inside[p]:
             slot[p] = -number[index[p]] - 1
             times[slot[p]] += 1
-    return pixels[:count].copy(), slot, times
+    names, shared = np.empty(count + 1, dtype=np.int64), 0
+    for pixel in range(count):
+        names[pixel] = shared
+        shared += times[pixel] > 1
+    crowded, common, found = np.empty_like(index), np.empty_like(index), 0
+    for p in range(len(index)):
+        if times[slot[p]] > 1:
+            crowded[found], common[found] = p, names[slot[p]]
+            found += 1
+    return pixels[:count].copy(), slot, crowded[:found].copy(), common[:found].copy(), shared
 
 
 _FrameArrays = tuple[Float32Array, Float32Array, Image, BoolArray]

@@ -47,11 +47,15 @@ def test_each_pixel_has_one_number() -> None:
     index = np.array([7, 3, 7, 9, 3, 3, 0, 5])
     inside = np.array([True, True, True, True, True, True, False, True])
     for form in (fit_windows._numbered.numpy_form, fit_windows._numbered.loop_form):
-        pixels, slot, times = form(index, inside, 12)
+        pixels, slot, crowded, common, shared = form(index, inside, 12)
         assert sorted(pixels.tolist()) == [3, 5, 7, 9]
         assert pixels[slot[inside]].tolist() == index[inside].tolist()
         assert slot[6] == 4
-        assert dict(zip(pixels.tolist(), times.tolist(), strict=True)) == {3: 3, 5: 1, 7: 2, 9: 1}
+        # The pixels 3 and 7 belong to several windows.
+        assert shared == 2
+        assert crowded.tolist() == [0, 1, 2, 4, 5]
+        assert sorted(common[:2].tolist()) == [0, 1]
+        assert common.tolist() == [common[1 if value == 3 else 0] for value in index[crowded]]
 
 
 def test_windows_have_the_values_of_the_frame_and_the_pixels_that_stars_share() -> None:
