@@ -578,7 +578,7 @@ class _DistortedPose:
 
     def true(self, direction: FloatArray, corner: float) -> FloatArray:
         """Return observed unit vectors (n, 3) corrected for scale and distortion."""
-        return stretched(direction, self.scale * self.ratio(direction, corner))
+        return _true(np.ascontiguousarray(direction), float(self.scale), float(self.distortion), corner)
 
     def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
         """Return the ratios r (n,) of true to observed tangents.
@@ -591,6 +591,33 @@ class _DistortedPose:
         for _ in range(4):
             ratio -= (ratio * (1.0 + squared * ratio**2) - 1.0) / (1.0 + 3.0 * squared * ratio**2)
         return ratio
+
+
+def _true_numpy(direction: FloatArray, scale: float, distortion: float, corner: float) -> FloatArray:
+    """Return observed unit vectors (n, 3) corrected for scale and distortion."""
+    pose = _DistortedPose(np.eye(3), scale, distortion)
+    return stretched(direction, scale * pose.ratio(direction, corner))
+
+
+@compiled_form_of(_true_numpy)
+def _true(direction: FloatArray, scale: float, distortion: float, corner: float) -> FloatArray:
+    """See `_true_numpy`."""
+    out = np.empty_like(direction)
+    for k in range(len(direction)):
+        x, y, z = direction[k]
+        factor = scale * _ratio(distortion * (x * x + y * y) / (z * z * corner * corner))
+        shrink = 1.0 / math.sqrt(factor * factor + (1.0 - factor * factor) * z * z)
+        out[k, 0], out[k, 1], out[k, 2] = x * factor * shrink, y * factor * shrink, z * shrink
+    return out
+
+
+@loop_helper
+def _ratio(squared: float) -> float:
+    """Return the ratio of true to observed tangent (see `_DistortedPose.ratio`)."""
+    ratio = 1.0
+    for _ in range(4):
+        ratio -= (ratio * (1.0 + squared * ratio * ratio) - 1.0) / (1.0 + 3.0 * squared * ratio * ratio)
+    return ratio
 
 
 def _squared_tangent(direction: FloatArray) -> FloatArray:
@@ -717,11 +744,9 @@ def _write_distorted(
     off: FloatArray,
 ) -> None:
     """Write the residual of one star (3,) to `off`, and its derivatives (3, 5) to `slope`, not weighted."""
-    (x, y, z), ratio = direction, 1.0
+    x, y, z = direction
     tangent = (x * x + y * y) / (z * z * corner * corner)
-    squared = distortion * tangent
-    for _ in range(4):
-        ratio -= (ratio * (1.0 + squared * ratio * ratio) - 1.0) / (1.0 + 3.0 * squared * ratio * ratio)
+    ratio = _ratio(distortion * tangent)
     factor = scale * ratio
     shrink = 1.0 / math.sqrt(factor * factor + (1.0 - factor * factor) * z * z)
     x, y, z = x * factor * shrink, y * factor * shrink, z * shrink

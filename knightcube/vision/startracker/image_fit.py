@@ -119,12 +119,12 @@ def fit_in_image(
     `unknowns` together with the attitude. Raises AttitudeError if the stars do not determine the parameters.
     """
     # The array `slopes` (n, 3, 2) contains the derivatives of the directions with respect to the positions.
-    moved = [
-        camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
-        for offset in _STEP_PX * np.eye(2)
-    ]
-    slopes = np.stack(moved, axis=-1) / (2.0 * _STEP_PX)
-    seen = _Seen(camera.unit_vectors(points), slopes, covariance, reference, unknowns)
+    # All directions are computed in one call, which takes less time than five calls.
+    offsets = _STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    moved = (points + offsets[:, None]).reshape(-1, 2)
+    observed, right, left, down, up = camera.unit_vectors(moved).reshape(5, -1, 3)
+    slopes = np.stack([right - left, down - up], axis=-1) / (2.0 * _STEP_PX)
+    seen = _Seen(observed, slopes, covariance, reference, unknowns)
     pose = seen.fitted(_FittedPose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     if squares.max() > _FARTHEST:

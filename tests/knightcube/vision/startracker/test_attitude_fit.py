@@ -24,6 +24,7 @@ from knightcube.vision.startracker.attitude_fit import (
     StarField,
     _fit_distorted,
     _refined,
+    _true,
     fit_with_distortion,
     inflation,
     refine,
@@ -275,3 +276,4 @@ def test_the_compiled_fit_of_the_distortion_equals_that_in_numpy(distortion: flo
         assert_forms_agree(
             _fit_distorted, seen, reference, weight, np.eye(3), 0.99, distortion, 0.2, relative=1e-6
         )
+        assert_forms_agree(_true, seen, 1.01, distortion, 0.2)
