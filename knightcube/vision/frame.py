@@ -719,7 +719,7 @@ def saturation_count(pixels: Image) -> float:
     """
     highest = pixels.max()
     # A frame with only one value is dead, unless the value is the maximum of its type.
-    if pixels.min() < highest and np.count_nonzero(pixels == highest) >= _PLATEAU:
+    if _PLATEAU <= np.count_nonzero(pixels == highest) < pixels.size:
         return float(highest)
     return saturation_level(pixels, None)
 

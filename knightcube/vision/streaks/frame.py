@@ -8,7 +8,6 @@ excluded.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,7 +111,7 @@ class BrightRegions:
 
 def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> BrightRegions:
     """Return up to `most` of the brightest regions with 3 x 3 sums above `sigmas` standard deviations."""
-    pixel = _significant(frame.sums, frame.floor, float(frame.floor.min()), 3.0 * sigmas)
+    pixel = _significant(frame.sums, frame.floor, 3.0 * sigmas)
     number, count = label_pixels(pixel, frame.shape[1])
     area = np.bincount(number, minlength=count)
     flux = np.bincount(number, np.maximum(frame.signal[pixel], np.float32(0.0)), count)
@@ -168,24 +167,24 @@ def _region_pixels(
     return owner[:count].copy(), column[:count].copy(), row[:count].copy(), light[:count].copy(), cut
 
 
-def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
+def _significant_numpy(sums: Float32Array, floor: Float32Array, threshold: float) -> IntArray:
     """Return the ascending indices of the pixels whose `sums` exceed `threshold` times their noise.
 
-    The noise of a pixel is the square root of its variance `floor`, whose minimum is `least`, counts^2.
+    The noise of a pixel is the square root of its variance `floor`, counts^2.
     """
-    pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(least)))
+    pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(floor.min())))
     return np.asarray(pixel[sums[pixel] > np.float32(threshold) * np.sqrt(floor[pixel])])
 
 
 @compiled_form_of(_significant_numpy)
-def _significant(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
+def _significant(sums: Float32Array, floor: Float32Array, threshold: float) -> IntArray:
     found, count = np.empty(len(sums), dtype=np.int64), 0
-    lowest, square = np.float32(threshold * math.sqrt(least)), threshold * threshold
+    square = threshold * threshold
     # Each index is stored without a branch, because the processor could not predict a branch.
     for pixel in range(len(sums)):
         own = float(sums[pixel])
         found[count] = pixel
-        count += (own > lowest) & (own * own > square * floor[pixel])
+        count += (own > 0.0) & (own * own > square * floor[pixel])
     return found[:count].copy()
 
 
