@@ -453,7 +453,7 @@ class Judge:
         brightness = float(signal.max() / noise)
         reach = self.objects.psf_sigma * (_DIM_SIGMAS + float(np.sqrt(2.0 * np.log(max(brightness, 1.0)))))
         path = star_path(ends.mean(axis=0), self.rotation, self.pinhole)
-        half = path[len(path) // 2] - ends.mean(axis=0)
+        half = path[len(path) // 2] - 0.5 * (path[0] + path[-1])
         count, other = _light_beside(region, signal, ends, half, reach)
         return other >= self.objects.point_significance * noise * float(np.sqrt(count + 1.0))
 
