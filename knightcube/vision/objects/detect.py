@@ -499,12 +499,13 @@ class Judge:
             if self._stars_fill(int(regions.label[index])):
                 continue
             patch = self._patch(index)
-            stars, left = fit_stars(patch, self.rotation, self.pinhole)
-            if patch.excess(left) < self.objects.crossing_improvement:
+            enough = self.objects.crossing_improvement
+            stars, left = fit_stars(patch, self.rotation, self.pinhole, enough)
+            if patch.excess(left) < enough:
                 continue
             found = self._remaining_object(brightest_left(patch, left), stars)
-            enough = self.objects.least_share * float(regions.flux[index]) if stars else 0.0
-            objects += [found] if found is not None and found.flux >= enough else []
+            least = self.objects.least_share * float(regions.flux[index]) if stars else 0.0
+            objects += [found] if found is not None and found.flux >= least else []
         return objects
 
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:

@@ -645,13 +645,18 @@ def _add_scaled(values: FloatArray, factor: float, total: FloatArray) -> None:
         total[k] += factor * values[k]
 
 
-def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
-    """Return the paths (m, 2), px, of the stars in a patch, and the counts (rows, columns) without stars."""
+def fit_stars(
+    patch: Patch, rotation: FloatArray, pinhole: Pinhole, enough: float = -np.inf
+) -> tuple[list[FloatArray], FloatArray]:
+    """Return the paths (m, 2), px, of the stars in a patch, and the counts (rows, columns) without stars.
+
+    No more stars are fitted if the excess of chi-square in the region (`Patch.excess`) is below `enough`.
+    """
     rows, columns = patch.signal.shape
     middles, paths, left = np.empty((0, 2)), np.empty((0, 1, 2)), patch.signal
     centre = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
     steps, factor = _steps_along(star_path(centre, rotation, pinhole) - centre, patch.psf_sigma)
-    while len(middles) < _MOST_STARS:
+    while len(middles) < _MOST_STARS and patch.excess(left) >= enough:
         middle = _brightest_star(patch, left, steps, factor)
         if middle is None:
             break
