@@ -407,13 +407,9 @@ def _end_of_light(gain: FloatArray) -> tuple[float, float]:
     return last, float(np.sqrt(likelihood @ (place - last) ** 2))
 
 
-def _light_along(
+def _light_along_numpy(
     pixels: IntArray, target: FloatArray, weight: FloatArray, curve: FloatArray, psf_sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the brightness (m,), counts/px, along a curve (m, 2), px, and the inverse variances (m,).
-
-    The pixels (p, 2) have the counts `target` (p,) and the reciprocal standard deviations `weight` (p,).
-    """
     width = float(np.sqrt(psf_sigma**2 + 1.0 / 12.0))
     chord = curve[-1] - curve[0]
     along = np.maximum.accumulate((curve - curve[0]) @ chord)
@@ -431,6 +427,41 @@ def _light_along(
     share = np.bincount(near, (weight * profile) ** 2, len(curve))
     light = np.bincount(near, weight**2 * profile * target, len(curve))
     return np.asarray(light / np.maximum(share, 1e-300)), np.asarray(share, dtype=float)
+
+
+@compiled_form_of(_light_along_numpy)
+def _light_along(
+    pixels: IntArray, target: FloatArray, weight: FloatArray, curve: FloatArray, psf_sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the brightness (m,), counts/px, along a curve (m, 2), px, and the inverse variances (m,).
+
+    The pixels (p, 2) have the counts `target` (p,) and the reciprocal standard deviations `weight` (p,).
+    """
+    m, width = len(curve), math.sqrt(psf_sigma**2 + 1.0 / 12.0)
+    x0, y0 = curve[0, 0], curve[0, 1]
+    chord_x, chord_y = curve[m - 1, 0] - x0, curve[m - 1, 1] - y0
+    along, tangent = np.empty(m), np.empty((m, 2))
+    for k in range(m):
+        along[k] = (curve[k, 0] - x0) * chord_x + (curve[k, 1] - y0) * chord_y
+        along[k] = max(along[k], along[max(k - 1, 0)])
+        before, after = max(k - 1, 0), min(k + 1, m - 1)
+        x, y = curve[after, 0] - curve[before, 0], curve[after, 1] - curve[before, 1]
+        size = max(math.hypot(x, y), 1e-300)
+        tangent[k, 0], tangent[k, 1] = x / size, y / size
+    share, light = np.zeros(m), np.zeros(m)
+    places = np.interp((pixels[:, 0] - x0) * chord_x + (pixels[:, 1] - y0) * chord_y, along, np.arange(m))
+    for p in range(len(pixels)):
+        k = min(max(int(np.rint(places[p])), 0), m - 1)
+        ahead = (pixels[p, 0] - curve[k, 0]) * tangent[k, 0] + (pixels[p, 1] - curve[k, 1]) * tangent[k, 1]
+        # The nearest point of a curve that is not straight is found in a second step.
+        k = min(max(k + int(np.rint(ahead)), 0), m - 1)
+        x, y = pixels[p, 0] - curve[k, 0], pixels[p, 1] - curve[k, 1]
+        if abs(x * tangent[k, 0] + y * tangent[k, 1]) <= 1.0:
+            across = (y * tangent[k, 0] - x * tangent[k, 1]) / width
+            profile = math.exp(-0.5 * across * across) / (math.sqrt(2.0 * math.pi) * width)
+            share[k] += (weight[p] * profile) ** 2
+            light[k] += weight[p] ** 2 * profile * target[p]
+    return light / np.maximum(share, 1e-300), share
 
 
 def _pixel_weights(
@@ -779,13 +810,13 @@ def _fit_together(
         # The array `images` (n, 3, p) contains the images of the stars and their derivatives.
         images = streak_images(pixels, paths - patch.corner, patch.psf_sigma, True)
         images *= weight
-        solution = least_squares(images.reshape(-1, len(flat)).T, target, theirs).reshape(-1, 3)
+        solution = least_squares(images.reshape(-1, len(flat)) * theirs, target).reshape(-1, 3)
         flux = np.maximum(solution[:, 0], 1e-9)
         middles = middles + np.clip(solution[:, 1:] / flux[:, None], -_LARGEST_STEP, _LARGEST_STEP)
         paths = _paths_through(middles, rotation, pinhole)
         theirs = target - flux @ images[:, 0] < _NOT_THEIRS
     lights = streak_images(pixels, paths - patch.corner, patch.psf_sigma, False)[:, 0]
-    flux = np.maximum(least_squares((lights * weight).T, target, theirs), 0.0)
+    flux = np.maximum(least_squares(lights * (weight * theirs), target), 0.0)
     left = patch.signal.copy()
     left.reshape(-1)[flat] -= flux @ lights
     return middles, paths, left
@@ -835,7 +866,7 @@ def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
         images = spread_with_slopes(path, np.ones((1, 1)), columns, rows, patch.psf_sigma)
         weight = patch.weight[near] * (images[0] > 1e-3 * images[0].max(initial=0.0))
         shape = np.stack([(image * weight).reshape(-1) for image in images])
-        solution = least_squares(shape.T, (left[near] * weight).reshape(-1))
+        solution = least_squares(shape, (left[near] * weight).reshape(-1))
         if solution[0] <= 0.0:
             break
         step = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP)

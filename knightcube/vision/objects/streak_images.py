@@ -642,16 +642,26 @@ _COVERED = 8.5
 _RIDGE = 1e-6
 
 
-def least_squares(images: FloatArray, target: FloatArray, used: BoolArray | None = None) -> FloatArray:
-    """Return the least-squares coefficients (k,) of `images` (p, k), slightly regularised.
+def least_squares(images: FloatArray, target: FloatArray) -> FloatArray:
+    """Return the least-squares coefficients (k,) of `images` (k, p), slightly regularised."""
+    return solved(np.vstack([images @ images.T, images @ target]))
 
-    Only the rows in the mask `used` (p,) are used, if it is given.
-    """
-    chosen = images.T if used is None else images.T * used
-    normal = chosen @ images
+
+def _solved_numpy(sums: FloatArray) -> FloatArray:
+    normal, right = sums[:-1], sums[-1]
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     normal = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
-    return np.asarray(np.linalg.solve(normal, (chosen @ target) / scale) / scale)
+    return np.asarray(np.linalg.solve(normal, right / scale) / scale)
+
+
+@compiled_form_of(_solved_numpy)
+def solved(sums: FloatArray) -> FloatArray:
+    """Return the solution (k,) of k normal equations, which are regularised by `_RIDGE`.
+
+    The array `sums` (k + 1, k) contains the matrix of the equations and, in its last row, their right-hand
+    side.
+    """
+    return _solved(sums)
 
 
 def _fitted_line_numpy(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float) -> FloatArray:
@@ -660,7 +670,7 @@ def _fitted_line_numpy(light: FloatArray, weight: FloatArray, ends: FloatArray, 
     for _ in range(_FITS):
         pixels, images, axes = line_image(ends, columns, rows, sigma)
         share = weights[pixels]
-        solution = least_squares((images * share).T, lights[pixels] * share)
+        solution = least_squares(images * share, lights[pixels] * share)
         if solution[0] <= 0.0:
             break
         steps = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP).reshape(2, 2)

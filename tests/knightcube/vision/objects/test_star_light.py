@@ -281,6 +281,7 @@ def test_the_brightness_along_a_path_is_its_flux_per_length(bend: float) -> None
     width = np.sqrt(1.0 + 1.0 / 12.0)
     assert even[3:-3].mean() == pytest.approx(9.0 / (2.0 * np.sqrt(np.pi) * width), rel=0.03)
     assert np.all(share >= 0.0)
+    assert_forms_agree(star_light._light_along, pixels, counts, weight, curve, 1.0)
 
 
 def test_the_light_on_a_path_is_zero_outside_the_frame() -> None:

@@ -13,6 +13,7 @@ from knightcube.vision.objects.streak_images import (
     line_image,
     path_among_stars,
     pixels_near,
+    solved,
     spread_over,
     spread_with_slopes,
     star_paths,
@@ -149,3 +150,11 @@ def test_all_forms_fit_the_same_line() -> None:
         assert_forms_agree(
             fitted_line, light.reshape(30, 40), weight.reshape(30, 40), guess, 1.0, relative=1e-6
         )
+
+
+def test_all_forms_solve_regularised_normal_equations() -> None:
+    images = np.random.default_rng(4).normal(size=(3, 20))
+    images = np.concatenate([images, images[:1], np.zeros((1, 20))])
+    sums = np.vstack([images @ images.T, images @ np.arange(20.0)])
+    assert_forms_agree(solved, sums, relative=1e-6)
+    np.testing.assert_allclose(solved(sums)[[1, 4]], [solved(sums[[0, 1, 2, 5]][:, :3])[1], 0.0], rtol=1e-4)
