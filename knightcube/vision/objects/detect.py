@@ -488,10 +488,8 @@ class Judge:
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
-        outside = near_border(regions, self.segmented.signal.shape, _BORDER_PX)
-        chosen = ~np.isin(regions.label, settled) & bright & ~outside
-        indices = np.flatnonzero(chosen)
-        order = np.lexsort((-regions.flux[indices], ~np.isin(regions.label[indices], strange)))
+        indices = np.flatnonzero(~np.isin(regions.label, settled) & bright)
+        order = np.lexsort((-regions.area[indices], ~np.isin(regions.label[indices], strange)))
         objects = []
         order = order[: self.objects.most_merged]
         order = order[~np.isin(regions.label[indices[order]], explained)]
@@ -728,6 +726,7 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
         judged.append(judge.crowd(corners))
         every.append(int(judge.segmented.candidates.label[index]))
         settled += every[-1:] if judged[-1].verdict is Verdict.OBJECT else []
+        strange += every[-1:] if judged[-1].verdict is Verdict.UNCLEAR else []
     explained = [label for label, one in zip(every, judged, strict=True) if judge.explained(one, label)]
     found = [one.candidate for one in judged if one.candidate is not None]
     found += judge.merged(*(np.array(each, dtype=np.int64) for each in (settled, strange, explained)))

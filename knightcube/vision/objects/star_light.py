@@ -56,7 +56,7 @@ _LONGEST_CHAIN = 5.0
 # Largest distance (px) between two paths that count as the same path.
 _SAME_PATH = 0.15
 # Maximum number of iterations, each of which follows the light of an object's streak and fits its ends.
-_ROUNDS = 5
+_ROUNDS = 8
 # Minimum distance (px) to which light is followed beyond each end, in the first and in later iterations.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
 # Difference (px) between assumed and measured end of the light above which the fit uses the measured end.
@@ -240,7 +240,9 @@ class StarLight:
             ends = found.ends
             if change < _LOCATED:
                 break
-            beyond = _BEYOND_LATER if moved.max() < _BEYOND_LATER else beyond
+            # The range stays long while the light may continue beyond its end.
+            ended = moved.max() < _BEYOND_LATER - 2.0 * _FOLLOWED
+            beyond = _BEYOND_LATER if ended else max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         return found
 
     def _path(self, ends: FloatArray, among_stars: bool, parts: FloatArray | None = None) -> FloatArray:
