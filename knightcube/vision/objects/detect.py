@@ -457,21 +457,6 @@ class Judge:
         count, other = _light_beside(region, signal, ends, half, reach)
         return other >= self.objects.point_significance * noise * float(np.sqrt(count + 1.0))
 
-    def _stars_fill(self, label: int) -> bool:
-        """Return whether a few stars near the axis of a region explain all light of the region."""
-        region = self._pixels_of(label)
-        weight = np.maximum(self.segmented.signal[region[:, 1], region[:, 0]], 0.0).astype(np.float64)
-        weight /= weight.sum()
-        centre = weight @ region
-        offset = region - centre
-        ends = line_of(centre, (offset * weight[:, None]).T @ offset, LEAST_LINE_PX)
-        try:
-            light = self._light(ends, per_length=_FEW_PATHS)
-        except FlightError:
-            return False
-        enough = self.objects.crossing_improvement
-        return self._only_stars(light, enough) and light.excess(region) < enough
-
     def _pixels_of(self, label: int) -> IntArray:
         """Return the pixels (x, y) of a region (m, 2), row by row."""
         regions = self.segmented.regions
@@ -480,11 +465,11 @@ class Judge:
     def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
         """Return the objects in regions in which the images of objects and stars may be merged.
 
-        If a few trial stars do not explain all light of a region, stars are fitted to the region. If the
-        fitted stars do not explain all light either, they are subtracted, and the brightest remaining light
-        of the region is tested. Regions whose label is in `settled` are not examined; regions whose label is
-        in `strange` are examined first. Regions whose label is in `explained` contain only stars, and count
-        as examined.
+        Stars are fitted to each region. If the fitted stars do not explain all light, they are subtracted,
+        and the brightest remaining light of the region is tested. Regions at the border of the image are
+        examined too, but the ends of an object lie inside the image. Regions whose label is in `settled` are
+        not examined. Regions whose label is in `strange` are examined first, then the largest. Regions whose
+        label is in `explained` contain only stars, and count as examined.
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
@@ -494,8 +479,6 @@ class Judge:
         order = order[: self.objects.most_merged]
         order = order[~np.isin(regions.label[indices[order]], explained)]
         for index in indices[order].tolist():
-            if self._stars_fill(int(regions.label[index])):
-                continue
             patch = self._patch(index)
             enough = self.objects.crossing_improvement
             stars, left = fit_stars(patch, self.rotation, self.pinhole, enough)

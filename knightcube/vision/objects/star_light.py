@@ -808,7 +808,7 @@ def _fit_together(
     weight = patch.weight.reshape(-1)[flat]
     target = patch.signal.reshape(-1)[flat] * weight
     theirs = np.ones(len(flat), dtype=np.bool_)
-    for _ in range(3):
+    for _ in range(2):
         # The array `images` (n, 3, p) contains the images of the stars and their derivatives.
         images = streak_images(pixels, paths - patch.corner, patch.psf_sigma, True)
         images *= weight
