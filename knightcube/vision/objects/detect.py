@@ -328,7 +328,9 @@ _DIM_SIGMAS = 2.0
 # Minimum distance (px) from the image border of the ends of a streak or region that is inside the image.
 _BORDER_PX = 2
 # Largest standard deviation (px) of the ends of an object's streak.
-_VAGUE_PX = 5.0
+_VAGUE_PX = 3.0
+# Factor of the required decrease of chi-square in regions at the border, whose stars are not seen whole.
+_AT_BORDER = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,13 +468,14 @@ class Judge:
         """Return the objects in regions in which the images of objects and stars may be merged.
 
         Stars are fitted to each region. If the fitted stars do not explain all light, they are subtracted,
-        and the brightest remaining light of the region is tested. Regions at the border of the image are
-        examined too, but the ends of an object lie inside the image. Regions whose label is in `settled` are
-        not examined. Regions whose label is in `strange` are examined first, then the largest. Regions whose
-        label is in `explained` contain only stars, and count as examined.
+        and the brightest remaining light of the region is tested. In regions at the border of the image, an
+        object must decrease chi-square more, and its ends lie inside the image. Regions whose label is in
+        `settled` are not examined. Regions whose label is in `strange` are examined first, then the largest.
+        Regions whose label is in `explained` contain only stars, and count as examined.
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
+        outside = near_border(regions, self.segmented.signal.shape, _BORDER_PX)
         indices = np.flatnonzero(~np.isin(regions.label, settled) & bright)
         order = np.lexsort((-regions.area[indices], ~np.isin(regions.label[indices], strange)))
         objects = []
@@ -480,13 +483,14 @@ class Judge:
         order = order[~np.isin(regions.label[indices[order]], explained)]
         for index in indices[order].tolist():
             patch = self._patch(index)
-            enough = self.objects.crossing_improvement
+            enough = self.objects.crossing_improvement * (_AT_BORDER if outside[index] else 1.0)
             stars, left = fit_stars(patch, self.rotation, self.pinhole, enough)
             if patch.excess(left) < enough:
                 continue
             found = self._remaining_object(brightest_left(patch, left), stars)
             least = self.objects.least_share * float(regions.flux[index]) if stars else 0.0
-            objects += [found] if found is not None and found.flux >= least else []
+            clear = found is not None and found.flux >= least and found.improvement >= enough
+            objects += [found] if found is not None and clear else []
         return objects
 
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:

@@ -321,15 +321,18 @@ def test_overlapping_streaks_of_two_stars_are_not_reported_as_an_object(
     assert {Verdict.STARS, Verdict.UNCLEAR} & set(report.verdicts + report.crowded)
 
 
-def test_an_object_that_crosses_a_star_is_found() -> None:
+@pytest.mark.parametrize("middle", [(270.0, 230.0), (20.0, 230.0)])
+def test_an_object_that_crosses_a_star_is_found(middle: tuple[float, float]) -> None:
+    """An object that crosses a star is found, also if the star's streak leaves the image."""
+    place = _FRAME_CAMERA.pinhole.unit_vectors(np.array([middle]))[0]
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
-    directions = np.concatenate([directions, _PLACE[None]])
+    directions = np.concatenate([directions, place[None]])
     image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 4.0), _ROTATION, 1.0)
-    star = -np.cross(_ROTATION, _PLACE)[:2]
+    star = -np.cross(_ROTATION, place)[:2]
     # In the image, the object moves perpendicularly to the path of the star.
     across = np.arctan2(star[0], -star[1])
     seen = object_path(
-        _FRAME_CAMERA, _PLACE, _ROTATION + motion_across(_PLACE, 60.0 / _FOCAL, across), _ROTATION
+        _FRAME_CAMERA, place, _ROTATION + motion_across(place, 60.0 / _FOCAL, across), _ROTATION
     )
     add_object(image, _FRAME_CAMERA, seen, 3.5, 1.0)
     found = _only(_detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(7)), _ROTATION))
