@@ -726,8 +726,8 @@ def test_a_region_with_many_corners_is_unclear_and_one_with_a_line_may_be_an_obj
     ("first", "sigma", "known"),
     [
         ((60.0, 80.0), 0.5, True),
-        ((60.0, 80.0), 4.9, True),
-        ((60.0, 80.0), 5.1, False),
+        ((60.0, 80.0), 2.9, True),
+        ((60.0, 80.0), 3.1, False),
         ((1.6, 80.0), 0.5, True),
         ((1.4, 80.0), 0.5, False),
         ((60.0, 510.0), 0.5, False),
