@@ -674,13 +674,15 @@ def _strips_and_patches(
     long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
     spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
+    if not len(spot):
+        return long, spot, strips, cut_patches(pinhole, np.empty((0, 2)), int(np.ceil(room)))
     # A square patch of pixels covers the slow part of a streak, or the complete path of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
     sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
     stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
     there = positions(pinhole, scene.motion, stars, sampled.reshape(-1)).reshape(-1, _INSTANTS, 2)
     low, high = there.min(axis=1), there.max(axis=1)
-    half = int(np.ceil(room + 0.5 * float(np.max(high - low, initial=0.0))))
+    half = int(np.ceil(room + 0.5 * float(np.max(high - low))))
     patches = cut_patches(pinhole, 0.5 * (low + high), half)
     strips = _without_patches(strips, long, patches, spot)
     return long, spot, strips, patches
