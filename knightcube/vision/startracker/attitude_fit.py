@@ -76,41 +76,6 @@ class StarField:
         return replace(self, direction=self.direction[chosen], sigma=self.sigma[chosen], magnitude=magnitude)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScaleSteps:
-    """Steps of the image scale, within each of which the side ratios of triangles are nearly constant.
-
-    Attributes:
-        middle: scales (s,), one in each step, at which the side ratios of triangles are computed.
-        lowest, highest: scale limits of each step (s,).
-    """
-
-    middle: FloatArray
-    lowest: FloatArray
-    highest: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.middle)
-
-    @classmethod
-    def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return scale steps; side ratios in a step differ from those at its middle by at most `tolerance`.
-
-        At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
-        / 2 across the radius. The ratio of two sides of a triangle at the field-angle tangent t therefore
-        depends on their directions by up to t^2 / 2. The number of steps is computed for a triangle half-way
-        between the image centre and a corner.
-        """
-        lowest, highest = field.scale
-        half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
-        count = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
-        if count == 1:
-            edges = np.array([math.sqrt(lowest**2), math.sqrt(highest**2)])
-        else:
-            edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
-        return cls(np.sqrt(edges[:-1] * edges[1:]), edges[:-1], edges[1:])
-
-
 class MatchStatus(Enum):
     """The outcome of an identification of stars."""
 

@@ -27,19 +27,17 @@ from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.startracker.attitude_fit import (
     MatchStatus,
-    ScaleSteps,
     StarField,
     StarMatch,
     stretched,
 )
 from knightcube.vision.startracker.index import (
-    CELL,
     CELLS,
     FINE,
     LEAST_RATIO,
+    OCTAVE,
     RUN_BITS,
-    SIZE_BITS,
-    SIZE_UNIT,
+    SIZES,
     SkyIndex,
 )
 from knightcube.vision.startracker.verification import VerificationSettings, nothing, verify_first
@@ -48,9 +46,9 @@ _BRIGHTEST = 12
 _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
-# Limits of the longest side of a medium-sized triangle, relative to the width of the field.
+# Limits of the longest side of a medium-sized and of a larger triangle, relative to the width of the field.
 # Larger triangles are in the index only for bright stars; smaller ones have inaccurate side ratios.
-_MIDDLE_SIZES = 0.3, 0.75
+_MIDDLE_SIZES = 0.2, 0.5, 0.75
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,27 +92,33 @@ def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
     points, or more than `_BRIGHTEST` points of unknown magnitude. A field and its mirror image have the same
     batches.
     """
-    batches = np.split(middle_sized(field, sum(sizes.spread)), np.cumsum(sizes.spread)[:-1])
+    batches = np.split(middle_sized(field, sum(sizes.spread), sizes.spread[0]), np.cumsum(sizes.spread)[:-1])
     if len(field) > (_BRIGHTEST if field.magnitude is None else _MOST_STARS):
         batches[-1] = np.concatenate([batches[-1], neighbours(field)])
     return batches
 
 
-def middle_sized(field: StarField, most: int) -> IntArray:
-    """Return up to `most` medium-sized triangles (t, 3) of the brightest stars, in a random order."""
+def middle_sized(field: StarField, most: int, least: int) -> IntArray:
+    """Return up to `most` medium-sized triangles (t, 3) of the brightest stars, in a random order.
+
+    If fewer than `least` triangles are of medium size, larger triangles follow, up to `least` triangles in
+    total.
+    """
     triangles = triples(min(len(field), _MOST_STARS), shuffled=True)
     direction = field.direction[:_MOST_STARS]
     # The longest side of a triangle connects the two stars with the smallest cosine of their angle.
     cosine = (direction @ direction.T).ravel()
-    shortest, longest = (2.0 * max(field.half_width) * size for size in _MIDDLE_SIZES)
-    found = [triangles[:0]]
+    shortest, medium, longest = (2.0 * max(field.half_width) * size for size in _MIDDLE_SIZES)
+    found, larger = [triangles[:0]], [triangles[:0]]
     while len(triangles) and sum(map(len, found)) < most:
         tried, triangles = triangles[: 2 * most], triangles[2 * most :]
         first, second, third = tried.T
         pairs = np.stack([first, second, third]) * len(direction) + np.stack([second, third, first])
         chord = 2.0 - 2.0 * cosine[pairs].min(axis=0)
-        found.append(tried[(chord >= shortest**2) & (chord <= longest**2)])
-    return np.concatenate(found)[:most]
+        found.append(tried[(chord >= shortest**2) & (chord <= medium**2)])
+        larger.append(tried[(chord > medium**2) & (chord <= longest**2)])
+    count = min(max(sum(map(len, found)), least), most)
+    return np.concatenate(found + larger)[:count]
 
 
 @lru_cache(maxsize=64)
@@ -144,7 +148,19 @@ def neighbours(field: StarField) -> IntArray:
     return np.stack([*np.divmod(pair, len(field)), three], axis=-1)
 
 
-_LARGEST_SIZE = (1 << SIZE_BITS) - 1
+def scale_steps(field: StarField, tolerance: float) -> FloatArray:
+    """Return the limits of s steps of the image scale and the scales in their middles (2 s + 1,), ascending.
+
+    Side ratios in a step differ from the ratios in its middle by at most `tolerance`. At a field angle of
+    tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2 / 2 across the radius.
+    The ratio of two sides of a triangle at the field-angle tangent t therefore depends on their directions by
+    up to t^2 / 2. The number of steps is computed for a triangle half-way between the image centre and a
+    corner.
+    """
+    lowest, highest = field.scale
+    half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
+    steps = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
+    return np.asarray(np.sqrt(np.linspace(lowest**2, highest**2, 2 * steps + 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,15 +170,13 @@ class TriangleMatches:
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint16.
         star: indices of the guide stars at the corresponding corners (k, 3), uint16.
-        scale: factor (k,) on the observed tangents for which both triangles have equal longest sides.
-        code: hash codes (k, 3), uint32, of the three pairs of an observed star and a guide star in each
-            match. In two matches of similar scale, the same pair has the same code.
+        scale: logarithm (k,), int32, in 1 / `OCTAVE` of log 2, of the factor on the observed tangents for
+            which both triangles have equal longest sides.
     """
 
     observed: npt.NDArray[np.uint16]
     star: npt.NDArray[np.uint16]
-    scale: FloatArray
-    code: npt.NDArray[np.uint32]
+    scale: npt.NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.scale)
@@ -176,32 +190,28 @@ class TriangleMatches:
             np.concatenate([part.observed for part in parts]),
             np.concatenate([part.star for part in parts]),
             np.concatenate([part.scale for part in parts]),
-            np.concatenate([part.code for part in parts]),
         )
 
 
-_BINS_PER_LN_SCALE = 15.0
+# Binary logarithm of the number of scales, in the units of `TriangleMatches.scale`, that count as similar.
+_SCALE_BITS = 10
 # Factors of a multiplicative hash. They are below 2^31, so that products fit into 64 bits.
 _OF_STAR, _OF_PAIR, _OF_CODE = 1021, 257, 1_640_531_527
 
 
-def _codes(
-    observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16], scale: FloatArray, lowest: float
-) -> npt.NDArray[np.uint32]:
-    """Return hash codes (k, 3) of the pairs in k matches; equal pairs of similar scale have equal codes."""
-    bins = (np.log(scale / lowest) * _BINS_PER_LN_SCALE).astype(np.uint32)
-    pair = star.astype(np.uint32) * np.uint32(_OF_STAR) + observed
-    return np.asarray((pair * np.uint32(_OF_PAIR) + bins[:, None]) * np.uint32(_OF_CODE))
-
-
-def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
+def _votes(
+    observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16], scale: npt.NDArray[np.int32]
+) -> npt.NDArray[np.intp]:
     """Return the votes (k,) for each of k matches of triangles.
 
     The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
     contain the pair. The votes of a match are the sum of the votes of its three pairs. In rare cases,
-    different pairs have the same first bits of their codes, and their votes are added.
+    different pairs have the same hash value, and their votes are added.
     """
-    bits = max(13, code.size.bit_length())
+    bits = max(13, star.size.bit_length() + 1)
+    similar = ((scale + (1 << _SCALE_BITS - 1)) >> _SCALE_BITS).astype(np.uint32)
+    pair = star.astype(np.uint32) * np.uint32(_OF_STAR) + observed
+    code = (pair * np.uint32(_OF_PAIR) + similar[:, None]) * np.uint32(_OF_CODE)
     slot = code >> np.uint32(32 - bits)
     return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot].sum(axis=1))
 
@@ -209,7 +219,7 @@ def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
 def look_up(
     field: StarField,
     sky: SkyIndex,
-    steps: ScaleSteps,
+    scales: FloatArray,
     triangles: IntArray,
     tolerance: float,
     distortion: float,
@@ -218,13 +228,15 @@ def look_up(
     """Return the matches of observed triangles in the index, and the number of index entries read.
 
     The array `triangles` (t, 3) contains the indices of the observed stars at the corners of each triangle.
-    The tolerance of a side ratio is in standard deviations, with an additional error due to `distortion` of
-    the lens. At most `most` index entries are read, in the order of the observed triangles.
+    The array `scales` contains the limits and middles of scale steps, as `scale_steps` returns them. For a
+    triangle whose side ratios depend little on the scale, successive steps are joined. The tolerance of a
+    side ratio is in standard deviations, with an additional error due to `distortion` of the lens. At most
+    `most` index entries are read, in the order of the observed triangles.
     """
-    observed, star, scale, code, read = _look_up(
+    observed, star, scale, read = _look_up(
         np.ascontiguousarray(field.direction),
         np.ascontiguousarray(field.sigma),
-        np.array([steps.middle, steps.lowest, steps.highest]),
+        scales,
         np.ascontiguousarray(triangles),
         tolerance,
         distortion,
@@ -232,351 +244,357 @@ def look_up(
         most,
         *sky.triangles.table,
     )
-    return TriangleMatches(observed, star, scale, code), read
+    return TriangleMatches(observed, star, scale), read
 
 
-_Matches = tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], FloatArray, npt.NDArray[np.uint32]]
-_Found = tuple[*_Matches, int]
+# Maximum error of a side ratio. Triangles with larger errors are not distinctive.
+_LARGEST_SLACK = 1.0 / 80.0
+_Found = tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], npt.NDArray[np.int32], int]
 
 
 def _look_up_numpy(
     direction: FloatArray,
     sigma: FloatArray,
-    steps: FloatArray,
+    scales: FloatArray,
     triangles: IntArray,
     tolerance: float,
     distortion: float,
     least_ratio: float,
     most: int,
-    key: npt.NDArray[np.uint32],
+    entries: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
-    places: npt.NDArray[np.uint16],
     below: npt.NDArray[np.int32],
     layout: IntArray,
 ) -> _Found:
     """Return the arrays of the `TriangleMatches`, and the number of entries read."""
-    scales = steps[0]
-    corners, sides, left = _forms(direction, triangles, scales)
-    size = np.maximum(sides[:, 2], SIZE_UNIT)
+    number, begin, end = _joined_steps(direction, triangles, scales, distortion)
+    middle = scales[begin + end]
+    corners, sides, left = _forms(direction, triangles[number], middle)
+    size = sides[:, 2]
     spread = np.sqrt(np.mean(sigma[corners] ** 2, axis=1))
-    step = np.tile(np.arange(len(scales)), len(triangles))
     # The error of a side ratio is computed from the errors of two directions and of the longest side.
-    slack = (1.6 * tolerance) * spread * scales[step] / size + distortion
+    slack = (1.6 * tolerance) * spread * middle / size + distortion
     ratio = sides[:, :2] / size[:, None]
-    usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= least_ratio))
-    corners, size, left = corners[usable], size[usable], left[usable]
-    slack, ratio, step = slack[usable], ratio[usable], step[usable]
-    lowest = size * (steps[1] / scales)[step] * (1.0 - slack)
-    highest = size * (steps[2] / scales)[step] * (1.0 + slack)
-    query, short, middle, begin, end = _runs(below, ratio, slack, left, lowest, highest)
+    usable = np.flatnonzero((slack <= _LARGEST_SLACK) & (ratio[:, 0] + slack >= least_ratio))
+    corners, ratio, slack, left = corners[usable], ratio[usable], slack[usable], left[usable]
+    begin, end = begin[usable], end[usable]
+    # The logarithms of the longest sides at scale 1, and of the limits at the limits of the scale.
+    side = np.log2(size[usable] / middle[usable]) * OCTAVE + SIZES
+    lowest = side + (np.log2(scales) * OCTAVE)[2 * begin] - slack * (OCTAVE / math.log(2.0))
+    highest = side + (np.log2(scales) * OCTAVE)[2 * end] + slack * (OCTAVE / math.log(2.0))
+    sizes = np.clip(np.stack([lowest, highest], axis=-1), 0, SIZES - 1).astype(np.int64)
+    places = np.stack([ratio - slack[:, None], ratio + slack[:, None]], axis=-1) * (CELLS * FINE)
+    places = np.clip(places, 0, CELLS * FINE - 1).astype(np.int64)
+    query, cells, begin, end = _runs(below, sizes, places, left)
     # Only the first ranges of index entries are read, with at most `most` entries in total.
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
-    begin, count = begin[:kept], count[:kept]
-    query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
+    begin, count, query, cells = begin[:kept], count[:kept], query[:kept], cells[:kept]
     # Arrays of int32 instead of int64 halve the computing time, of which most is spent on index entries.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
+    columns = np.ascontiguousarray(entries[entry]).view(np.uint8).reshape(-1, 4)
     near = np.ones(len(entry), dtype=np.bool_)
-    place = places[entry].view(np.uint8).reshape(-1, 2)
-    for column, cells in enumerate((short, middle)):
-        lowest_place, width = _places(ratio[query, column], slack[query], cells)
+    for column in range(2):
+        limits = np.clip(places[query, column] - cells[:, column, None] * FINE, 0, FINE - 1).astype(np.uint8)
         # Differences of unsigned bytes wrap around, so that positions below the lowest position are excluded.
-        near &= place[:, column] - np.repeat(lowest_place, count) <= np.repeat(width, count)
+        above = columns[:, 1 - column] - np.repeat(limits[:, 0], count)
+        near &= above <= np.repeat(limits[:, 1] - limits[:, 0], count)
     chosen = np.flatnonzero(near)
     total = len(entry)
     entry = entry[chosen]
     query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
-    longest = (key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+    longest = (entries[entry] >> np.uint32(16)).astype(np.int64)
     # The ranges of index entries also contain triangles that are too small or too large for the scale step.
-    fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
+    fits = np.flatnonzero((longest >= sizes[query, 0]) & (longest <= sizes[query, 1]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
-    scale = longest / size[query] * scales[step[query]]
-    observed, star = corners[query].astype(np.uint16), star_of[entry]
-    return observed, star, scale, _codes(observed, star, scale, steps[1, 0] * (1.0 - CELL)), total
+    scale = np.floor(longest + 0.5 - side[query]).astype(np.int32)
+    return corners[query].astype(np.uint16), star_of[entry], scale, total
 
 
 @compiled_form_of(_look_up_numpy)
 def _look_up(
     direction: FloatArray,
     sigma: FloatArray,
-    steps: FloatArray,
+    scales: FloatArray,
     triangles: IntArray,
     tolerance: float,
     distortion: float,
     least_ratio: float,
     most: int,
-    key: npt.NDArray[np.uint32],
+    entries: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
-    places: npt.NDArray[np.uint16],
     below: npt.NDArray[np.int32],
     layout: IntArray,
 ) -> _Found:
-    cells, unit = layout[0], 1.0 / (1 << layout[2])
-    lowest = steps[1, 0] * (1.0 - 1.0 / cells)
-    seen = _at_scales(direction, steps[0])
-    # If a triangle is sufficiently accurate, at most three cells agree with each of its two side ratios.
-    runs = np.empty((9 * len(triangles) * len(seen), 7), dtype=np.int64)
-    limits = np.empty((len(triangles) * len(seen), 3))
-    corners = np.empty((len(triangles) * len(seen), 3), dtype=np.int64)
-    side = np.empty(3)
-    queries, count, total = 0, 0, 0
+    octave = layout[2]
+    steps = len(scales) // 2
+    limits = np.log2(scales) * octave
+    corners = np.empty((len(triangles) * steps, 3), dtype=np.uint16)
+    longest = np.empty(len(triangles) * steps)
+    runs = np.empty((len(triangles) * steps * _MOST_RUNS, 3), dtype=np.int32)
+    windows = np.empty((len(runs), 2), dtype=np.uint32)
+    side, corner = np.empty(3), np.empty(3, dtype=np.int64)
+    queries, count = 0, 0
     for t in range(len(triangles)):
-        for s in range(len(seen)):
-            left = _sorted_sides(seen[s], triangles[t], side, corners[queries])
-            a, b, c = sigma[corners[queries, 0]], sigma[corners[queries, 1]], sigma[corners[queries, 2]]
-            size = max(side[2], unit)
-            spread = math.sqrt((a * a + b * b + c * c) / 3.0)
-            slack = 1.6 * tolerance * spread * steps[0, s] / size + distortion
-            if not (slack <= 1.0 / cells and side[0] / size + slack >= least_ratio):
+        corner[:] = triangles[t]
+        a, b, c = sigma[corner[0]], sigma[corner[1]], sigma[corner[2]]
+        spread = 1.6 * tolerance * math.sqrt((a * a + b * b + c * c) / 3.0)
+        joined = _joined(direction, scales, distortion, corner, side)
+        for begin in range(0, steps, joined):
+            end = min(begin + joined, steps)
+            middle = scales[begin + end]
+            _sort_sides(direction, middle, corner, side)
+            short, medium = side[0] / side[2], side[1] / side[2]
+            slack = spread * middle / side[2] + distortion
+            if not (slack <= _LARGEST_SLACK and short + slack >= least_ratio):
                 continue
-            limits[queries, 0] = size * (steps[1, s] / steps[0, s]) * (1.0 - slack)
-            limits[queries, 1] = size * (steps[2, s] / steps[0, s]) * (1.0 + slack)
-            limits[queries, 2] = steps[0, s] / size
-            added = _add_runs(
-                left, side[0] / size, side[1] / size, slack, limits[queries], below, layout, runs[count:]
+            longest[queries] = math.log2(side[2] / middle) * octave + layout[1]
+            corners[queries, 0], corners[queries, 1], corners[queries, 2] = corner[0], corner[1], corner[2]
+            margin = slack * (octave / math.log(2.0))
+            lowest = longest[queries] + limits[2 * begin] - margin
+            highest = longest[queries] + limits[2 * end] + margin
+            if highest < layout[4] or lowest > layout[5]:
+                continue
+            left = _is_left(direction, corner)
+            after = count + _add_runs(
+                left, short, medium, slack, lowest, highest, below, layout, runs[count:], windows[count:]
             )
-            for run in range(count, count + added):
-                if total + runs[run, 1] - runs[run, 0] > most:
-                    kept = _matching_entries(runs[:run], total, limits, key, places, layout)
-                    return *_matches(*kept, limits, corners, key, star_of, layout, lowest), total
-                total += runs[run, 1] - runs[run, 0]
-                runs[run, 6] = queries
-            queries, count = queries + 1, count + added
-    kept = _matching_entries(runs[:count], total, limits, key, places, layout)
-    return *_matches(*kept, limits, corners, key, star_of, layout, lowest), total
+            while count < after:
+                runs[count, 2] = queries
+                count += 1
+            queries += 1
+    entry, query, total = _matching_entries(runs[:count], windows, entries, most)
+    return *_matches(entry, query, entries, longest, corners, star_of), total
+
+
+# Maximum number of pairs of cells that contain both side ratios, in up to five cells each.
+_MOST_RUNS = 25
+
+
+@loop_helper
+def _joined(
+    direction: FloatArray, scales: FloatArray, distortion: float, corner: IntArray, side: FloatArray
+) -> int:
+    """Return the number of successive scale steps that `_joined_steps` joins for a triangle."""
+    steps = len(scales) // 2
+    if steps == 1:
+        return 1
+    _sort_sides(direction, scales[0], corner, side)
+    short, medium = side[0] / side[2], side[1] / side[2]
+    _sort_sides(direction, scales[-1], corner, side)
+    change = max(abs(short - side[0] / side[2]), abs(medium - side[1] / side[2]))
+    return int(min(max(2.0 * distortion * steps / max(change, 1e-9), 1.0), float(steps)))
 
 
 @loop_helper
 def _add_runs(
     left: int,
     short: float,
-    middle: float,
+    medium: float,
     slack: float,
-    limits: FloatArray,
+    lowest: float,
+    highest: float,
     below: npt.NDArray[np.int32],
     layout: IntArray,
-    runs: IntArray,
+    runs: npt.NDArray[np.int32],
+    windows: npt.NDArray[np.uint32],
 ) -> int:
-    """Write the ranges of keys that may contain triangles similar to an observed triangle to `runs`.
+    """Write the ranges of entries that may contain triangles similar to an observed triangle.
 
-    Each row of `runs` contains the first index of a range, the index after the last, and the lowest and
-    highest possible positions of both side ratios within their cells. Returns the number of ranges.
+    The first two columns of `runs` are the index of the first entry and the index after the last. The columns
+    of `windows` are two entries that contain the lower and the upper limits of the longest side and of both
+    positions. Returns the number of ranges.
     """
-    cells, fine, size_bits, run_bits = layout
-    sizes = 1 << size_bits
-    first, last = int(min(limits[0] * sizes, sizes - 1.0)), int(min(limits[1] * sizes, sizes - 1.0))
+    cells, sizes, run_bits = layout[0], layout[1], layout[3]
+    width = cells * 256.0
+    first, last = int(min(max(lowest, 0.0), sizes - 1.0)), int(min(max(highest, 0.0), sizes - 1.0))
+    low, high = int(max((short - slack) * width, 0.0)), int(min((short + slack) * width, width - 1.0))
+    lower, upper = int(max((medium - slack) * width, 0.0)), int(min((medium + slack) * width, width - 1.0))
     count = 0
-    for i in range(max(int((short - slack) * cells), 0), min(int((short + slack) * cells), cells - 1) + 1):
-        low, high = _place_limits(short, slack, i, cells, fine)
-        from_cell, to_cell = int((middle - slack) * cells), int((middle + slack) * cells)
-        for j in range(max(from_cell, 0), min(to_cell, cells - 1) + 1):
-            form = ((left * cells + i) * cells + j) << size_bits
-            lower, upper = _place_limits(middle, slack, j, cells, fine)
-            runs[count, 0] = below[(form | first) >> run_bits]
-            runs[count, 1] = below[((form | last) >> run_bits) + 1]
-            runs[count, 2], runs[count, 3], runs[count, 4], runs[count, 5] = low, high, lower, upper
+    for i in range(low >> 8, (high >> 8) + 1):
+        shortest, longest = max(low - (i << 8), 0), min(high - (i << 8), 255)
+        for j in range(lower >> 8, (upper >> 8) + 1):
+            form = ((left * cells + i) * cells + j) * (sizes >> run_bits)
+            runs[count, 0] = below[form + (first >> run_bits)]
+            runs[count, 1] = below[form + (last >> run_bits) + 1]
+            windows[count, 0] = first << 16 | shortest << 8 | max(lower - (j << 8), 0)
+            windows[count, 1] = last << 16 | longest << 8 | min(upper - (j << 8), 255)
             count += 1
     return count
 
 
 @loop_helper
 def _matching_entries(
-    runs: IntArray,
-    total: int,
-    limits: FloatArray,
-    key: npt.NDArray[np.uint32],
-    places: npt.NDArray[np.uint16],
-    layout: IntArray,
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Return the index entries (k,) that match, among the `total` entries in `runs`, and their triangles."""
-    entry, query = np.empty(total + 8, dtype=np.int32), np.empty(total + 8, dtype=np.int32)
-    found, sizes, most = 0, 1 << layout[2], 0
-    for run in range(len(runs)):
-        most = max(most, runs[run, 1] - runs[run, 0])
-    # Eight entries are compared at a time, so that the compiled comparison consists of vector instructions.
-    near = np.zeros(8 * (most // 8 + 1), dtype=np.uint8)
-    eight = near.view(np.uint64)
-    for run in range(len(runs)):
-        begin, end, low, high, lower, upper, triangle = runs[run]
-        if begin == end:
-            continue
-        # All entries of a range are in the same cells.
-        # Entries outside the range are excluded by the length of their longest side.
-        form = np.int64(key[begin]) & ~(sizes - 1)
-        shortest = form + min(math.ceil(limits[triangle, 0] * sizes), sizes - 1)
-        longest = form + min(math.floor(limits[triangle, 1] * sizes), sizes - 1)
-        groups = (end - begin + 7) // 8
-        begin = max(min(begin, len(key) - 8 * groups), 0)
-        lengths = key[begin : begin + 8 * groups]
-        if len(lengths) < 8 * groups:
-            near[:] = 0
-        _mark(
-            near[: len(lengths)],
-            lengths,
-            places[begin : begin + 8 * groups],
-            (np.uint32(shortest), np.uint32(longest)),
-            (np.uint8(low), np.uint8(high)),
-            (np.uint8(lower), np.uint8(upper)),
-        )
-        for group in range(groups):
-            if eight[group]:
-                for k in range(8 * group, 8 * group + 8):
-                    entry[found], query[found] = begin + k, triangle
-                    found += int(near[k])
-    return entry[:found], query[:found]
+    runs: npt.NDArray[np.int32], windows: npt.NDArray[np.uint32], entries: npt.NDArray[np.uint32], most: int
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], int]:
+    """Return the entries (k,) within the windows of ranges, their triangles, and the number of entries read.
+
+    Only the first ranges are read, with at most `most` entries in total.
+    """
+    kept, total = 0, 0
+    while kept < len(runs) and total + runs[kept, 1] - runs[kept, 0] <= most:
+        total += runs[kept, 1] - runs[kept, 0]
+        kept += 1
+    entry, query = np.empty(total + 1, dtype=np.int32), np.empty(total + 1, dtype=np.int32)
+    found, touched = 0, np.uint32(0)
+    for begin in range(0, kept, _RUNS_AHEAD):
+        end = min(begin + _RUNS_AHEAD, kept)
+        # The first loop only loads entries into the cache. The processor loads many entries at the same time.
+        for run in range(begin, end):
+            for k in range(runs[run, 0], runs[run, 1], _CACHE_LINE):
+                touched ^= entries[k]
+        for run in range(begin, end):
+            smallest, low, lower = _fields(windows[run, 0])
+            largest, high, upper = _fields(windows[run, 1])
+            for k in range(runs[run, 0], runs[run, 1]):
+                size, short, medium = _fields(entries[k])
+                fits = (size >= smallest) & (size <= largest)
+                fits &= (short >= low) & (short <= high) & (medium >= lower) & (medium <= upper)
+                entry[found], query[found] = k, runs[run, 2]
+                found += int(fits)
+    # The compiler would omit the first loop if its result were not used.
+    entry[found] = touched & np.uint32(1)
+    return entry[:found], query[:found], total
+
+
+# Number of ranges whose entries are loaded before they are compared, and number of entries in a cache line.
+_RUNS_AHEAD, _CACHE_LINE = 256, 16
 
 
 @loop_helper
-def _mark(
-    near: npt.NDArray[np.uint8],
-    lengths: npt.NDArray[np.uint32],
-    places: npt.NDArray[np.uint16],
-    length: tuple[np.uint32, np.uint32],
-    short: tuple[np.uint8, np.uint8],
-    middle: tuple[np.uint8, np.uint8],
-) -> None:
-    """Write 1 to `near` (k,) for index entries within the limits of key and positions, otherwise 0."""
-    for k in range(len(near)):
-        one, two = np.uint8(places[k] & 0xFF), np.uint8(places[k] >> 8)
-        fits = (lengths[k] >= length[0]) & (lengths[k] <= length[1])
-        fits &= (one >= short[0]) & (one <= short[1]) & (two >= middle[0]) & (two <= middle[1])
-        near[k] = np.uint8(fits)
+def _fields(entry: np.uint32) -> tuple[np.uint32, np.uint32, np.uint32]:
+    """Return the longest side and both positions in an entry of the index."""
+    return entry >> np.uint32(16), entry >> np.uint32(8) & np.uint32(0xFF), entry & np.uint32(0xFF)
 
 
 @loop_helper
 def _matches(
     entry: npt.NDArray[np.int32],
     query: npt.NDArray[np.int32],
-    limits: FloatArray,
-    corners: IntArray,
-    key: npt.NDArray[np.uint32],
+    entries: npt.NDArray[np.uint32],
+    longest: FloatArray,
+    corners: npt.NDArray[np.uint16],
     star_of: npt.NDArray[np.uint16],
-    layout: IntArray,
-    lowest: float,
-) -> _Matches:
-    """Return the arrays of the `TriangleMatches` for k index entries that match the triangles `query`."""
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], npt.NDArray[np.int32]]:
+    """Return the arrays of the `TriangleMatches` for k entries that match the observed triangles `query`."""
     observed, star = np.empty((len(entry), 3), dtype=np.uint16), np.empty((len(entry), 3), dtype=np.uint16)
-    scale, code = np.empty(len(entry)), np.empty((len(entry), 3), dtype=np.uint32)
-    sizes = 1 << layout[2]
+    scale = np.empty(len(entry), dtype=np.int32)
     for k in range(len(entry)):
         one, two = entry[k], query[k]
-        scale[k] = float(np.int64(key[one]) & (sizes - 1)) / sizes * limits[two, 2]
-        part = int(math.log(scale[k] / lowest) * _BINS_PER_LN_SCALE)
+        scale[k] = math.floor(np.int64(entries[one] >> 16) + 0.5 - longest[two])
         for c in range(3):
             observed[k, c], star[k, c] = corners[two, c], star_of[one, c]
-            pair = np.int64(star_of[one, c]) * _OF_STAR + corners[two, c]
-            code[k, c] = ((pair * _OF_PAIR + part) & 0xFFFFFFFF) * _OF_CODE & 0xFFFFFFFF
-    return observed, star, scale, code
+    return observed, star, scale
 
 
 @loop_helper
-def _at_scales(direction: FloatArray, scales: FloatArray) -> FloatArray:
-    """Return unit vectors (s, n, 3) at s scales."""
-    seen = np.empty((len(scales), len(direction), 3))
-    for s in range(len(scales)):
-        for i in range(len(direction)):
-            x, y, z = scales[s] * direction[i, 0], scales[s] * direction[i, 1], direction[i, 2]
-            norm = math.sqrt(x * x + y * y + z * z)
-            seen[s, i, 0], seen[s, i, 1], seen[s, i, 2] = x / norm, y / norm, z / norm
-    return seen
+def _sort_sides(direction: FloatArray, scale: float, corner: IntArray, side: FloatArray) -> None:
+    """Sort the corners of a triangle by the lengths of their opposite sides, and write these to `side`."""
+    i, j, k = corner[0], corner[1], corner[2]
+    squared = scale * scale
+    a = 1.0 / math.sqrt(squared + (1.0 - squared) * direction[i, 2] * direction[i, 2])
+    b = 1.0 / math.sqrt(squared + (1.0 - squared) * direction[j, 2] * direction[j, 2])
+    c = 1.0 / math.sqrt(squared + (1.0 - squared) * direction[k, 2] * direction[k, 2])
+    opposite_i = _cosine(direction[j], direction[k], squared) * b * c
+    opposite_j = _cosine(direction[k], direction[i], squared) * c * a
+    opposite_k = _cosine(direction[i], direction[j], squared) * a * b
+    # The shortest side has the largest cosine.
+    if opposite_i < opposite_j:
+        i, j, opposite_i, opposite_j = j, i, opposite_j, opposite_i
+    if opposite_j < opposite_k:
+        j, k, opposite_j, opposite_k = k, j, opposite_k, opposite_j
+    if opposite_i < opposite_j:
+        i, j, opposite_i, opposite_j = j, i, opposite_j, opposite_i
+    corner[0], corner[1], corner[2] = i, j, k
+    side[0] = math.sqrt(max(2.0 - 2.0 * opposite_i, _TINY))
+    side[1] = math.sqrt(max(2.0 - 2.0 * opposite_j, _TINY))
+    side[2] = math.sqrt(max(2.0 - 2.0 * opposite_k, _TINY))
 
 
 @loop_helper
-def _sorted_sides(seen: FloatArray, triangle: IntArray, side: FloatArray, corner: IntArray) -> int:
-    """Write sorted sides and their opposite corners; return 1 if their orientation is left, otherwise 0."""
-    for c in range(3):
-        one, two = triangle[(c + 1) % 3], triangle[(c + 2) % 3]
-        cosine = seen[one, 0] * seen[two, 0] + seen[one, 1] * seen[two, 1] + seen[one, 2] * seen[two, 2]
-        length = math.sqrt(max(2.0 - 2.0 * cosine, 0.0))
-        at = c
-        while at > 0 and side[at - 1] > length:
-            side[at], corner[at] = side[at - 1], corner[at - 1]
-            at -= 1
-        side[at], corner[at] = length, triangle[c]
+def _cosine(one: FloatArray, two: FloatArray, squared: float) -> float:
+    """Return the scalar product of two directions whose x and y are multiplied by the root of `squared`."""
+    cosine: float = squared * (one[0] * two[0] + one[1] * two[1]) + one[2] * two[2]
+    return cosine
+
+
+# Smallest squared side of an observed triangle; two observed stars may have the same direction.
+_TINY = 1e-18
+
+
+@loop_helper
+def _is_left(direction: FloatArray, corner: IntArray) -> int:
+    """Return 1 if the orientation of the corners is left, otherwise 0."""
     a, b, c = corner[0], corner[1], corner[2]
-    au, av = seen[a, 0] / seen[a, 2], seen[a, 1] / seen[a, 2]
-    bu, bv = seen[b, 0] / seen[b, 2], seen[b, 1] / seen[b, 2]
-    cu, cv = seen[c, 0] / seen[c, 2], seen[c, 1] / seen[c, 2]
-    return 1 if (bu - au) * (cv - av) > (cu - au) * (bv - av) else 0
+    x = direction[b, 1] * direction[c, 2] - direction[b, 2] * direction[c, 1]
+    y = direction[b, 2] * direction[c, 0] - direction[b, 0] * direction[c, 2]
+    z = direction[b, 0] * direction[c, 1] - direction[b, 1] * direction[c, 0]
+    return 1 if direction[a, 0] * x + direction[a, 1] * y + direction[a, 2] * z > 0.0 else 0
 
 
-@loop_helper
-def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) -> tuple[int, int]:
-    """Return the lowest and highest position within a cell that differ from `ratio` by at most `slack`."""
-    wanted = ratio * (cells * fine) - 0.5 - cell * fine
-    reach = slack * (cells * fine) + 0.5
-    lowest = min(max(math.ceil(wanted - reach), 0), fine - 1)
-    return lowest, min(max(math.floor(wanted + reach), lowest), fine - 1)
+def _joined_steps(
+    direction: FloatArray, triangles: IntArray, scales: FloatArray, distortion: float
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return ranges of scale steps in which the side ratios of t triangles are nearly constant.
 
-
-def _places(
-    ratio: FloatArray, slack: FloatArray, cells: IntArray
-) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position in a cell within `slack` of each ratio, and the range of positions."""
-    # Positions within a cell are in units of 1 / FINE of its width, and refer to the middle of a unit.
-    wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
-    reach = slack * (CELLS * FINE) + 0.5
-    lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
-    highest = np.clip(np.floor(wanted + reach), lowest, FINE - 1)
-    return lowest.astype(np.uint8), (highest - lowest).astype(np.uint8)
+    The ratios change by at most 2 `distortion` in a range, except in a single step. For each range, the
+    result contains the number of the triangle, the first step, and the step after the last.
+    """
+    steps = len(scales) // 2
+    if steps == 1:
+        number = np.arange(len(triangles))
+        return number, np.zeros_like(number), np.ones_like(number)
+    first, last = (
+        sides[:, :2] / sides[:, 2:]
+        for _, sides, _ in (_forms(direction, triangles, np.full(len(triangles), s)) for s in scales[[0, -1]])
+    )
+    change = np.maximum(np.abs(last - first).max(axis=1), 1e-9)
+    joined = np.clip(2.0 * distortion * steps / change, 1, steps).astype(np.int64)
+    count = -(-steps // joined)
+    number = np.repeat(np.arange(len(triangles)), count)
+    begin = (np.arange(len(number)) - np.repeat(np.cumsum(count) - count, count)) * joined[number]
+    return number, begin, np.minimum(begin + joined[number], steps)
 
 
 def _forms(
     seen: FloatArray, triangles: IntArray, scales: FloatArray
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return corners and sides (t s, 3) of t triangles at s scales, sorted by side length.
+    """Return corners and sides (t, 3) of triangles (t, 3) at the scales (t,), sorted by side length.
 
-    The third returned value is the orientation of the corners in the image (t s,).
+    The third returned value is the orientation of the corners (t,).
     """
-    x, y, z = seen.T
-    direction = np.empty((len(scales), len(seen), 3))
-    direction[:, :, 0] = scales[:, None] * x
-    direction[:, :, 1] = scales[:, None] * y
-    direction[:, :, 2] = z
-    direction /= np.sqrt(np.einsum("sij,sij->si", direction, direction))[:, :, None]
-    first, second, third = triangles.T
-    one = np.stack([second, third, first], axis=-1)
-    two = np.stack([third, first, second], axis=-1)
-    cosine = (direction @ direction.transpose(0, 2, 1))[:, one, two]
-    sides = np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)).transpose(1, 0, 2).reshape(-1, 3)
-    order = np.argsort(sides, axis=1)
-    rows = np.arange(len(sides))[:, None]
-    corners = np.repeat(triangles, len(scales), axis=0)[rows, order]
-    a, b, c = corners.T
-    u, v = x / z, y / z
-    left = (u[b] - u[a]) * (v[c] - v[a]) > (u[c] - u[a]) * (v[b] - v[a])
-    return corners, sides[rows, order], left
+    direction = seen[triangles] * np.stack([scales, scales, np.ones(len(scales))], axis=-1)[:, None]
+    direction /= np.sqrt(np.einsum("tij,tij->ti", direction, direction))[:, :, None]
+    cosine = np.einsum("tij,tij->ti", direction[:, [1, 2, 0]], direction[:, [2, 0, 1]])
+    squared = np.maximum(2.0 - 2.0 * cosine, _TINY)
+    order = np.argsort(squared, axis=1)
+    rows = np.arange(len(triangles))[:, None]
+    corners = triangles[rows, order]
+    a, b, c = seen[corners].transpose(1, 0, 2)
+    left = np.einsum("ti,ti->t", a, np.cross(b, c)) > 0.0
+    return corners, np.sqrt(squared[rows, order]), left
 
 
 def _runs(
-    below: npt.NDArray[np.int32],
-    ratio: FloatArray,
-    slack: FloatArray,
-    left: BoolArray,
-    lowest: FloatArray,
-    highest: FloatArray,
-) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
-    """Return the ranges of sorted triangle keys that may contain triangles similar to observed triangles.
+    below: npt.NDArray[np.int32], sizes: IntArray, places: IntArray, left: BoolArray
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return the ranges of index entries that may contain triangles similar to observed triangles.
 
-    For each range, the result contains the index of the observed triangle (query), the cells of its two side
-    ratios, the first index in the sorted keys, and the index after the last. Each side ratio of an observed
-    triangle may lie in up to three cells.
+    The longest sides of the observed triangles have the limits `sizes` (t, 2), and their two side ratios have
+    the limits `places` (t, 2, 2), in positions within all cells. For each range, the result contains the
+    index of the observed triangle, the cells (2,) of the two ratios, the first entry, and the entry after the
+    last.
     """
-    low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
-    high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
+    low, high = places[:, :, 0] // FINE, places[:, :, 1] // FINE
     spans = high - low
-    widest = int(spans.max(initial=0)) + 1
-    here = np.arange(widest) <= spans[:, :, None]
+    here = np.arange(int(spans.max(initial=0)) + 1) <= spans[:, :, None]
     # The ranges are sorted by observed triangle, because only the first ranges are read.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
-    short = low[query, 0] + along_short
-    middle = low[query, 1] + along_middle
-    form = ((left[query] * CELLS + short) * CELLS + middle) << SIZE_BITS
-    first = np.minimum(lowest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
-    last = np.minimum(highest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
-    begin, end = below[(form | first) >> RUN_BITS], below[((form | last) >> RUN_BITS) + 1]
-    return query, short, middle, begin, end
+    cells = low[query] + np.stack([along_short, along_middle], axis=-1)
+    form = ((left[query] * CELLS + cells[:, 0]) * CELLS + cells[:, 1]) * (SIZES >> RUN_BITS)
+    first, last = (sizes[query] >> RUN_BITS).T
+    return query, cells, below[form + first], below[form + last + 1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -598,16 +616,16 @@ class IdentificationSettings:
     tolerance: float = 3.0
     distortion: float = 0.0015
     batches: BatchSizes = field(default_factory=BatchSizes)
-    work: int = 600_000
+    work: int = 200_000
     verified: int = 12
     mirror: bool = True
     hint_error: float = 1.25
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor on the tolerance and on the number of verified candidates for triangles that include faint stars.
-# The factor is below 1, because many true triangles vote for the same pairs.
-_OF_SPREAD = 0.6
+# Factors on the tolerance and on the number of verified candidates for triangles that include faint stars.
+# The factors are below 1, because many true triangles vote for the same pairs.
+_TOLERANCE_OF_SPREAD, _VERIFIED_OF_SPREAD = 0.3, 0.6
 # Number of matches with the most votes that are considered for each candidate to be verified.
 _RANKED = 8
 # Factor on the expected number of chance matches for a mirrored field or a scale outside the given range.
@@ -639,31 +657,30 @@ def _search(
     spread_triangles: Callable[[], list[IntArray]],
 ) -> StarMatch:
     """Return the identification of a field, without trying the mirrored field or other scales."""
-    steps = ScaleSteps.of(observed, settings.distortion)
+    scales = scale_steps(observed, settings.distortion)
     found: list[TriangleMatches] = []
     tried = np.empty((0, 2), dtype=np.int64)
     work = 0
-    for triangles, spread in batches_of(observed, settings.batches, len(steps), spread_triangles):
-        share = _OF_SPREAD if spread else 1.0
+    for triangles, spread in batches_of(observed, settings.batches, len(scales) // 2, spread_triangles):
         finds, read = look_up(
             observed,
             sky,
-            steps,
+            scales,
             triangles,
-            share * settings.tolerance,
+            (_TOLERANCE_OF_SPREAD if spread else 1.0) * settings.tolerance,
             settings.distortion,
             settings.work - work,
         )
         if len(finds):
             found.append(finds)
-        most = round(share * settings.verified)
+        most = round((_VERIFIED_OF_SPREAD if spread else 1.0) * settings.verified)
         if found:
             direction, whole = np.ascontiguousarray(observed.direction), TriangleMatches.of(found)
-            matches = whole.observed, whole.star, whole.scale, whole.code
-            matrices, scales, tried = _choose(
-                direction, sky.stars.direction, *matches, tried, most, *observed.scale
+            matches = whole.observed, whole.star, whole.scale
+            matrices, zooms, tried = _choose(
+                direction, sky.stars.direction, *matches, tried, most, *observed.scale, OCTAVE
             )
-            answer = verify_first(observed, sky, matrices, scales, searched, settings.verification)
+            answer = verify_first(observed, sky, matrices, zooms, searched, settings.verification)
             if answer.status is MatchStatus.IDENTIFIED:
                 return answer
         work += read
@@ -680,19 +697,19 @@ def _choose_numpy(
     guide: FloatArray,
     observed: npt.NDArray[np.uint16],
     star: npt.NDArray[np.uint16],
-    scale: FloatArray,
-    code: npt.NDArray[np.uint32],
+    scale: npt.NDArray[np.int32],
     tried: IntArray,
     most: int,
     lowest: float,
     highest: float,
+    octave: int,
 ) -> _Chosen:
     """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
 
     A match is omitted if two of its pairs of an observed star and a guide star are among the pairs `tried`
     (k, 2). The third returned value is the array `tried`, extended by the pairs of the new candidates.
     """
-    votes = _votes(code)
+    votes = _votes(observed, star, scale)
     # There may be a hundred thousand matches, so only the matches with the most votes are sorted.
     count = min(_RANKED * most, len(votes))
     least = np.partition(votes, len(votes) - count)[len(votes) - count]
@@ -707,10 +724,11 @@ def _choose_numpy(
         pairs_tried.update(pairs)
         tried = np.concatenate([tried, pairs])
         # The attitude transforms the guide stars of the match into the observed stars.
-        seen = stretched(direction[observed[find]], float(scale[find]))
+        factor = 2.0 ** (float(scale[find]) / octave)
+        seen = stretched(direction[observed[find]], factor)
         matrices.append(_frame(seen).T @ _frame(guide[star[find]]))
         # The scale from one triangle is inaccurate, so it is limited to the range of possible scales.
-        scales.append(min(max(float(scale[find]), lowest), highest))
+        scales.append(min(max(factor, lowest), highest))
         if len(scales) == most:
             break
     return np.array(matrices).reshape(-1, 3, 3), np.array(scales), tried
@@ -722,14 +740,14 @@ def _choose(
     guide: FloatArray,
     observed: npt.NDArray[np.uint16],
     star: npt.NDArray[np.uint16],
-    scale: FloatArray,
-    code: npt.NDArray[np.uint32],
+    scale: npt.NDArray[np.int32],
     tried: IntArray,
     most: int,
     lowest: float,
     highest: float,
+    octave: int,
 ) -> _Chosen:
-    votes = _counted_votes(code)
+    votes = _counted_votes(observed, star, scale)
     order = _most_voted(votes, min(_RANKED * most, len(votes)))
     pairs = np.empty((len(tried) + 3 * most, 2), dtype=np.int64)
     pairs[: len(tried)] = tried
@@ -739,15 +757,16 @@ def _choose(
     for find in order:
         if _shared_pairs(pairs[:known], observed[find], star[find]) >= 2:
             continue
-        squared = scale[find] * scale[find]
+        factor = 2.0 ** (scale[find] / octave)
+        squared = factor * factor
         for c in range(3):
             one, two = np.int64(observed[find, c]), np.int64(star[find, c])
             pairs[known, 0], pairs[known, 1] = one, two
             known += 1
             z = direction[one, 2]
             shrink = 1.0 / math.sqrt(squared + (1.0 - squared) * z * z)
-            seen[0, c] = direction[one, 0] * scale[find] * shrink
-            seen[1, c] = direction[one, 1] * scale[find] * shrink
+            seen[0, c] = direction[one, 0] * factor * shrink
+            seen[1, c] = direction[one, 1] * factor * shrink
             seen[2, c] = z * shrink
             for axis in range(3):
                 wanted[axis, c] = guide[two, axis]
@@ -759,7 +778,7 @@ def _choose(
                 for axis in range(3):
                     total += seen[row, axis] * wanted[column, axis]
                 matrices[count, row, column] = total
-        scales[count] = min(max(scale[find], lowest), highest)
+        scales[count] = min(max(factor, lowest), highest)
         count += 1
         if count == most:
             break
@@ -779,23 +798,28 @@ def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint16], star: npt.N
 
 
 @loop_helper
-def _counted_votes(code: npt.NDArray[np.uint32]) -> IntArray:
+def _counted_votes(
+    observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16], scale: npt.NDArray[np.int32]
+) -> IntArray:
     """Return the votes (k,) of k matches, as `_votes` does."""
-    bits, size = 0, 3 * len(code)
+    bits, size = 1, 3 * len(star)
     while size:
         size >>= 1
         bits += 1
     bits = max(13, bits)
-    unused = 32 - bits
-    count = np.zeros(1 << bits, dtype=np.int32)
-    for k in range(len(code)):
+    unused, rounded = 32 - bits, 1 << (_SCALE_BITS - 1)
+    count = np.zeros(1 << bits, dtype=np.uint16)
+    slot = np.empty((len(star), 3), dtype=np.uint32)
+    for k in range(len(star)):
+        similar = (np.int64(scale[k]) + rounded) >> _SCALE_BITS
         for c in range(3):
-            count[np.int64(code[k, c]) >> unused] += 1
-    votes = np.empty(len(code), dtype=np.int64)
-    for k in range(len(code)):
-        votes[k] = 0
-        for c in range(3):
-            votes[k] += count[np.int64(code[k, c]) >> unused]
+            pair = np.int64(star[k, c]) * _OF_STAR + np.int64(observed[k, c])
+            code = ((pair * _OF_PAIR + similar) & 0xFFFFFFFF) * _OF_CODE & 0xFFFFFFFF
+            slot[k, c] = code >> unused
+            count[code >> unused] += 1
+    votes = np.empty(len(star), dtype=np.int64)
+    for k in range(len(star)):
+        votes[k] = np.int64(count[slot[k, 0]]) + np.int64(count[slot[k, 1]]) + np.int64(count[slot[k, 2]])
     return votes
 
 

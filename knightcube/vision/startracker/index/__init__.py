@@ -20,11 +20,11 @@ contain about the same number of triangles that are in the index. Near a cluster
 all stars is so short that there would be too few triangles. The sky is therefore also covered by circles of
 several radii, and the triangles of the `few` brightest stars of each circle are added to the index.
 
-The sides of a triangle are chords of the unit sphere. The key of a triangle consists of the orientation (left
-or right) of its corners, ordered by the lengths of the opposite sides, of the ratios of the shortest and of
-the middle side to the longest side, rounded down to multiples of `CELL`, and of the length of the longest
-side. In the sorted list of keys, the triangles with the same orientation, the same rounded side ratios and a
-longest side between two limits are contiguous.
+The sides of a triangle are chords of the unit sphere. The form of a triangle consists of the orientation
+(left or right) of its corners, ordered by the lengths of the opposite sides, and of the cells that contain
+the ratios of the shortest and of the middle side to the longest side. The entry of a triangle consists of its
+longest side and of the positions of both ratios within their cells. An entry has only four bytes, so that it
+is read quickly. Triangles with the same form are contiguous and sorted by their longest sides.
 """
 
 from __future__ import annotations
@@ -201,18 +201,15 @@ def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
             return group
 
 
-CELLS = 80
-CELL = 1.0 / CELLS
-"""Width of the cells (bins) of a triangle's side ratios, which are between 0 and 1."""
+CELLS = 128
+"""Number of cells (bins) into which the range 0 to 1 of a triangle's side ratio is divided."""
 FINE = 256
-SIZE_BITS = 18
-SIZE_UNIT = 2.0**-SIZE_BITS
-"""Quantisation step of the longest side in the key of a triangle.
-
-The longest side is a chord of the unit sphere and is below 1.
-"""
-RUN_BITS = 12
-"""Binary logarithm of the interval between the key values of consecutive entries of `TriangleIndex.below`."""
+"""Number of positions within a cell."""
+SIZES = 1 << 16
+OCTAVE = SIZES // 8
+"""Number of steps of a triangle's longest side per factor of two; `SIZES` steps end at the chord 1."""
+RUN_BITS = 10
+"""Binary logarithm of the number of steps of the longest side per interval of `TriangleIndex.below`."""
 # Number of boxes along each axis into which the cube around the unit sphere is divided for star searches.
 _BOXES = 20
 TIE = 1e-9
@@ -231,40 +228,45 @@ _BRIGHTER = 2.0
 
 @dataclass(frozen=True, eq=False)
 class TriangleIndex:
-    """Triangles of guide stars, sorted by their keys.
+    """Triangles of guide stars, sorted by form and longest side.
 
     Attributes:
-        key: key of each triangle (m,), uint32, from orientation, cell of the side ratios, and longest side.
+        begin: index of the first triangle of each form, and the number of triangles (f + 1,), int32.
+        entry: entry of each triangle (m,), uint32: the longest side (`size_steps`) in the upper 16 bits, and
+            the positions of the shortest and of the middle side's ratios in 8 bits each.
         corners: indices of the guide stars opposite the shortest, middle and longest side (m, 3), uint16.
-        shape: positions of each triangle's two side ratios within their cells (m, 2), uint8, in 1/256 of a
-            cell.
     """
 
-    key: npt.NDArray[np.uint32]
+    begin: npt.NDArray[np.int32]
+    entry: npt.NDArray[np.uint32]
     corners: npt.NDArray[np.uint16]
-    shape: npt.NDArray[np.uint8]
 
     def __len__(self) -> int:
-        return len(self.key)
+        return len(self.entry)
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """The number of keys below each multiple of 2^RUN_BITS (f,), for a fast search of keys."""
-        run = self.key >> np.uint32(RUN_BITS)
-        count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
+        """The number of triangles before each interval of the longest side of each form (i + 1,)."""
+        form = np.repeat(np.arange(len(self.begin) - 1), np.diff(self.begin))
+        intervals = SIZES >> RUN_BITS
+        count = np.bincount(
+            form * intervals + (self.entry >> np.uint32(16 + RUN_BITS)),
+            minlength=(len(self.begin) - 1) * intervals,
+        )
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
     @cached_property
     def table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The arrays key, corners, positions and below, contiguous and read-only, and the layout of keys.
+        """The arrays entry, corners and below, contiguous and read-only, and the layout (6,) of entries.
 
-        The positions (m,), uint16, contain the two columns of `shape` in their low and high bytes. The layout
-        (4,) is `CELLS`, `FINE`, `SIZE_BITS` and `RUN_BITS`.
+        The layout is `CELLS`, `SIZES`, `OCTAVE`, `RUN_BITS`, and the smallest and largest longest side.
         """
-        layout = np.array([CELLS, FINE, SIZE_BITS, RUN_BITS])
-        places = np.ascontiguousarray(self.shape).view("<u2").ravel()
-        given = self.key, self.corners, places, self.below, layout
-        arrays = [np.ascontiguousarray(array).view() for array in given]
+        size = self.entry >> np.uint32(16)
+        limits = (int(size.min()), int(size.max())) if len(size) else (0, 0)
+        layout = np.array([CELLS, SIZES, OCTAVE, RUN_BITS, *limits])
+        arrays = [
+            np.ascontiguousarray(array).view() for array in (self.entry, self.corners, self.below, layout)
+        ]
         for array in arrays:
             array.flags.writeable = False
         return tuple(arrays)
@@ -410,32 +412,25 @@ def _indexed(direction: FloatArray, corners: IntArray) -> TriangleIndex:
     corners = np.take_along_axis(corners, order, axis=-1)
     a, b, c = (direction[corners[:, column]] for column in range(3))
     left = np.einsum("ij,ij->i", np.cross(a, b), c) > 0.0
-    ratio = sides[:, :2] / sides[:, 2:]
-    key = keys(cell(ratio[:, 0]), cell(ratio[:, 1]), left, sides[:, 2])
-    sorting = np.lexsort((corners[:, 2], corners[:, 1], corners[:, 0], key))
-    shape = np.floor((ratio * CELLS - cell(ratio)) * FINE)
+    place = np.minimum(sides[:, :2] / sides[:, 2:] * (CELLS * FINE), CELLS * FINE - 1).astype(np.int64)
+    cell, fine = np.divmod(place, FINE)
+    form = (left * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
+    entry = (size_steps(sides[:, 2]) * FINE + fine[:, 0]) * FINE + fine[:, 1]
+    sorting = np.lexsort((corners[:, 2], corners[:, 1], corners[:, 0], (form << 32) | entry))
+    count = np.bincount(form, minlength=2 * CELLS * CELLS)
     return TriangleIndex(
-        key[sorting],
+        np.concatenate([[0], np.cumsum(count)]).astype(np.int32),
+        entry[sorting].astype(np.uint32),
         corners[sorting].astype(np.uint16),
-        np.clip(shape, 0, FINE - 1)[sorting].astype(np.uint8),
     )
 
 
-def cell(ratio: FloatArray) -> IntArray:
-    """Return the indices of the cells into which given side ratios of triangles fall."""
-    return np.clip(np.floor(ratio * CELLS), 0, CELLS - 1).astype(np.int64)
+def size_steps(size: FloatArray) -> IntArray:
+    """Return longest sides of triangles in logarithmic steps: `OCTAVE` steps for each factor of two."""
+    return np.asarray(np.clip(np.log2(size) * OCTAVE + SIZES, 0, SIZES - 1), dtype=np.int64)
 
 
-def keys(
-    short: IntArray, middle: IntArray, left: npt.NDArray[np.bool_], size: FloatArray
-) -> npt.NDArray[np.uint32]:
-    """Return the keys of triangles from the cells of their side ratios, orientation and longest side."""
-    form = ((left * CELLS + short) * CELLS + middle).astype(np.int64)
-    step = np.clip(size / SIZE_UNIT, 0, (1 << SIZE_BITS) - 1).astype(np.int64)
-    return ((form << SIZE_BITS) | step).astype(np.uint32)
-
-
-_VERSION = 3
+_VERSION = 4
 KIND = TableKind(
     b"KCSKYIDX",
     _VERSION,
@@ -455,7 +450,7 @@ class SkyIndex:
     Attributes:
         stars: guide stars at the epoch of the index.
         motion: proper motion of each guide star as the change of its unit vector (n, 3), rad/yr, float32.
-        triangles: triangles of guide stars, sorted by their keys.
+        triangles: triangles of guide stars, sorted by form and longest side.
     """
 
     stars: GuideStars

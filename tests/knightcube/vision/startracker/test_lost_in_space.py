@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -13,13 +14,12 @@ from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.vision.startracker import lost_in_space
 from knightcube.vision.startracker.attitude_fit import (
     MatchStatus,
-    ScaleSteps,
     StarField,
     StarMatch,
     _refined,
     stretched,
 )
-from knightcube.vision.startracker.index import CELLS, FINE
+from knightcube.vision.startracker.index import CELLS, FINE, OCTAVE
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import (
     BatchSizes,
@@ -31,6 +31,7 @@ from knightcube.vision.startracker.lost_in_space import (
     look_up,
     middle_sized,
     neighbours,
+    scale_steps,
     spread_batches,
     triples,
 )
@@ -284,14 +285,13 @@ def test_all_triangles_of_a_field_occur_once_the_brightest_first() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "seed", "most"),
-    [(ListKind(false_stars=2), 1, 600_000), (ListKind(known_deg=None), 2, 600_000), (ListKind(), 3, 500)],
+    [(ListKind(false_stars=2), 1, 600_000), (ListKind(known_deg=None), 2, 600_000), (ListKind(), 3, 300)],
 )
 def test_all_forms_find_the_same_matches_and_candidates_in_the_same_order(
     kind: ListKind, seed: int, most: int
 ) -> None:
     field = _drawn(kind, seed).field()
-    steps = ScaleSteps.of(field, 0.0015)
-    scales = np.stack([steps.middle, steps.lowest, steps.highest])
+    scales = scale_steps(field, 0.0015)
     seen = field.direction, field.sigma
     looked_up: tuple[Any, ...] = (
         *seen,
@@ -309,7 +309,7 @@ def test_all_forms_find_the_same_matches_and_candidates_in_the_same_order(
     assert 0 < read <= most
     tried = np.stack([matches[0][0], matches[1][0]], axis=1).astype(np.int64)
     for known in (tried[:0], tried):
-        chosen = (field.direction, SKY.stars.direction, *matches, known, 12, *field.scale)
+        chosen = (field.direction, SKY.stars.direction, *matches, known, 12, *field.scale, OCTAVE)
         assert_forms_agree(_choose, *chosen)
         assert len(_choose.numpy_form(*chosen)[1]) > 0
 
@@ -378,21 +378,31 @@ def test_batches_begin_with_triangles_of_the_brightest_stars() -> None:
 
 
 def test_spread_batches_contain_triangles_of_medium_size() -> None:
-    """The longest side is between 0.3 and 0.75 field widths; many or unranked points add their neighbours."""
+    """The longest side is between 0.2 and 0.5 field widths; many or unranked points add their neighbours.
+
+    Larger triangles follow only if the field has too few triangles of medium size.
+    """
     field, sizes = _spread_field(40), BatchSizes((10,), (100, 300))
-    chosen = middle_sized(field, 400)
+    chosen = middle_sized(field, 400, 100)
     assert len(chosen) == 400
     assert len({tuple(row) for row in chosen.tolist()}) == 400
     corner = field.direction[chosen]
     sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
-    lowest, highest = lost_in_space._MIDDLE_SIZES
+    lowest, highest, largest = lost_in_space._MIDDLE_SIZES
     assert sides.min() >= 0.2 * lowest
     assert sides.max() <= 0.2 * highest
     every = triples(40)
     corner = field.direction[every]
     sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
-    fitting = np.count_nonzero((sides >= 0.2 * lowest) & (sides <= 0.2 * highest))
-    assert len(middle_sized(field, 100_000)) == fitting
+    fitting = int(np.count_nonzero((sides >= 0.2 * lowest) & (sides <= 0.2 * highest)))
+    assert len(middle_sized(field, 100_000, 100)) == fitting
+    more = middle_sized(field, 100_000, fitting + 50)
+    assert np.array_equal(more[:fitting], middle_sized(field, 100_000, 0))
+    assert len({tuple(row) for row in more.tolist()}) == fitting + 50
+    corner = field.direction[more[fitting:]]
+    sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
+    assert sides.min() > 0.2 * highest
+    assert sides.max() <= 0.2 * largest
     first, second = spread_batches(field, sizes)
     assert np.array_equal(first, chosen[:100])
     assert np.array_equal(second[:300], chosen[100:])
@@ -409,17 +419,18 @@ def test_matches_are_ranked_by_the_number_of_matches_with_the_same_pairs() -> No
     draw = np.random.default_rng(2)
     observed = draw.integers(0, 6, (300, 3)).astype(np.uint16)
     star = draw.integers(0, 9, (300, 3)).astype(np.uint16)
-    scale = draw.choice([0.97, 1.1], 300)
-    code = lost_in_space._codes(observed, star, scale, 0.9)
+    # Scales of 0.97 to 1.03 are similar, and a scale of 1.1 is not.
+    like = draw.choice([0, 1], 300)
+    factor = np.where(like, 1.1, draw.choice([0.97, 1.0, 1.03], 300))
+    scale = np.floor(np.log2(factor) * OCTAVE).astype(np.int32)
     keys = [
-        [(one, two, scale[k]) for one, two in zip(observed[k].tolist(), star[k].tolist(), strict=True)]
+        [(one, two, like[k]) for one, two in zip(observed[k].tolist(), star[k].tolist(), strict=True)]
         for k in range(300)
     ]
     pairs = [pair for match in keys for pair in match]
     expected = [sum(pairs.count(pair) for pair in match) for match in keys]
-    assert len(np.unique(code)) == len(set(pairs))
-    assert lost_in_space._votes(code).tolist() == expected
-    assert lost_in_space._counted_votes(code).tolist() == expected
+    assert lost_in_space._votes(observed, star, scale).tolist() == expected
+    assert lost_in_space._counted_votes(observed, star, scale).tolist() == expected
     order = sorted(range(300), key=lambda k: (-expected[k], k))
     assert lost_in_space._most_voted(np.array(expected), 25).tolist() == order[:25]
 
@@ -450,12 +461,11 @@ def test_candidates_are_the_attitudes_of_the_matches_with_the_most_votes() -> No
     guide = stretched(field.direction, 1.04) @ turn
     observed = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [4, 5, 6], [7, 3, 2]], dtype=np.uint16)
     star = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [5, 4, 6], [7, 3, 2]], dtype=np.uint16)
-    scale = np.array([1.04, 1.04, 1.04, 1.04, 1.04])
-    code = lost_in_space._codes(observed, star, scale, 0.9)
+    scale = np.full(5, round(math.log2(1.04) * 1_000_000_000), dtype=np.int32)
     none = np.zeros((0, 2), dtype=np.int64)
-    arguments = field.direction, guide, observed, star, scale, code
+    arguments = field.direction, guide, observed, star, scale
     for form in (_choose.numpy_form, _choose.loop_form):
-        matrices, scales, tried = form(*arguments, none, 9, 0.9, 1.02)
+        matrices, scales, tried = form(*arguments, none, 9, 0.9, 1.02, 1_000_000_000)
         # The second match shares two pairs with the first.
         assert len(matrices) == 4
         assert matrices[0] == pytest.approx(turn, abs=1e-9)
@@ -464,7 +474,7 @@ def test_candidates_are_the_attitudes_of_the_matches_with_the_most_votes() -> No
         assert tried.shape == (12, 2)
         assert sorted(map(tuple, tried[:3].tolist())) == [(0, 0), (1, 1), (2, 2)]
         known = np.array([[4, 4], [5, 5], [0, 0], [1, 1], [2, 2]])
-        matrices, scales, tried = form(*arguments, known, 1, 1.05, 1.2)
+        matrices, scales, tried = form(*arguments, known, 1, 1.05, 1.2, 1_000_000_000)
         assert len(matrices) == 1
         assert scales.tolist() == [1.05]
         assert tried.shape == (8, 2)
@@ -477,7 +487,7 @@ def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
 
     A mirrored triangle is not found.
     """
-    *_, star_of, _, _, _ = SKY.triangles.table
+    star_of = SKY.triangles.corners
     draw = np.random.default_rng(4)
     found = mirrored = 0
     for entry in draw.choice(len(star_of), 12, replace=False):
@@ -489,16 +499,17 @@ def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
         width = float(np.abs(seen[:, :2] / seen[:, 2:]).max()) + 0.01
         limits = (scale, scale) if scale == 1.0 else (0.9, 0.96)
         field = StarField(seen[order], np.full(3, 1e-6), (width, width), limits)
-        steps = ScaleSteps.of(field, 0.0015)
-        matches, read = look_up(field, SKY, steps, np.array([[0, 1, 2]]), 3.0, 0.0015, 10_000_000)
+        scales = scale_steps(field, 0.0015)
+        matches, read = look_up(field, SKY, scales, np.array([[0, 1, 2]]), 3.0, 0.0015, 10_000_000)
         assert read >= len(matches)
-        for corners, names_found, at in zip(matches.observed, matches.star, matches.scale, strict=True):
+        factors = 2.0 ** (matches.scale / OCTAVE)
+        for corners, names_found, at in zip(matches.observed, matches.star, factors, strict=True):
             assert limits[0] * (1.0 - 0.02) <= at <= limits[1] * (1.0 + 0.02)
             if names_found.tolist() == names[order][corners].tolist() and set(names_found) == set(names):
                 found += 1
                 assert at == pytest.approx(scale, rel=2e-3)
                 break
-        matches, _ = look_up(field.mirrored(), SKY, steps, np.array([[0, 1, 2]]), 3.0, 0.0015, 10_000_000)
+        matches, _ = look_up(field.mirrored(), SKY, scales, np.array([[0, 1, 2]]), 3.0, 0.0015, 10_000_000)
         mirrored += any(set(row) == set(names) for row in matches.star.tolist())
     assert found == 12
     assert mirrored == 0
@@ -506,34 +517,74 @@ def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
 
 def test_sides_of_triangles_are_sorted_with_their_opposite_corners() -> None:
     """The first corner is opposite to the shortest side; the orientation is that of the sorted corners."""
-    field, triangles, scales = _spread_field(9), triples(9), np.array([0.9, 1.15])
+    field, triangles = _spread_field(9), triples(9)
+    scales = np.random.default_rng(3).uniform(0.9, 1.15, len(triangles))
     corners, sides, left = lost_in_space._forms(field.direction, triangles, scales)
-    assert len(corners) == 2 * len(triangles)
     for row, (abc, three, is_left) in enumerate(zip(corners, sides, left, strict=True)):
-        assert sorted(abc.tolist()) == triangles[row // 2].tolist()
-        at = stretched(field.direction[abc], float(scales[row % 2]))
+        assert sorted(abc.tolist()) == triangles[row].tolist()
+        at = stretched(field.direction[abc], float(scales[row]))
         opposite = [np.linalg.norm(at[(k + 1) % 3] - at[(k + 2) % 3]) for k in range(3)]
         assert three == pytest.approx(opposite)
         assert np.all(np.diff(three) >= 0.0)
         (ax, ay), (bx, by), (cx, cy) = field.direction[abc, :2] / field.direction[abc, 2:]
         assert is_left == ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay) > 0.0)
+        corner, side = triangles[row].copy(), np.empty(3)
+        lost_in_space._sort_sides(field.direction, float(scales[row]), corner, side)
+        assert corner.tolist() == abc.tolist()
+        assert side == pytest.approx(three)
+        assert lost_in_space._is_left(field.direction, corner) == is_left
 
 
-def test_places_in_a_cell_are_those_within_the_tolerance_of_a_ratio() -> None:
-    """A place in a cell is in the range if its middle, give or take half its width, is near the ratio."""
+def test_scale_steps_are_joined_while_side_ratios_are_nearly_constant() -> None:
+    """The side ratios at the limits of joined steps differ from the ratios in the middle by the tolerance.
+
+    The ranges of joined steps cover all steps. The ratios of small triangles near the axis change least.
+    """
+    tangent = np.array([[0.0, 0.0], [0.02, 0.0], [0.01, 0.03], [0.28, 0.3], [-0.3, 0.2], [-0.1, -0.28]])
+    direction = np.column_stack([tangent, np.ones(6)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    field = StarField(direction, np.full(6, 1e-5), (0.3, 0.3), (0.4, 1.6))
+    scales, triangles = scale_steps(field, 0.0015), triples(6)
+    steps = len(scales) // 2
+    assert scales[[0, -1]] == pytest.approx([0.4, 1.6])
+    number, begin, end = lost_in_space._joined_steps(direction, triangles, scales, 0.0015)
+    ratios = []
+    for at in (2 * begin, begin + end, 2 * end):
+        _, sides, _ = lost_in_space._forms(direction, triangles[number], scales[at])
+        ratios.append(sides[:, :2] / sides[:, 2:])
+    wide = end - begin > 1
+    assert wide.any()
+    assert np.abs(np.array(ratios) - ratios[1])[:, wide].max() < 1.15 * 0.0015
+    counts = np.bincount(number)
+    for triangle in range(len(triangles)):
+        own = number == triangle
+        assert begin[own][0] == 0
+        assert end[own][-1] == steps
+        assert np.array_equal(begin[own][1:], end[own][:-1])
+        joined = lost_in_space._joined(direction, scales, 0.0015, triangles[triangle].copy(), np.empty(3))
+        assert joined == (end - begin)[own][0]
+    assert counts[0] == counts.min() < counts.max()
+
+
+def test_places_are_those_within_the_tolerance_of_a_ratio() -> None:
+    """Ranges of entries have all positions whose widths overlap with the tolerance of both ratios."""
     draw = np.random.default_rng(5)
-    ratio, slack = draw.uniform(0.2, 0.9, 60), draw.uniform(1e-4, 8e-3, 60)
-    cell = np.clip((ratio * CELLS).astype(np.int64) + draw.integers(-1, 2, 60), 0, CELLS - 1)
-    lowest, width = lost_in_space._places(ratio, slack, cell)
-    for k in range(60):
-        middle = (cell[k] + (np.arange(FINE) + 0.5) / FINE) / CELLS
-        near = np.flatnonzero(np.abs(middle - ratio[k]) <= slack[k] + 0.5 / (CELLS * FINE) + 1e-12)
-        limits = lost_in_space._place_limits(ratio[k], slack[k], int(cell[k]), CELLS, FINE)
-        assert limits == (lowest[k], lowest[k] + width[k])
-        if len(near):
-            assert limits == (near[0], near[-1])
-        else:
-            assert width[k] == 0
+    *_, below, layout = SKY.triangles.table
+    for _ in range(40):
+        short, medium, slack = draw.uniform(0.2, 0.9), draw.uniform(0.2, 0.9), draw.uniform(1e-4, 8e-3)
+        runs, windows = np.zeros((25, 3), dtype=np.int32), np.zeros((25, 2), dtype=np.uint32)
+        count = lost_in_space._add_runs(
+            1, short, medium, slack, 10_000.5, 30_000.5, below, layout, runs, windows
+        )
+        assert (windows[:count] >> 16 == [10_000, 30_000]).all()
+        for shift, ratio in ((8, short), (0, medium)):
+            widths = [
+                high - low + 1 for low, high in (windows[:count].astype(np.int64) >> shift & 255).tolist()
+            ]
+            edges = np.arange(CELLS * FINE) / (CELLS * FINE)
+            near = (edges + 1.0 / (CELLS * FINE) > ratio - slack) & (edges <= ratio + slack)
+            cells = len(np.unique(np.flatnonzero(near) // FINE))
+            assert sum(widths) * cells == np.count_nonzero(near) * count
 
 
 def test_a_mirrored_field_or_a_wrong_scale_is_searched_only_if_allowed() -> None:

@@ -14,9 +14,10 @@ from knightcube.vision.startracker.index import (
     CELLS,
     FINE,
     LEAST_RATIO,
+    OCTAVE,
     PATH,
-    SIZE_BITS,
-    SIZE_UNIT,
+    RUN_BITS,
+    SIZES,
     TIE,
     build_triangles,
     load,
@@ -112,21 +113,35 @@ def test_a_rotated_sky_has_the_same_triangles() -> None:
         np.testing.assert_array_equal(found, first)
 
 
-def test_a_key_depends_on_shape_and_size_of_its_triangle() -> None:
+def test_an_entry_depends_on_shape_and_size_of_its_triangle() -> None:
     sky = default_index()
-    some = np.random.default_rng(3).integers(0, len(sky.triangles), 500)
-    corners = sky.stars.direction[sky.triangles.corners[some].astype(int)]
+    triangles = sky.triangles
+    some = np.random.default_rng(3).integers(0, len(triangles), 500)
+    corners = sky.stars.direction[triangles.corners[some].astype(int)]
     sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]], axis=-1)
     assert np.all(np.diff(sides, axis=1) >= 0.0)
-    key = sky.triangles.key[some].astype(np.int64)
-    form = key >> SIZE_BITS
+    entry = triangles.entry[some].astype(np.int64)
+    form = np.searchsorted(triangles.begin, some, side="right") - 1
     cells = np.stack([form // CELLS % CELLS, form % CELLS], axis=-1)
-    ratio = (cells + (sky.triangles.shape[some] + 0.5) / FINE) / CELLS
+    fine = np.stack([entry // FINE % FINE, entry % FINE], axis=-1)
+    ratio = (cells + (fine + 0.5) / FINE) / CELLS
     assert np.allclose(ratio, sides[:, :2] / sides[:, 2:], atol=1.0 / (CELLS * FINE))
-    assert np.allclose((key & ((1 << SIZE_BITS) - 1)) * SIZE_UNIT, sides[:, 2], atol=2.0 * SIZE_UNIT)
+    size = 2.0 ** (((entry >> 16) + 0.5 - SIZES) / OCTAVE)
+    assert np.allclose(size, sides[:, 2], rtol=1.0 / OCTAVE)
     left = np.linalg.det(corners) > 0.0
     assert np.array_equal(form // CELLS**2 == 1, left)
-    assert np.all(np.diff(sky.triangles.key.astype(np.int64)) >= 0)
+
+
+def test_entries_of_a_form_between_two_sizes_are_contiguous() -> None:
+    """Each interval of sizes of a form contains exactly the entries that are counted by a search."""
+    triangles = default_index().triangles
+    form = np.repeat(np.arange(len(triangles.begin) - 1), np.diff(triangles.begin))
+    whole = form * SIZES + (triangles.entry >> np.uint32(16))
+    assert np.all(np.diff(whole) >= 0)
+    intervals = np.random.default_rng(4).integers(0, len(triangles.below) - 1, 300)
+    expected = np.searchsorted(whole, intervals << RUN_BITS)
+    assert np.array_equal(triangles.below[intervals], expected)
+    assert triangles.below[-1] == len(triangles)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +157,7 @@ def test_an_index_file_round_trips_and_is_deterministic(stored: Path, tmp_path: 
     save(sky, again)
     assert again.read_bytes() == stored.read_bytes()
     back = load(stored)
-    assert np.array_equal(back.triangles.key, sky.triangles.key)
+    assert np.array_equal(back.triangles.entry, sky.triangles.entry)
     assert np.array_equal(back.triangles.corners, sky.triangles.corners)
     assert np.abs(back.stars.direction - sky.stars.direction).max() < 1e-7
     assert np.abs(back.stars.magnitude - sky.stars.magnitude).max() < 1e-3
