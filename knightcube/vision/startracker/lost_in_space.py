@@ -623,9 +623,9 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factors on the tolerance and on the number of verified candidates for triangles that include faint stars.
-# The factors are below 1, because many true triangles vote for the same pairs.
-_TOLERANCE_OF_SPREAD, _VERIFIED_OF_SPREAD = 0.3, 0.6
+# Factor on the tolerance for triangles that include faint stars.
+# The factor is below 1, because many true triangles vote for the same pairs.
+_OF_SPREAD = 0.3
 # Number of matches with the most votes that are considered for each candidate to be verified.
 _RANKED = 8
 # Factor on the expected number of chance matches for a mirrored field or a scale outside the given range.
@@ -667,18 +667,17 @@ def _search(
             sky,
             scales,
             triangles,
-            (_TOLERANCE_OF_SPREAD if spread else 1.0) * settings.tolerance,
+            (_OF_SPREAD if spread else 1.0) * settings.tolerance,
             settings.distortion,
             settings.work - work,
         )
         if len(finds):
             found.append(finds)
-        most = round((_VERIFIED_OF_SPREAD if spread else 1.0) * settings.verified)
         if found:
             direction, whole = np.ascontiguousarray(observed.direction), TriangleMatches.of(found)
             matches = whole.observed, whole.star, whole.scale
             matrices, zooms, tried = _choose(
-                direction, sky.stars.direction, *matches, tried, most, *observed.scale, OCTAVE
+                direction, sky.stars.direction, *matches, tried, settings.verified, *observed.scale, OCTAVE
             )
             answer = verify_first(observed, sky, matrices, zooms, searched, settings.verification)
             if answer.status is MatchStatus.IDENTIFIED:
