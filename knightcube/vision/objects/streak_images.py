@@ -406,14 +406,7 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
     n = off * cosine
     s = arcs[k] + part * (arcs[k + 1] - arcs[k]) + off * bend * cosine
     light = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * pace * len(path))
-    # The ends of the streak affect only nearby pixels.
-    covered, sloping = np.ones(len(s)), np.zeros(len(s))
-    for sign, distance in ((1.0, s + 0.5 * spacing[0]), (-1.0, arc[-1] + 0.5 * spacing[-1] - s)):
-        ending = np.flatnonzero(distance < room)
-        part = distance[ending] / width
-        bell = np.exp(-0.5 * part**2) / (np.sqrt(2.0 * np.pi) * width)
-        sloping[ending] = sloping[ending] * ndtr(part) + sign * covered[ending] * bell
-        covered[ending] *= ndtr(part)
+    covered, sloping = _between_ends(s + 0.5 * spacing[0], arc[-1] + 0.5 * spacing[-1] - s, width)
     image[0, chosen] += light * covered
     if len(image) == 3:
         across_x, across_y = (cosine * (normal[k] - bend * tangent[k]) for k in (0, 1))
@@ -421,6 +414,22 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
         aside = covered * n / width**2
         image[1, chosen] += light * (aside * across_x - sloping * along_x)
         image[2, chosen] += light * (aside * across_y - sloping * along_y)
+
+
+def _between_ends(start: FloatArray, stop: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+    """Return the fractions (n,) of a streak's light that its ends leave, and their slopes along the streak.
+
+    The distances `start` and `stop` (n,) from the ends are positive within the streak.
+    """
+    covered, sloping = np.ones(len(start)), np.zeros(len(start))
+    for sign, distance in ((1.0, start), (-1.0, stop)):
+        # An end affects only nearby pixels.
+        ending = np.flatnonzero(distance < _FARTHEST * width)
+        part = distance[ending] / width
+        bell = np.exp(-0.5 * part**2) / (np.sqrt(2.0 * np.pi) * width)
+        sloping[ending] = sloping[ending] * ndtr(part) + sign * covered[ending] * bell
+        covered[ending] *= ndtr(part)
+    return covered, sloping
 
 
 @compiled_form_of(_streak_images_numpy)

@@ -327,15 +327,13 @@ def _look_up(
     below: npt.NDArray[np.int32],
     layout: IntArray,
 ) -> _Found:
-    octave = layout[2]
-    steps = len(scales) // 2
+    octave, steps = layout[2], len(scales) // 2
     limits = np.log2(scales) * octave
     corners = np.empty((len(triangles) * steps, 3), dtype=np.uint16)
     longest = np.empty(len(triangles) * steps)
     runs = np.empty((len(triangles) * steps * _MOST_RUNS, 3), dtype=np.int32)
     windows = np.empty((len(runs), 2), dtype=np.uint32)
-    side, corner = np.empty(3), np.empty(3, dtype=np.int64)
-    queries, count = 0, 0
+    side, corner, queries, count = np.empty(3), np.empty(3, dtype=np.int64), 0, 0
     for t in range(len(triangles)):
         corner[:] = triangles[t]
         a, b, c = sigma[corner[0]], sigma[corner[1]], sigma[corner[2]]
@@ -360,9 +358,8 @@ def _look_up(
             after = count + _add_runs(
                 left, short, medium, slack, lowest, highest, below, layout, runs[count:], windows[count:]
             )
-            while count < after:
-                runs[count, 2] = queries
-                count += 1
+            runs[count:after, 2] = queries
+            count = after
             queries += 1
     entry, query, total = _matching_entries(runs[:count], windows, entries, most)
     return *_matches(entry, query, entries, longest, corners, star_of), total
