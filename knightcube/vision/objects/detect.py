@@ -470,8 +470,8 @@ class Judge:
         Stars are fitted to each region. If the fitted stars do not explain all light, they are subtracted,
         and the brightest remaining light of the region is tested. In regions at the border of the image, an
         object must decrease chi-square more, and its ends lie inside the image. Regions whose label is in
-        `settled` are not examined. Regions whose label is in `strange` are examined first, then the largest.
-        Regions whose label is in `explained` contain only stars, and count as examined.
+        `settled` are not examined, nor regions whose label is in `explained`, which contain only stars.
+        Regions whose label is in `strange` are examined first, then the largest.
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
@@ -479,8 +479,7 @@ class Judge:
         indices = np.flatnonzero(~np.isin(regions.label, settled) & bright)
         order = np.lexsort((-regions.area[indices], ~np.isin(regions.label[indices], strange)))
         objects = []
-        order = order[: self.objects.most_merged]
-        order = order[~np.isin(regions.label[indices[order]], explained)]
+        order = order[~np.isin(regions.label[indices[order]], explained)][: self.objects.most_merged]
         for index in indices[order].tolist():
             patch = self._patch(index)
             enough = self.objects.crossing_improvement * (_AT_BORDER if outside[index] else 1.0)
@@ -503,8 +502,10 @@ class Judge:
         enough = self.objects.crossing_improvement
         try:
             few = self._light(ends, stars, _FEW_PATHS)
-            gained = few.chi_square - few.chi_square_with(ends)
-            if gained < enough:
+            least = few.chi_square_with(ends)
+            gained = few.chi_square - least
+            # Fitted stars can hide a part of the object's streak, so that the ends contain only the rest.
+            if gained < enough or least - few.expected > gained:
                 longer = few.located(ends, among_stars=True) if gained >= _PART * enough else None
                 if longer is None:
                     return None

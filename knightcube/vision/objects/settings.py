@@ -101,7 +101,7 @@ class ObjectSettings:
     saturation: float | None = None
     most_streaks: int = 80
     most_points: int = 20
-    most_merged: int = 12
+    most_merged: int = 10
     least_share: float = 0.04
     most_corners: int = 6
     point_significance: float = 20.0

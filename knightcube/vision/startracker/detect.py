@@ -340,9 +340,11 @@ def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
 
 
 def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:
-    """Return which sources (n,) are significant, near their peak and inside the frame."""
+    """Return which sources (n,) are significant, with a determined place near their peak inside the frame."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
+    # The place is undetermined if, for instance, all pixels of the source are saturated.
+    near &= np.trace(found.covariance, axis1=1, axis2=2) < 2.0 * far[:, 0] ** 2
     limits = np.array(targets.pixels.shape)[::-1] - 0.5
     inside = ((found.points > -0.5) & (found.points < limits)).all(axis=1)
     return np.asarray(

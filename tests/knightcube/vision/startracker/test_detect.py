@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.detect import Quality, _on_wings, detect, measure_near
+from knightcube.vision.startracker.detect import Quality, _on_wings, confirmed, detect, measure_near
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Method, survey
 from knightcube.vision.streaks.geometry import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
@@ -165,6 +167,15 @@ def test_a_bright_corner_full_of_leaves_does_not_drown_the_stars() -> None:
     found = detect(counts(frame)).stars()
     assert len(matched(found, stars)[0]) >= 18
     assert np.count_nonzero((found.points > 390.0).all(axis=1)) <= 8
+
+
+def test_a_source_whose_place_is_undetermined_is_not_a_star() -> None:
+    middle, one = np.full((2, 2), 32), np.ones(2)
+    covariance = np.array([0.01 * np.eye(2), 1e30 * np.eye(2)])
+    found = SimpleNamespace(points=middle + 0.1, flux=1e6 * one, flux_sigma=one, covariance=covariance)
+    targets = SimpleNamespace(core=0.0 * one, middle=middle, pixels=np.zeros((64, 64)))
+    real = confirmed(cast(Any, found), cast(Any, targets), DetectionSettings())
+    assert real.tolist() == [True, False]
 
 
 def test_a_saturated_moon_is_not_detected_as_a_star() -> None:
