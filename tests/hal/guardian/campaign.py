@@ -14,6 +14,7 @@ STOPPED_S = 1.0
 UNGUARDED = ("SIGSTOP, the guardian too", "SIGSTOP, the guardian too, once more")
 """Two acts, because the last command before a stop of the flight process can be a zero current."""
 _CALM_S = 1.2
+_PATIENCE_S = 30.0  # longest time until a new guardian is ready
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,13 @@ def hurt_in_every_way(folder: Path) -> Campaign:
             time.sleep(_CALM_S)
         for number in (signal.SIGKILL, signal.SIGSTOP):
             guardians.append(flight.guardian())
+            before = flight.reported("guardian-ready")
             os.kill(guardians[-1], number)
             lost_ns.append(time.monotonic_ns())
             time.sleep(2.5)
+            deadline = time.monotonic() + _PATIENCE_S
+            while flight.reported("guardian-ready") == before and time.monotonic() < deadline:
+                time.sleep(0.1)
         guardians.append(flight.guardian())
         children = flight.children()
         flight.wait_until_driven()

@@ -114,6 +114,11 @@ class LiveFlight:
             time.sleep(0.05)
         raise AssertionError(f"the coil was not driven within {patience:g} s: {self.end()}")
 
+    def reported(self, name: str) -> int:
+        """Return how many events named `name` the flight log contains."""
+        data = b"".join(path.read_bytes() for path in find_segments(self.folder, "flight"))
+        return int(np.count_nonzero(scan(data).packets["event"]["name"] == name.encode()))
+
     def do(self, number: signal.Signals) -> int:
         """Send a signal to the flight process; return the monotonic time (ns) of the signal."""
         self.process.send_signal(number)

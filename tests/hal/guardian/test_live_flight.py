@@ -46,14 +46,13 @@ def test_control_comes_back_by_itself_within_two_seconds(campaign: Campaign, act
 
 def test_a_guardian_that_is_killed_or_hangs_is_replaced_and_reported(campaign: Campaign) -> None:
     assert len(set(campaign.guardians)) == 3
-    names = event_names(campaign.truth.run)
-    assert names.count("guardian-lost") == 2
-    assert names.count("guardian-ready") >= 2
+    assert event_names(campaign.truth.run).count("guardian-ready") >= 2
     events = campaign.truth.run["event"]
     reported = events["time_ns"][events["name"] == b"guardian-lost"] + campaign.truth.epoch_ns
-    delays = (reported - np.array(campaign.guardian_lost_ns)) * 1e-9
-    assert 0.0 < delays[0] < 0.5, "a death is seen at once"
-    assert 0.0 < delays[1] < 2.0, "a line that is not read fills up"
+    # On a busy machine, a new guardian can be replaced too, because it does not read its line yet.
+    killed, stopped = ((reported[reported > lost] - lost)[0] * 1e-9 for lost in campaign.guardian_lost_ns)
+    assert killed < 0.5, "a death is seen at once"
+    assert stopped < 2.0, "a line that is not read fills up"
 
 
 def test_a_lost_guardian_does_not_disturb_the_flight(campaign: Campaign) -> None:
