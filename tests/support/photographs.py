@@ -47,6 +47,21 @@ class Photograph:
     arcsec: float
     stars: int
     ms: float
+    size: str = ""
+
+
+def reduced(pixels: Image, columns: int, rows: int) -> Image:
+    """Return an image of integers reduced to (rows, columns) by the mean over each larger pixel."""
+    down, across = _areas(pixels.shape[0], rows), _areas(pixels.shape[1], columns)
+    return np.rint(down @ pixels.astype(np.float64) @ across.T).astype(pixels.dtype)
+
+
+def _areas(many: int, few: int) -> FloatArray:
+    """Return the fractions (few, many) that `many` pixels along an axis contribute to `few` larger pixels."""
+    edges, step = np.arange(many, dtype=np.float64), many / few
+    begin = step * np.arange(few)[:, None]
+    overlap = np.minimum(edges + 1.0, begin + step) - np.maximum(edges, begin)
+    return np.maximum(overlap, 0.0) / step
 
 
 def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:
@@ -57,9 +72,13 @@ def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pi
     return Pinhole(columns, rows, 0.5 * columns / middle), (scale[0], scale[1])
 
 
-def photograph(folder: Path, name: str, truth: dict[str, float], known: bool) -> Photograph:
-    """Return the star tracker's result for one photograph."""
+def photograph(
+    folder: Path, name: str, truth: dict[str, float], known: bool, size: tuple[int, int] | None = None
+) -> Photograph:
+    """Return the star tracker's result for one photograph, reduced to `size` (columns, rows) if given."""
     pixels = read_image(folder / name)
+    pixels = pixels if size is None else reduced(pixels, *size)
+    shown = f"{pixels.shape[1]} x {pixels.shape[0]}"
     fov = truth["fov"]
     low, high = (
         (fov * (1.0 - FIELD_SHARE), fov * (1.0 + FIELD_SHARE)) if known else (_LOWEST_DEG, _HIGHEST_DEG)
@@ -69,11 +88,11 @@ def photograph(folder: Path, name: str, truth: dict[str, float], known: bool) ->
     found = solve_frame(pixels, camera, scale, 1.0, sky(), SolveSettings())
     ms = 1e3 * (time.process_time() - begin)
     if found.fix is None:
-        return Photograph(name, known, False, math.nan, 0, ms)
+        return Photograph(name, known, False, math.nan, 0, ms, shown)
     pointing = Pointing.of(found.fix.quaternion)
     place = direction(pointing.right_ascension, pointing.declination)
     off = angle_arcsec(place, centre_of(truth))
-    return Photograph(name, known, True, off, len(found.matched), ms)
+    return Photograph(name, known, True, off, len(found.matched), ms, shown)
 
 
 def centre_of(truth: dict[str, float]) -> FloatArray:
