@@ -115,6 +115,11 @@ def compiled_floats(function: Callable[Parameters, Result]) -> HotFunction[Param
     return HotFunction(function, function)
 
 
+@compiled_floats
+def load() -> None:
+    """Load numba if the compiled forms are in use, which takes half a second in the first call."""
+
+
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Return `function` unchanged, after marking it for compilation with the loop forms that call it.
 

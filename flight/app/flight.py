@@ -8,6 +8,7 @@ The function `open_flight` opens logs, guardian, devices, workers and channels, 
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import sys
@@ -90,7 +91,7 @@ from flight.schema.document import ConfigError, imported, merged_text, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
-from knightcube.compiled import use_numpy_forms
+from knightcube import compiled
 from knightcube.errors import UsageError
 from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
@@ -126,7 +127,7 @@ def open_flight(
     missing device. The folders `earlier` of earlier runs serve to detect that the stored state is outdated.
     """
     if rig.realtime:
-        use_numpy_forms()
+        compiled.use_numpy_forms()
     flight_log = _open_log(folder, "flight", rig, config, stack, patient)
     performance_log = _open_log(folder, "performance", rig, config, stack, patient)
     # The stored state is opened last, so that a boot in which the start fails is not counted.
@@ -153,6 +154,11 @@ def open_flight(
     opened = Opened(clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))
+    if not rig.realtime:
+        # Otherwise, the first control cycles load numba, and some cycles examine all objects of the start.
+        compiled.load()
+        gc.freeze()
+        stack.callback(gc.unfreeze)
     return loop, flight_log
 
 

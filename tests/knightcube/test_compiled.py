@@ -132,3 +132,12 @@ def test_an_import_does_not_load_numba(module: str) -> None:
     subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, "KNIGHTCUBE_COMPILED": "1"}, timeout=100, check=True
     )
+
+
+@pytest.mark.parametrize("selected", [True, False])
+def test_numba_can_be_loaded_before_the_first_call_of_a_compiled_form(selected: bool) -> None:
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    code = "import sys\nfrom knightcube import compiled\ncompiled.load()\nsys.exit('numba' in sys.modules)"
+    environment = {**os.environ, "KNIGHTCUBE_COMPILED": str(int(selected)), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=False)
+    assert done.returncode == selected

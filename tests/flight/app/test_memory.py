@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -84,6 +85,18 @@ collect()
 sys.stdout.write(f"{frozen > 1000} {lost() is None} {gc.get_count()[0] < 100} {gc.isenabled()}")
 """
 
+_LOCK_STEP = """
+import gc, sys
+from pathlib import Path
+from flight.app.flight import fly
+from flight.app.run import RunRequest
+
+counts = []
+request = RunRequest(Path("config/step_demo.yaml"), Path(sys.argv[1]), duration=2.0)
+fly(request, lambda _: counts.append(gc.get_freeze_count()))
+sys.stdout.write(f"{min(counts) > 1000} {gc.get_freeze_count()} {gc.isenabled()}")
+"""
+
 
 def _said(code: str, *words: str) -> str:
     done = subprocess.run([sys.executable, "-c", code, *words], check=True, capture_output=True, text=True)
@@ -112,3 +125,7 @@ def test_arrays_of_megabytes_do_not_stretch_the_heap_of_a_settled_process() -> N
 
 def test_garbage_that_a_failure_made_is_found_and_what_stays_is_looked_at_once() -> None:
     assert _said(_LOOPS) == "True True True False"
+
+
+def test_a_flight_in_lock_step_examines_the_objects_of_its_start_only_after_its_end(tmp_path: Path) -> None:
+    assert _said(_LOCK_STEP, str(tmp_path / "run")) == "True 0 True"
