@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import correlate1d, gaussian_filter
+from scipy.special import ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
@@ -560,7 +561,9 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
     """Return the frame (rows, columns), counts, for `radiance` (rows, columns)."""
     offsets, spread, dead, hot, hot_counts = _pattern(model)
     if model.response == "logarithmic":
-        signal = np.log10(1.0 + radiance * np.float32(1.0 / model.darkest))
+        signal = radiance * np.float32(1.0 / model.darkest)
+        signal += np.float32(1.0)
+        np.log10(signal, out=signal)
         signal *= np.float32(model.counts_per_decade)
         signal += _normal(model, model.noise, generator)
     else:
@@ -601,17 +604,30 @@ def spill(charge: Float32Array, full_well: float) -> None:
                     carried -= taken
 
 
+@lru_cache(maxsize=4)
+def _normal_values(sigma: float) -> Float32Array:
+    """Return 65,536 equally probable values of a normal distribution with the standard deviation `sigma`."""
+    values = ndtri((np.arange(65_536) + 0.5) / 65_536)
+    return np.asarray(values * (sigma / values.std())).astype(np.float32)
+
+
 def _normal(model: EarthCameraModel, sigma: float, generator: np.random.Generator) -> Float32Array:
-    return generator.standard_normal((model.rows, model.columns), dtype=np.float32) * np.float32(sigma)
+    """Return normal noise (rows, columns) with the standard deviation `sigma`, of at most 4.3 `sigma`.
+
+    Drawing equally probable values takes a fifth of the time of `Generator.standard_normal`.
+    """
+    count = model.rows * model.columns
+    words = generator.bit_generator.random_raw(-(-count // 4)).view(np.uint16)[:count]
+    return _normal_values(sigma).take(words).reshape(model.rows, model.columns)
 
 
 @lru_cache(maxsize=8)
 def _pattern(model: EarthCameraModel) -> tuple[Float32Array, Float32Array, IntArray, IntArray, Float32Array]:
     """Return pixel offsets (counts), sensitivity errors, dead pixels, hot pixels and hot pixels' counts."""
     rng = np.random.default_rng(model.seed)
-    size = model.rows * model.columns
-    offsets = _normal(model, model.fixed_pattern, rng)
-    spread = _normal(model, model.response_spread, rng)
+    shape, size = (model.rows, model.columns), model.rows * model.columns
+    offsets = rng.standard_normal(shape, dtype=np.float32) * np.float32(model.fixed_pattern)
+    spread = rng.standard_normal(shape, dtype=np.float32) * np.float32(model.response_spread)
     blemished = rng.choice(size, size=model.dead_pixels + model.hot_pixels, replace=False)
     bright = rng.uniform(0.3, 1.0, size=model.hot_pixels) * model.highest_count
     dead, hot = blemished[: model.dead_pixels], blemished[model.dead_pixels :]

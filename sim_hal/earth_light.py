@@ -425,8 +425,11 @@ def light(
     points = np.empty(3 * _BLOCK, np.float32)
     heights = np.empty(2 * _BLOCK, np.float32)
     lit, ground = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64)
+    down, lowest = _earthward(origin, into_earth, axes)
     for start in range(0, count, _BLOCK):
         size = min(_BLOCK, count - start)
+        if not _steepest(rays, start, size, down) > lowest:
+            continue
         _trace(rays, start, size, origin, into_earth, axes, sun, traced)
         number = 0
         for i in range(size):
@@ -449,6 +452,42 @@ def light(
             j = ground[k]
             radiance[start + lit[j]] += np.float32(sunlight) * shaded[_BLOCK + j] * points[k]
     return radiance, at_limb
+
+
+@loop_helper
+def _earthward(
+    origin: FloatArray, into_earth: FloatArray, axes: FloatArray
+) -> tuple[tuple[np.float32, np.float32, np.float32], np.float32]:
+    """Return the unit vector (3,) to the centre of the Earth, in camera axes, and a cosine.
+
+    A unit ray whose product with the vector is below the cosine stays above the height `TOP`.
+    """
+    x, y, z = origin[0] * axes[0], origin[1] * axes[1], origin[2] * axes[2]
+    distance = math.sqrt(x * x + y * y + z * z)
+    x, y, z = -x / distance * axes[0], -y / distance * axes[1], -z / distance * axes[2]
+    sine = (max(axes[0], axes[1], axes[2]) + TOP) / distance
+    # The margin of 1e-5 is far larger than the rounding errors of 32-bit numbers.
+    lowest = math.sqrt(1.0 - sine * sine) - 1e-5 if sine < 1.0 else -2.0
+    m = into_earth
+    right = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
+    below = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
+    ahead = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
+    return (np.float32(right), np.float32(below), np.float32(ahead)), np.float32(lowest)
+
+
+@loop_helper
+def _steepest(
+    rays: Float32Array, start: int, size: int, down: tuple[np.float32, np.float32, np.float32]
+) -> np.float32:
+    """Return the largest product of `down` (3,) with `size` rays (3, n) from the column `start` on.
+
+    Rays that are not numbers are ignored.
+    """
+    x, y, z = down
+    largest = -_ONE
+    for i in range(start, start + size):
+        largest = max(largest, x * rays[0, i] + y * rays[1, i] + z * rays[2, i])
+    return largest
 
 
 @loop_helper

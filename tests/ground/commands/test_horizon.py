@@ -25,7 +25,7 @@ SCENE = limb_scene(zenith=np.array([1.0, 0.0, 0.1]), sun=np.array([1.0, 0.6, 0.5
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with grey and colour images of the limb, an image of the sky, and the camera file."""
     folder = tmp_path_factory.mktemp("limb")
-    frame = render(MODEL, SCENE, np.random.default_rng(1))
+    frame = render(MODEL, SCENE, np.random.default_rng(4))
     pillow.fromarray(frame).save(folder / "limb.png")
     pillow.fromarray(np.stack([frame] * 3, axis=2)).save(folder / "colour.png")
     pillow.fromarray(np.full((512, 512), 9, np.uint8)).save(folder / "sky.png")
