@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,12 +25,19 @@ def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record
 
     The selection `chosen` is a Boolean mask (n,) or indices. The fields named in `common` remain unchanged.
     """
-    picked: dict[str, Any] = {
-        field.name: getattr(record, field.name)[chosen]
-        for field in fields(record)  # type: ignore[arg-type]  # a dataclass
-        if field.name not in common
-    }
-    return replace(record, **picked)  # type: ignore[type-var]  # a dataclass
+    # Indices select rows of many arrays faster than a mask.
+    rows = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+    kept = (
+        getattr(record, name) if name in common else getattr(record, name).take(rows, axis=0)
+        for name in _names(type(record))
+    )
+    return type(record)(*kept)
+
+
+@functools.cache
+def _names(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass."""
+    return tuple(field.name for field in fields(kind))
 
 
 def tangent_basis(direction: Iterable[float]) -> FloatArray:

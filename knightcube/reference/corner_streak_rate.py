@@ -50,8 +50,9 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.errors import FlightError
 from knightcube.reference.corner_streaks import StreakResult, StreakSettings
+from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole
-from knightcube.vision.frame import MAD_TO_SIGMA, saturation_level
+from knightcube.vision.frame import saturation_level
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.streak_ends import (
     Regions,

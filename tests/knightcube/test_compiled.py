@@ -43,7 +43,7 @@ def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Pat
     hidden = "" if numba else "sys.modules['numba'] = None\n"
     code = (
         f"import sys\n{hidden}import numpy as np\nfrom knightcube import compiled\n"
-        "from knightcube.vision.frame import estimate_background\n"
+        "from knightcube.vision.background import estimate_background\n"
         "estimate_background(np.zeros((64, 64)))\nsys.exit(compiled.in_use())"
     )
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
@@ -96,7 +96,7 @@ def test_the_process_that_compiles_a_function_computes_the_same_as_later_process
         "PYTHONPATH": str(ROOT),
     }
     code = (
-        "import hashlib\nimport numpy as np\nfrom knightcube.vision.frame import Background\n"
+        "import hashlib\nimport numpy as np\nfrom knightcube.vision.background import Background\n"
         "rng = np.random.default_rng(1)\nlevel, noise = rng.uniform(90.0, 110.0, (2, 8, 8))\n"
         "pixels = rng.poisson(400.0, (512, 512)).astype(np.uint16)\n"
         "signal, variance = Background(level, noise, (512, 512), False).subtracted(pixels)\n"

@@ -38,7 +38,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
-from knightcube.vision.frame import MAD_TO_SIGMA
+from knightcube.vision.background import MAD_TO_SIGMA
 
 _EYE3: FloatArray = np.eye(3)
 MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0

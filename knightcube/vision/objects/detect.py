@@ -38,8 +38,9 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.compiled import compiled_form_of
 from knightcube.errors import FlightError
+from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
-from knightcube.vision.frame import MAD_TO_SIGMA, line_of, positions
+from knightcube.vision.frame import line_of, positions
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     LEAST_LINE_PX,

@@ -23,11 +23,10 @@ from scipy import ndimage
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
 from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.vision.background import Background, estimate_background
 from knightcube.vision.frame import (
-    Background,
     at_least,
     box_sum,
-    estimate_background,
     label_pixels,
     moments,
     positions,

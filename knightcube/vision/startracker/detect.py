@@ -14,7 +14,8 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
 from knightcube.compiled import compiled_form_of
-from knightcube.vision.frame import MAD_TO_SIGMA, label_pixels, saturation_level
+from knightcube.vision.background import MAD_TO_SIGMA
+from knightcube.vision.frame import label_pixels, saturation_level
 from knightcube.vision.startracker.measurement import (
     FrameSpread,
     MeasuredStars,
@@ -381,7 +382,7 @@ def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     restless = noise.at(*peaks.place.T) > _RESTLESS * np.median(noise.values)
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
-    if frame_shape(areas).kind is not FrameKind.STREAKS:
+    if long.any() and frame_shape(areas).kind is not FrameKind.STREAKS:
         # A long area may also be a row of stars (several peaks) or a bright star with a tail due to coma.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)

@@ -20,18 +20,20 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
-from knightcube.compiled import compiled_form_of
-from knightcube.vision.frame import (
-    HOT_SIGMAS,
+from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.vision.background import (
     MAD_TO_SIGMA,
     Background,
     among_blocks,
     estimate_background,
-    hot_among,
     in_blocks,
     interpolation_weights,
-    label_pixels,
     median_of_neighbours,
+)
+from knightcube.vision.frame import (
+    HOT_SIGMAS,
+    hot_among,
+    label_pixels,
     moments,
     saturation_of_bright,
 )
@@ -266,22 +268,21 @@ def _bright_indices(pixels: Image, lowest: Image) -> IntArray:
 def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixels:
     """Return the pixels of the smoothed frame that exceed the background by `sigmas` standard deviations."""
     rows, columns = pixels.shape
-    limit = Surface(sky.smooth_level.values + sigmas * sky.smooth_noise.values, (rows, columns))
-    down, across = limit.factors()
-    index, smooth = _smoothed_above(np.ascontiguousarray(pixels), down, across)
+    limit = sky.smooth_level.values + sigmas * sky.smooth_noise.values
+    index, smooth = _smoothed_above(np.ascontiguousarray(pixels), limit)
     row, column = np.divmod(index, columns)
     return BrightPixels(index, smooth - sky.smooth_level.at(column, row), (rows, columns))
 
 
-def _smoothed_above_numpy(
-    pixels: Image, down: Float32Array, across: Float32Array
-) -> tuple[IntArray, Float32Array]:
+def _smoothed_above_numpy(pixels: Image, limit: FloatArray) -> tuple[IntArray, Float32Array]:
     """Return the ascending flat indices (m,) of the pixels whose smoothed counts exceed a limit.
 
-    The second returned array has the smoothed counts (m,). The limit of each pixel is the product of `down`
-    (rows, k), which has two nonzero elements in each row at most, and `across` (k, columns).
+    The second returned array has the smoothed counts (m,). The limits at the centres of blocks of pixels are
+    `limit` (down, across).
     """
     rows, columns = pixels.shape
+    # The limit of each pixel is the product of a row of `down` and a column of `across`.
+    down, across = Surface(limit, (rows, columns)).factors()
     across = np.ascontiguousarray(across[:, 1:-1])
     count = min(_BAND, rows - 2)
     band = np.empty((count + 2, columns), dtype=np.float32)
@@ -314,22 +315,24 @@ def _smoothed_above_numpy(
 
 
 @compiled_form_of(_smoothed_above_numpy)
-def _smoothed_above(pixels: Image, down: Float32Array, across: Float32Array) -> tuple[IntArray, Float32Array]:
+def _smoothed_above(pixels: Image, limit: FloatArray) -> tuple[IntArray, Float32Array]:
     """See `_smoothed_above_numpy`."""
-    rows, columns = pixels.shape
+    (rows, columns), (down, across) = pixels.shape, limit.shape
     index, found, count = np.empty(rows * columns, np.int64), np.empty(rows * columns, np.float32), 0
     twice, smooth = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
-    bound = np.empty(columns, dtype=np.float32)
+    bound, limits = np.empty(columns, dtype=np.float32), np.empty((down, columns), dtype=np.float32)
+    for column in range(columns):
+        left, share = _before(column, columns, across)
+        right = min(left + 1, across - 1)
+        for block in range(down):
+            limits[block, column] = limit[block, left] * (1.0 - share) + limit[block, right] * share
     for row in range(1, rows - 1):
-        first = 0
-        while first < down.shape[1] - 1 and down[row, first] == 0.0:
-            first += 1
-        second = min(first + 1, down.shape[1] - 1)
-        one, other = down[row, first], down[row, second] if second > first else np.float32(0.0)
+        first, share = _before(row, rows, down)
+        one, other, second = np.float32(1.0 - share), np.float32(share), min(first + 1, down - 1)
         for column in range(columns):
             above, own = np.float32(pixels[row - 1, column]), np.float32(pixels[row, column])
             twice[column] = (above + own) + (own + np.float32(pixels[row + 1, column]))
-            bound[column] = one * across[first, column] + other * across[second, column]
+            bound[column] = one * limits[first, column] + other * limits[second, column]
         for column in range(1, columns - 1):
             smooth[column] = (twice[column - 1] + twice[column]) + (twice[column] + twice[column + 1])
         for start in range(1, columns - 1, _SEGMENT):
@@ -342,6 +345,14 @@ def _smoothed_above(pixels: Image, down: Float32Array, across: Float32Array) -> 
                     index[count], found[count] = row * columns + start + k, part[k]
                     count += 1
     return index[:count].copy(), found[:count].copy()
+
+
+@loop_helper
+def _before(pixel: int, pixels: int, blocks: int) -> tuple[int, float]:
+    """Return the last block centre before a pixel of a side, and its distance (see `place_among_blocks`)."""
+    size = pixels // blocks
+    place = min(max((pixel - 0.5 * (size - 1)) / size, 0.0), blocks - 1.0)
+    return int(place), place - int(place)
 
 
 def _smoothed_at_numpy(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
@@ -382,7 +393,8 @@ def _tails(sample: Image, level: FloatArray, noise: FloatArray) -> tuple[FloatAr
     (rows, columns), (down, across) = sample.shape, level.shape
     last = (rows // down) * (columns // across) - 1
     high = min(last, int(TAIL_PART * (last + 1)))
-    ordered = np.sort(in_blocks(sample, down, across), axis=-1)
+    # Only 32-bit values are sorted with vector instructions, which have no mispredicted branches.
+    ordered = np.sort(in_blocks(sample, down, across).astype(np.float32), axis=-1)
     tail = np.maximum(1.0, 0.5 * (ordered[..., high] - level) / noise)
     reach = median_of_neighbours((level - ordered[..., last - high]) / noise)
     return median_of_neighbours(tail), one_sided(reach * noise, noise)
@@ -538,14 +550,46 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     A block has many bright pixels if their fraction exceeds `share`. A second grid of blocks, displaced by
     half a block along rows and columns, is also tested.
     """
-    down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
+    return _cluttered(areas.row, areas.column, np.ascontiguousarray(place), *areas.shape, share)
+
+
+def _cluttered_numpy(
+    bright_row: IntArray, bright_column: IntArray, place: IntArray, rows: int, columns: int, share: float
+) -> BoolArray:
+    """See `cluttered`; the bright pixels have the rows and columns (m,)."""
+    down, across = rows // _BLOCK + 2, columns // _BLOCK + 2
     found = np.zeros(len(place), dtype=bool)
     for shift_y in (0, _BLOCK // 2):
         for shift_x in (0, _BLOCK // 2):
-            block = (areas.row + shift_y) // _BLOCK * across + (areas.column + shift_x) // _BLOCK
+            block = (bright_row + shift_y) // _BLOCK * across + (bright_column + shift_x) // _BLOCK
             filled = np.bincount(block, minlength=down * across)
             own = (place[:, 1] + shift_y) // _BLOCK * across + (place[:, 0] + shift_x) // _BLOCK
             found |= filled[own] > share * _BLOCK**2
+    return found
+
+
+@compiled_form_of(_cluttered_numpy)
+def _cluttered(
+    bright_row: IntArray, bright_column: IntArray, place: IntArray, rows: int, columns: int, share: float
+) -> BoolArray:
+    """See `_cluttered_numpy`."""
+    half = _BLOCK // 2
+    filled, found = (
+        np.zeros((rows // half + 4, columns // half + 4), np.int64),
+        np.zeros(len(place), np.bool_),
+    )
+    for k in range(len(bright_row)):
+        filled[bright_row[k] // half, bright_column[k] // half] += 1
+    for k in range(len(place)):
+        down, across = place[k, 1] // half, place[k, 0] // half
+        # The block of each grid consists of four half-sized blocks, of which one contains the pixel.
+        for top in (down - down % 2, down - (down + 1) % 2):
+            for left in (across - across % 2, across - (across + 1) % 2):
+                bright = 0
+                for row in range(max(top, 0), top + 2):
+                    for column in range(max(left, 0), left + 2):
+                        bright += filled[row, column]
+                found[k] |= bright > share * _BLOCK**2
     return found
 
 

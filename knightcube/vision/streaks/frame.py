@@ -14,11 +14,11 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of
+from knightcube.vision.background import estimate_background
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import (
     at_least,
     box_sum,
-    estimate_background,
     find_hot_pixels,
     in_steps,
     label_pixels,

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.frame import Background, are_hot
+from knightcube.vision.background import Background
+from knightcube.vision.frame import are_hot
 from knightcube.vision.startracker import survey as survey_module
 from knightcube.vision.startracker.detect import find_peaks
 from knightcube.vision.startracker.measurement import centre_of_mass
@@ -23,6 +24,7 @@ from knightcube.vision.startracker.survey import (
     FrameKind,
     Surface,
     _bright_indices,
+    _cluttered,
     _local_maxima,
     _smoothed_above,
     _smoothed_at,
@@ -212,7 +214,7 @@ def test_the_compiled_smoothing_equals_that_in_numpy(
     draw = np.random.default_rng(shape)
     pixels = draw.integers(0, 200, shape).astype(dtype)
     limit = Surface(draw.uniform(1_500.0, 1_900.0, (shape[0] // 16, shape[1] // 16)), shape)
-    assert_forms_agree(_smoothed_above, pixels, *limit.factors())
+    assert_forms_agree(_smoothed_above, pixels, limit.values)
     row, column = np.arange(2, shape[0] - 1, 4), np.arange(2, shape[1] - 1, 4)
     assert_forms_agree(_smoothed_at, pixels, row, column)
 
@@ -365,6 +367,14 @@ def test_places_among_many_bright_pixels_are_cluttered() -> None:
     assert cluttered(bright, place, 0.2).tolist() == [True] * 4 + [False] * 4
     assert cluttered(bright, place, 0.2501).tolist() == [False] * 8
     assert cluttered(bright, place[:1], 0.2499).tolist() == [True]
+
+
+def test_the_compiled_search_of_clutter_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(4)
+    row, column = draw.integers(0, 90, 900), draw.integers(0, 130, 900)
+    place = np.stack([draw.integers(0, 130, 80), draw.integers(0, 90, 80)], axis=-1)
+    assert 10 < np.count_nonzero(_cluttered.numpy_form(row, column, place, 90, 130, 0.08)) < 70
+    assert_forms_agree(_cluttered, row, column, place, 90, 130, 0.08)
 
 
 def test_areas_have_the_moments_of_their_light() -> None:
