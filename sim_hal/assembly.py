@@ -270,8 +270,12 @@ def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> C
     def sense(time_ns: int) -> BodyMotion:
         # The unit averages its magnetometer over one control period, so the mean coil currents are used.
         motion = world.motion(time_ns)
-        field = field_matrix @ (motion.field_body + coil_field @ circuit.currents()) + offset
-        rate, force = gyro_matrix @ motion.rate, motion.specific_force_body
+        # The method `dot` takes half the time of the operator `@`.
+        total: FloatArray = coil_field.dot(circuit.currents())
+        total += motion.field_body
+        field: FloatArray = field_matrix.dot(total)
+        field += offset
+        rate, force = gyro_matrix.dot(motion.rate), motion.specific_force_body
         return BodyMotion(motion.time_ns, motion.quaternion, rate, field, force)
 
     return sense

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, from_rotation_
 from sim_hal.clock import NEVER
 from sim_hal.emulators.serial_line import DeviceEnd
 from sim_hal.emulators.vn100_sensors import (
-    BINARY_FIELDS,
     IMU_RATE_HZ,
     OUTPUT_BY_REGISTER,
     OUTPUT_BY_TYPE,
@@ -38,8 +37,10 @@ from sim_hal.emulators.vn100_sensors import (
     AsciiOutput,
     MessageData,
     NoiseProfile,
+    Reader,
     Sensors,
     Vn100Sample,
+    readers,
 )
 from sim_hal.worlds.world import BodyMotion
 
@@ -197,16 +198,22 @@ _BASE_10 = 2  # number of decimal fields at the start of registers 75 to 77; lat
 
 @dataclass(frozen=True, slots=True)
 class BinaryOutput:
-    """A binary output of registers 75 to 77, with serial ports, period (800 Hz ticks) and packet layout."""
+    """A binary output of registers 75 to 77, with serial ports, period (800 Hz ticks) and packet layout.
+
+    The functions `readers` return the values of the packet.
+    """
 
     ports: int
     divisor: int
     layout: OutputLayout
+    readers: tuple[Reader, ...]
 
     def pack(self, now: MessageData) -> bytes:
         """Return the binary packet with the data of one sampling time."""
-        quantities = " ".join(BINARY_FIELDS[key] for key in self.layout.fields)
-        return self.layout.pack(now.values(quantities))
+        values: list[float] = []
+        for read in self.readers:
+            values += read(now)
+        return self.layout.pack(values)
 
 
 def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
@@ -227,7 +234,8 @@ def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
     known = all(word and not word & ~SUPPORTED_FIELDS.get(bit, 0) for bit, word in pairs.items())
     if divisor == 0 or not bits or not known:
         raise UnitError(INVALID_PARAMETER)
-    return BinaryOutput(ports, divisor, layout_of(pairs))
+    layout = layout_of(pairs)
+    return BinaryOutput(ports, divisor, layout, readers(layout.fields))
 
 
 class RegisterFile:
@@ -387,6 +395,12 @@ def _yaw_of(fields: tuple[str, ...]) -> float:
         raise UnitError(INVALID_PARAMETER)
     attitude = Vn100Sample(normalise(np.array(values)), np.zeros(3), np.zeros(3), np.zeros(3))
     return math.radians(attitude.yaw_pitch_roll[0])
+
+
+@lru_cache(maxsize=16)
+def _windows(fields: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the filter lengths of magnetometer, accelerometer and gyro, the first fields of register 85."""
+    return tuple(map(int, fields[:3]))
 
 
 _OUR_PORT = 1
@@ -738,8 +752,7 @@ class Vn100Emulator:
     # Output.
 
     def _sample(self, now_ns: int) -> Vn100Sample:
-        # Register 85 begins with the filter lengths of magnetometer, accelerometer and gyro.
-        windows = tuple(map(int, self.registers.values[85][:3]))
+        windows = _windows(self.registers.values[85])
         sample = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return sample if self.alter is None else self.alter(sample)
 

@@ -10,21 +10,21 @@ layouts and number formats follow VectorNav UM001 v2.43, chapters 4 and 5.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import (
+    IDENTITY,
+    Quaternion,
     attitude_matrix,
     compose,
     conjugate,
     exponential,
     from_rotation_vector,
-    multiply,
     normalise,
 )
 from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
@@ -138,11 +138,11 @@ class Sensors:
         self._map: FloatArray = np.asarray(
             np.kron(np.diag([1.0, GAUSS_PER_TESLA, 1.0]), turn), dtype=np.float64
         )
-        # A matrix product is enough, because the measurement is bilinear in true and error quaternion.
-        body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
-        self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
+        self._vectors: FloatArray = np.empty(9)
+        self._to_sensor, self._reference = _floats(conjugate(mounting)), _floats(reference)
         self._fixed_bias = gyro_bias
-        self._static: FloatArray | None = None
+        self._static: Quaternion = _floats(IDENTITY)
+        self._from_ned = self._reference
         self._biases: FloatArray = np.array([*gyro_bias, *np.zeros(6)])
         self._free_fall = free_fall
         self._scales: dict[tuple[int, ...], FloatArray] = {}
@@ -151,43 +151,61 @@ class Sensors:
         """Draw the errors that are constant until the next start of the unit."""
         draws = self._rng.standard_normal(6)
         self._biases[:3] = self._fixed_bias + self._profile.gyro_bias * draws[:3]
-        static = np.array(self._profile.static_attitude)
-        self._static = from_rotation_vector(static * draws[3:]) if static.any() else None
+        self._static = _floats(from_rotation_vector(np.array(self._profile.static_attitude) * draws[3:]))
         if self._free_fall:
-            self._static = normalise(self._rng.standard_normal(4))
+            self._static = _floats(normalise(self._rng.standard_normal(4)))
+        self._from_ned = compose(self._reference, self._static)
 
     def measure(self, motion: BodyMotion, windows: tuple[int, ...]) -> Vn100Sample:
         """Return one sample for the filter lengths `windows` of magnetometer, accelerometer and gyro."""
-        profile = self._profile
-        if windows not in self._scales:
-            mag, accel, gyro = (math.sqrt(max(1, window)) for window in windows)
-            densities = profile.rate_density, profile.field_density, profile.acceleration_density
-            scales = np.array(densities) / (gyro, mag, accel) * (1.0, GAUSS_PER_TESLA, 1.0)
-            self._scales[windows] = np.repeat(scales * _ROOT_BANDWIDTH, 3)
-        a, b, c, *spun = self._rng.random(6).tolist()
-        noise = self._scales[windows] * self._rng.standard_normal(9)
-        bound = profile.attitude_bound
-        x, y, z = bound * (2.0 * a - 1.0), bound * (2.0 * b - 1.0), bound * (2.0 * c - 1.0)
-        small = np.array([x, y, z, math.sqrt(1.0 - x * x - y * y - z * z)])
-        q = small @ (motion.quaternion @ self._table).reshape(4, 4)
-        if self._free_fall and self._static is not None:
-            drift = exponential(*(_DRIFT_WITHOUT_GRAVITY * self._rng.standard_normal(3)).tolist())
-            self._static = np.array(compose(drift, self._static.tolist()))
-        if self._static is not None:
-            q = multiply(q, self._static)
-        vectors = np.concatenate([motion.rate, motion.field_body, motion.specific_force_body])
+        rng, profile = self._rng, self._profile
+        a, b, c, *spun = rng.random(6).tolist()
+        noise = rng.standard_normal(9)
+        scales = self._scales.get(windows)
+        if scales is None:
+            scales = self._scales[windows] = self._noise_scales(windows)
+        noise *= scales
+        noise += self._biases
+        q = _floats(motion.quaternion)
+        if bound := profile.attitude_bound:
+            x, y, z = bound * (2.0 * a - 1.0), bound * (2.0 * b - 1.0), bound * (2.0 * c - 1.0)
+            q = compose((x, y, z, math.sqrt(1.0 - x * x - y * y - z * z)), q)
+        if self._free_fall:
+            x, y, z = rng.standard_normal(3).tolist()
+            drift = _DRIFT_WITHOUT_GRAVITY
+            self._static = compose(exponential(drift * x, drift * y, drift * z), self._static)
+            self._from_ned = compose(self._reference, self._static)
+        vectors = self._vectors
+        vectors[:3], vectors[3:6], vectors[6:] = motion.rate, motion.field_body, motion.specific_force_body
         if profile.rate_bound:
             vectors[:3] += [profile.rate_bound * (2.0 * share - 1.0) for share in spun]
-        values = self._map @ vectors + (noise + self._biases)
-        return Vn100Sample(quaternion=q, rate=values[:3], mag=values[3:6], accel=values[6:])
+        values: FloatArray = self._map.dot(vectors)
+        values += noise
+        attitude = np.array(compose(compose(self._to_sensor, q), self._from_ned))
+        return Vn100Sample(quaternion=attitude, rate=values[:3], mag=values[3:6], accel=values[6:])
+
+    def _noise_scales(self, windows: tuple[int, ...]) -> FloatArray:
+        """Return the standard deviations (9,) of rate, field and specific force for filter lengths (3,)."""
+        mag, accel, gyro = (math.sqrt(max(1, window)) for window in windows)
+        profile = self._profile
+        densities = profile.rate_density, profile.field_density, profile.acceleration_density
+        scales = np.array(densities) / (gyro, mag, accel) * (1.0, GAUSS_PER_TESLA, 1.0)
+        return np.repeat(scales * _ROOT_BANDWIDTH, 3)
+
+
+def _floats(q: FloatArray) -> Quaternion:
+    """Return a quaternion (4,) as a tuple of floats."""
+    x, y, z, w = q.tolist()
+    return x, y, z, w
 
 
 GRAVITY_NED: FloatArray = np.array([0.0, 0.0, STANDARD_GRAVITY])
-Values = tuple[float, ...]
+Values = Sequence[float]
+Reader = Callable[["MessageData"], Values]
+"""Function that returns the values of a quantity."""
 
 
-@dataclass(frozen=True, slots=True)
-class MessageData:
+class MessageData(NamedTuple):
     """Data for all messages of one sampling time.
 
     Attributes:
@@ -206,10 +224,6 @@ class MessageData:
     temperature: float
     pressure: float
 
-    def values(self, names: str) -> Values:
-        """Return the values of quantities whose names are separated by spaces."""
-        return tuple(value for read in _readers(names) for value in read(self))
-
     def text(self, names: str) -> list[str]:
         """Return the values of named quantities as text in the format of the VN-100."""
         quantities = (_QUANTITIES[name] for name in names.split())
@@ -222,11 +236,11 @@ class MessageData:
         return self.sample.accel + self.sample.matrix @ GRAVITY_NED
 
 
-def _vector(read: Callable[[MessageData], FloatArray]) -> Callable[[MessageData], Values]:
-    return lambda now: tuple(read(now).tolist())
+def _vector(read: Callable[[MessageData], FloatArray]) -> Reader:
+    return lambda now: read(now).tolist()
 
 
-_QUANTITIES: Mapping[str, tuple[Callable[[MessageData], Values], str]] = {
+_QUANTITIES: Mapping[str, tuple[Reader, str]] = {
     "zero": (lambda _: (0,), ""),
     "time": (lambda now: (now.device_ns,), ""),
     "status": (lambda now: (now.status,), ""),
@@ -251,12 +265,6 @@ _QUANTITIES: Mapping[str, tuple[Callable[[MessageData], Values], str]] = {
 """Read function and ASCII format of each quantity; delta angles in deg, delta velocities in m/s."""
 
 
-@lru_cache(maxsize=64)
-def _readers(names: str) -> tuple[Callable[[MessageData], Values], ...]:
-    """Return the functions that read the quantities whose names are separated by spaces."""
-    return tuple(_QUANTITIES[name][0] for name in names.split())
-
-
 BINARY_FIELDS: Mapping[tuple[int, int], str] = {
     (0, 0): "time", (0, 2): "zero", (0, 3): "angles", (0, 4): "quaternion", (0, 5): "rate", (0, 8): "accel",
     (0, 9): "accel rate", (0, 10): "mag temperature pressure", (0, 11): "interval delta_angle delta_velocity",
@@ -269,6 +277,11 @@ BINARY_FIELDS: Mapping[tuple[int, int], str] = {
     (4, 5): "accel_ned", (4, 6): "linear", (4, 7): "linear_ned", (4, 8): "uncertainty",
 }  # fmt: skip
 """Quantities by group bit and field bit, as in `hal.drivers.vn100_protocol.FIELDS`."""
+
+
+def readers(fields: Iterable[tuple[int, int]]) -> tuple[Reader, ...]:
+    """Return the functions that read the quantities of binary fields, given their group and field bits."""
+    return tuple(_QUANTITIES[name][0] for field in fields for name in BINARY_FIELDS[field].split())
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from sim_hal.emulators.vn100_sensors import (
     NoiseProfile,
     Sensors,
     Vn100Sample,
+    readers,
 )
 from sim_hal.worlds.world import BodyMotion
 
@@ -169,7 +170,7 @@ EXPECTED: dict[str, list[float]] = {
 def test_a_binary_field_has_the_quantity_of_its_name(key: tuple[int, int]) -> None:
     group, bit = key
     name, code = FIELDS[group][bit]
-    values = data().values(BINARY_FIELDS[key])
+    values = tuple(value for read in readers([key]) for value in read(data()))
     assert len(values) == (int(code[:-1]) if code[:-1] else 1)
     if name == "quaternion":
         np.testing.assert_allclose(attitude_matrix(np.array(values)), TURN, atol=1e-12)
