@@ -197,7 +197,8 @@ class EmulatedGps:
         around = self._world.surroundings()
         to_ground = celestial_to_terrestrial(date)
         exact = to_ground @ np.array(around.position)
-        velocity = to_ground @ np.array(around.velocity) - np.cross([0.0, 0.0, ROTATION_RATE], exact)
+        x, y, _ = exact.tolist()
+        velocity = to_ground @ np.array(around.velocity) - ROTATION_RATE * np.array([-y, x, 0.0])
         position = exact + errors.walk * self._walk + errors.noise * noise[:3] + self.shift
         velocity = velocity + errors.velocity_noise * noise[3:]
         found = not self.blind and epoch_ns >= self._found_ns

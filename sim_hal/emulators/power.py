@@ -35,6 +35,7 @@ from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
+from knightcube.compiled import compiled_form_of, loop_helper
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.settings import PowerTruth
 from sim_hal.worlds.world import OrbitingWorld
@@ -228,15 +229,13 @@ class SolarCellsModel:
         `to_sun` (3,) is the direction to the Sun, ICRS, and `light` the intensity of the sunlight relative to
         that at one astronomical unit, 0 in the umbra.
         """
-        normals = self.normals @ body
-        sunlight = light * self._accepted(normals @ to_sun)
         distance = math.hypot(*position.tolist())
         rays, ground, solid = _ground_in_view(round(distance / _DISTANCE_STEP))
-        down = -position / distance
-        local = np.vstack([tangent_basis(down), down])
-        lit = np.maximum(ground @ (local @ to_sun), 0.0)
-        earthlight = self._accepted(normals @ local.T @ rays.T) @ (self.albedo / np.pi * solid * lit)
-        return self._produced(sunlight + earthlight, generator)
+        local = np.empty((3, 3))
+        local[2] = position / -distance
+        local[:2] = tangent_basis(local[2].tolist())
+        place = local, to_sun, light, rays, ground, self.albedo / math.pi * solid
+        return self._produced(_irradiance(self.normals.dot(body), *place, math.sin(self.grazing)), generator)
 
     def in_lamplight(self, lamp: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return the currents (n,), A, while a lamp shines onto the panel with the normal `lamp` (3,)."""
@@ -249,10 +248,72 @@ class SolarCellsModel:
         # The diode of a solar string blocks reverse current.
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
-    def _accepted(self, cosines: FloatArray) -> FloatArray:
-        """Return the currents (...) relative to normal incidence, for `cosines` (...) of incidence angles."""
-        grazing, lit = math.sin(self.grazing), np.maximum(cosines, 0.0)
+
+def _irradiance_numpy(
+    normals: FloatArray,
+    local: FloatArray,
+    to_sun: FloatArray,
+    light: float,
+    rays: FloatArray,
+    ground: FloatArray,
+    reflected: float,
+    grazing: float,
+) -> FloatArray:
+    """Return the irradiances (n,), as the numpy form of `_irradiance`."""
+
+    def accepted(cosines: FloatArray) -> FloatArray:
+        lit = np.maximum(cosines, 0.0)
         return np.asarray(lit * np.minimum(lit / grazing, 1.0)) if grazing > 0.0 else lit
+
+    lit = np.maximum(ground @ (local @ to_sun), 0.0)
+    return light * accepted(normals @ to_sun) + accepted(normals @ local.T @ rays.T) @ (reflected * lit)
+
+
+@compiled_form_of(_irradiance_numpy)
+def _irradiance(
+    normals: FloatArray,
+    local: FloatArray,
+    to_sun: FloatArray,
+    light: float,
+    rays: FloatArray,
+    ground: FloatArray,
+    reflected: float,
+    grazing: float,
+) -> FloatArray:
+    """Return the irradiances (n,), relative to sunlight at normal incidence, that the solar strings use.
+
+    If the cosine of the incidence angle is below `grazing`, the used light decreases with its square.
+
+    Args:
+        normals: unit normals (n, 3) of the strings, ICRS.
+        local: rotation matrix (3, 3) from ICRS to axes whose third axis points to the centre of the Earth.
+        to_sun: unit vector (3,) to the Sun, ICRS.
+        light: intensity of the sunlight.
+        rays: directions (m, 3) to ground points in the axes of `local`.
+        ground: unit verticals (m, 3) at the ground points.
+        reflected: intensity of the light from each ground point if the Sun is at the zenith there.
+        grazing: cosine.
+    """
+    count = len(normals)
+    used, turned = np.zeros(count), normals @ local.T
+    x, y, z = local @ to_sun
+    for i in range(count):
+        used[i] = light * _used(turned[i, 0] * x + turned[i, 1] * y + turned[i, 2] * z, grazing)
+    for k in range(len(rays)):
+        lit = reflected * (ground[k, 0] * x + ground[k, 1] * y + ground[k, 2] * z)
+        if lit > 0.0:
+            right, down, ahead = rays[k]
+            for i in range(count):
+                cosine = turned[i, 0] * right + turned[i, 1] * down + turned[i, 2] * ahead
+                used[i] += lit * _used(cosine, grazing)
+    return used
+
+
+@loop_helper
+def _used(cosine: float, grazing: float) -> float:
+    """Return the used fraction of the light at the cosine of an incidence angle."""
+    lit = max(cosine, 0.0)
+    return lit * lit / grazing if lit < grazing else lit
 
 
 @lru_cache(maxsize=8)
@@ -387,7 +448,7 @@ class EmulatedSolarCells:
         if not self.frozen and now_ns - self._measured_ns >= _FRESH_NS:
             self._measured_ns = now_ns
             self._currents = self._light(now_ns)
-        return volt_per_ampere * float(np.where(self.dead, 0.0, self.gain * self._currents)[index])
+        return 0.0 if self.dead[index] else volt_per_ampere * self.gain * float(self._currents[index])
 
     def _light(self, now_ns: int) -> FloatArray:
         if self.lamp is not None:

@@ -38,6 +38,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY
 from knightcube.astro.inertia import inertia_problem, principal_axes
+from knightcube.astro.quaternion import Quaternion, compose, cross, exponential
 from knightcube.compiled import compiled_floats, loop_helper
 from sim_hal.clock import NEVER
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
@@ -511,8 +512,8 @@ class FreeBody:
         self._loads = LoadModel(self.craft, multiples)
         self._rotation = Rotation(self.craft.inertia)
         self._currents, self._supply = currents, supply
-        self._from_principal = quaternion.conjugate(self.craft.to_principal)
         x, y, z, w = self.craft.to_principal.tolist()
+        self._from_principal: Quaternion = (-x, -y, -z, w)
         self._to_principal, self._to_body = matrix(x, y, z, w), matrix(-x, -y, -z, w)
         attitude, self._tip_off = released(section.release, tip_off)
         a, b, c, d = quaternion.multiply(self.craft.to_principal, attitude).tolist()
@@ -520,6 +521,7 @@ class FreeBody:
         self._start_ns, self._release_ns = start_ns, NEVER
         self._held = True
         self._acting: tuple[float, ...] = (0.0,) * len(supply.resistance)
+        self._heat = self._power = 0.0  # power (W) that heats the coils, and power drawn from the supply
         self._read: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
@@ -541,6 +543,9 @@ class FreeBody:
         if currents != self._acting:
             self._integrate()
             self._acting = currents
+            ohms = self._supply.resistance
+            self._heat = sum(ohm * current * current for current, ohm in zip(currents, ohms, strict=True))
+            self._power = self._supply.voltage * sum(map(abs, currents))
         self.time_ns = time_ns
 
     def motion(self, time_ns: int) -> BodyMotion:
@@ -551,7 +556,7 @@ class FreeBody:
         if motion is None or motion.time_ns != self.time_ns or state is not self._state:
             motion = BodyMotion(
                 time_ns=self.time_ns,
-                quaternion=self._attitude(),
+                quaternion=np.array(self._attitude()),
                 rate=np.array(turned(self._to_body, self._state[4:])),
                 field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
                 specific_force_body=np.zeros(3),
@@ -582,7 +587,7 @@ class FreeBody:
             energy=self.energy,
             supply_energy=self.supply_energy,
             utc=self.utc_start + self._seconds(self.time_ns) / DAY,
-            quaternion=self._attitude(),
+            quaternion=np.array(self._attitude()),
             rate=np.array(turned(self._to_body, state[4:])),
             position=np.array(around.position),
             velocity=np.array(around.velocity),
@@ -597,17 +602,15 @@ class FreeBody:
         self, around: OrbitEnvironment, state: State, acting: tuple[float, ...]
     ) -> dict[str, FloatArray]:
         """Return the torque (3,), N m, body axes, by each cause in `CAUSES`."""
-        turn = matrix(*state[:4])
-        attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
-        to_body = matrix(*attitude.tolist())
+        turn, to_body = matrix(*state[:4]), matrix(*compose(self._from_principal, state[:4]))
         field = turned(to_body, around.field)
         drag, sunlight = self._loads.pressures(around, to_body)
         gx, gy, gz = turned(turn, self._loads.pull(around.position))
         a, b, c = self.craft.inertia
         gradient = (c - b) * gy * gz, (a - c) * gz * gx, (b - a) * gx * gy
         return {
-            "coils": np.cross(self._loads.coil_dipole(self._varied(acting)), field),
-            "residual dipole": np.cross(self._loads.residual_dipole(around), field),
+            "coils": np.array(cross(self._loads.coil_dipole(self._varied(acting)), field)),
+            "residual dipole": np.array(cross(self._loads.residual_dipole(around), field)),
             "gravity gradient": np.array(turned(self._to_body, gradient)),
             "drag": np.array(drag),
             "sunlight": np.array(sunlight),
@@ -627,12 +630,8 @@ class FreeBody:
         start, end = self._seconds(self._done_ns), self._seconds(self.time_ns)
         if end <= start:
             return
-        heat = drawn = 0.0
-        for current, ohm in zip(self._acting, self._supply.resistance, strict=True):
-            heat += ohm * current * current
-            drawn += abs(current)
-        self.energy += (end - start) * heat
-        self.supply_energy += (end - start) * self._supply.voltage * drawn
+        self.energy += (end - start) * self._heat
+        self.supply_energy += (end - start) * self._power
         steps = steps_within(end - start, math.hypot(*self._state[4:]), LONGEST_STEP)
         for step in range(steps):
             self._step(start + (end - start) * step / steps, start + (end - start) * (step + 1) / steps)
@@ -659,10 +658,10 @@ class FreeBody:
 
         The attitude is extrapolated to the time `middle`.
         """
-        around = self.environment.at(middle)
-        ahead = (middle - time) * np.array(turned(self._to_body, self._state[4:]))
-        turn = quaternion.multiply(quaternion.from_rotation_vector(ahead), self._attitude())
-        (a, b, c), (d, e, f) = self._loads.pressures(around, matrix(*turn.tolist()))
+        around, ahead = self.environment.at(middle), middle - time
+        x, y, z = turned(self._to_body, self._state[4:])
+        turn = compose(exponential(ahead * x, ahead * y, ahead * z), self._attitude())
+        (a, b, c), (d, e, f) = self._loads.pressures(around, matrix(*turn))
         self._torque = turned(self._to_principal, (a + d, b + e, c + f))
         self._residual = self._loads.residual_dipole(around)
         interval = int(middle / VARIED_FOR)
@@ -680,8 +679,8 @@ class FreeBody:
         position, field = self.environment.position_and_field(time)
         return self._loads.pull(position), field
 
-    def _attitude(self) -> FloatArray:
-        return quaternion.multiply(self._from_principal, np.array(self._state[:4]))
+    def _attitude(self) -> Quaternion:
+        return compose(self._from_principal, self._state[:4])
 
     def _seconds(self, time_ns: int) -> float:
         return (time_ns - self._start_ns) * 1e-9

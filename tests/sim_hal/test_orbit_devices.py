@@ -27,6 +27,7 @@ from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.assembly import assemble, wide_model
 from sim_hal.clock import SimClock
 from sim_hal.emulation import EmulatedWires
+from sim_hal.emulators import power
 from sim_hal.emulators.gps import GpsErrors
 from sim_hal.emulators.power import SolarCellsModel
 from sim_hal.faults.schedule import parse, put
@@ -37,6 +38,7 @@ from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld
 from tests.hal.gps.bench_line import bench
 from tests.sim_hal.faults.benches import bench_of
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.flights import TEXT, demo_config, demo_world
 from tests.support.orbit_devices import UTC, at_first, orbit_config, orbit_world
 
@@ -406,3 +408,15 @@ def test_the_walk_of_the_position_keeps_its_size_and_is_correlated_over_its_time
     correlation = float(walk[1:] @ walk[:-1] / (walk @ walk))
     assert correlation == pytest.approx(math.exp(-1.0 / walk_time), abs=0.12)
     assert float(np.sqrt(np.mean(walk**2))) == pytest.approx(3.0, rel=0.25)
+
+
+@pytest.mark.parametrize("grazing", [0.0, 0.1])
+def test_both_forms_of_the_irradiance_of_solar_strings_agree(grazing: float) -> None:
+    generator = np.random.default_rng(5)
+    rays, ground, _ = power._ground_in_view(68_780)
+    normals, local = (
+        quaternion.attitude_matrix(quaternion.normalise(generator.standard_normal(4))) for _ in range(2)
+    )
+    for sun in (local[2], -local[2], local[0]):
+        arguments = np.concatenate([normals, -normals]), local, sun, 0.9, rays, ground, 2e-4, grazing
+        assert_forms_agree(power._irradiance, *arguments)
