@@ -155,11 +155,24 @@ def open_flight(
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))
     if not rig.realtime:
-        # Otherwise, the first control cycles load numba, and some cycles examine all objects of the start.
-        compiled.load()
-        gc.freeze()
-        stack.callback(gc.unfreeze)
+        compiled.load()  # otherwise, the first control cycle would load numba
+        _collect_rarely(stack)
     return loop, flight_log
+
+
+_YOUNG_OBJECTS = 20_000
+"""Number of new objects after which the garbage of a lock-step flight is collected."""
+
+
+def _collect_rarely(stack: ExitStack) -> None:
+    """Keep the garbage collector from examining all present objects, and new objects every few seconds.
+
+    Reference counting frees nearly all objects of a flight. The stack restores the collector at the end.
+    """
+    gc.freeze()
+    stack.callback(gc.unfreeze)
+    stack.callback(gc.set_threshold, *gc.get_threshold())
+    gc.set_threshold(_YOUNG_OBJECTS)
 
 
 def _open_jobs(config: Config, rig: Rig, stack: ExitStack, cores: Set[int]) -> JobRunner:
