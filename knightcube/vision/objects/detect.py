@@ -43,17 +43,19 @@ from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
 from knightcube.vision.frame import line_of, positions
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
-    LEAST_LINE_PX,
     PATHS_PER_LENGTH,
     Explanation,
     LocatedEnds,
-    Patch,
     StarLight,
+    light_on_path,
+    region_along,
+)
+from knightcube.vision.objects.star_subtraction import (
+    LEAST_LINE_PX,
+    Patch,
     brightest_left,
     cut_patch,
     fit_stars,
-    light_on_path,
-    region_along,
 )
 from knightcube.vision.objects.streak_ends import (
     Segmented,
