@@ -440,13 +440,15 @@ class CoilMonitor:
         # Without readings of the current monitor, the search for a stuck leg cannot succeed, and is ended.
         if self._leg.is_searching and time_ns - self._looked_ns > _WINDOW_NS:
             self._leg.reset()
-        effective = tuple(self.correction.effective(currents).tolist())
+        effective = values
+        if not self.correction.unchanged:
+            effective = tuple(self.correction.effective(currents).tolist())
         for response in self._responses:
             response.commanded(time_ns if written_ns is None else written_ns, effective)
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
         """Add a sample of body rate (3,), rad/s, and magnetic field (3,), T, in body axes."""
-        self._speed = float(np.sqrt(rate @ rate))
+        self._speed = math.hypot(*rate.tolist())
         if self._rests:
             self._end_rests(time_ns, self._speed)
         for response in self._responses:
@@ -636,7 +638,7 @@ class CoilMonitor:
 
     def _check_healthy(self, reading: PowerReading) -> None:
         windows, known = self._windows(reading), self._known
-        asked = float(np.abs(windows[0][1]).sum(axis=1).mean())
+        asked = float(np.abs(windows[0][1]).sum()) / len(windows[0][1])
         if known:
             healthy = all(fits([predict(*window)], self._bounds, known) for window in windows)
         else:

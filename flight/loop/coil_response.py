@@ -609,6 +609,7 @@ class CoilCorrection:
         deviations: relative standard deviations (n,) of the estimated gains; zero for coils without an
             estimated gain.
         sizes: absolute values of the factors, n floats.
+        unchanged: whether all factors have been 1 since the start.
     """
 
     def __init__(self, coils: int = 3) -> None:
@@ -618,14 +619,15 @@ class CoilCorrection:
         self.deviations: FloatArray = np.zeros(coils)
         self._changes: list[list[int]] = [[] for _ in range(coils)]  # times (ns) of the changes of sign
         self._unreviewed: set[int] = set()
+        self.unchanged = True
 
     def effective(self, wire: FloatArray) -> FloatArray:
         """Return the currents (n,), A, with which healthy coils would have the same dipole as the coils."""
-        return self.factors * wire
+        return wire if self.unchanged else self.factors * wire
 
     def wire(self, effective: FloatArray) -> FloatArray:
         """Return the currents (n,), A, of the coils that cause the dipole of the effective currents (n,)."""
-        return effective / self.factors
+        return effective if self.unchanged else effective / self.factors
 
     @property
     def unreviewed(self) -> frozenset[int]:
@@ -666,6 +668,7 @@ class CoilCorrection:
         if factors.shape != self.factors.shape or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
             number = f"not {len(self.factors)} factors"
             return f"{factors.tolist()}: {number} from {LEAST_GAIN:g} to 1 in magnitude"
+        self.unchanged = False
         self.factors, self.deviations = factors.copy(), deviations.copy()
         self.sizes = tuple(sizes.tolist())
         return ""
@@ -679,6 +682,7 @@ class CoilCorrection:
         return f"used with {self.factors[axis]:+.2f} of its configured dipole"
 
     def _multiply(self, axis: int, factor: float) -> None:
+        self.unchanged = False
         self.factors = self.factors.copy()
         self.factors[axis] *= factor
         self.sizes = tuple(np.abs(self.factors).tolist())

@@ -212,8 +212,11 @@ class Facts:
         self._states = {fact.name: _State() for fact in FACTS}
         self._mode = Mode.BOOT
 
-    def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update a condition (`holds` is None if unknown); report a change as an event with `text`."""
+    def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str | Callable[[], str]) -> None:
+        """Update a condition (`holds` is None if unknown); report a change as an event with `text`.
+
+        A function `text`, which returns the text, is only called for a change.
+        """
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -225,6 +228,7 @@ class Facts:
             return
         if not state.holds and state.count < fact.after:
             return
+        text = text if isinstance(text, str) else text()
         state.holds, state.count, state.cause = holds, 0, text if holds else ""
         kind = fact.begins if holds else fact.ends
         if kind is not None:

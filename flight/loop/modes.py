@@ -317,7 +317,9 @@ class PointingWatch:
     def watch_rate(self, rate: float, now_ns: int) -> None:
         """Update the monitored condition TUMBLING from the magnitude (rad/s) of the body rate."""
         limit = self._settings.tumble_rate
-        self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
+        self._facts.update(
+            facts.TUMBLING, rate > limit, now_ns, lambda: f"{rate:.3f} rad/s, {limit:g} allowed"
+        )
 
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
         """Update TUMBLING and HOLD_IMPOSSIBLE; return the pointing error `off` (rad), or 0 for None."""
@@ -325,11 +327,17 @@ class PointingWatch:
         self.watch_rate(self._targets.speed(estimate), now_ns)
         error = 0.0 if off is None else off
         impossible = self._off.update(error > settings.hold_error, now_ns)
-        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
-        self._facts.update(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        self._facts.update(
+            facts.HOLD_IMPOSSIBLE,
+            impossible,
+            now_ns,
+            lambda: f"{error:.2f} rad off for {settings.hold_patience:g} s",
+        )
         return error
 
 
+_HOLDING = frozenset({Mode.HOLD, Mode.SLEW})
+"""Modes in which the body holds or approaches a commanded attitude."""
 SAFING_REACTIONS = {
     Reaction.SAFE: Trigger.REACT_SAFE,
     Reaction.DETUMBLE: Trigger.REACT_DETUMBLE,
@@ -464,12 +472,14 @@ class ModeControl:
         if self.mode is Mode.BOOT:
             self._boot(measured and coils_answer, now_ns)
         blind = (now_ns - self._measured_ns) * 1e-9
-        text = f"no estimate for {blind:.0f} s"
-        if Mode.ACQUIRE in self._modes and rate is None:
-            text = f"no body rate for {blind:.0f} s"
-        elif estimate is not None:
-            text = f"no estimate accurate enough for control for {blind:.0f} s"
-        self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
+        missing = "estimate" if estimate is None else "estimate accurate enough for control"
+        missing = "body rate" if Mode.ACQUIRE in self._modes and rate is None else missing
+        self._facts.update(
+            facts.BLIND,
+            blind > self._settings.blind_limit,
+            now_ns,
+            lambda: f"no {missing} for {blind:.0f} s",
+        )
         if self.mode is Mode.DETUMBLE and rate is not None:
             self._brake(estimate, rate, now_ns)
         elif self.mode in ORBITAL and rate is not None:
@@ -481,7 +491,7 @@ class ModeControl:
             )
         if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
             self._fire(trigger, "", now_ns)
-        if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
+        if estimate is not None and self.mode in _HOLDING:
             self._keep(estimate, now_ns)
         elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
             self._pointing.watch(estimate, overdue, now_ns)

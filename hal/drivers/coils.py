@@ -535,12 +535,14 @@ class PwmTorqueCoils:
 
     def _counts(self, command: tuple[float, ...]) -> tuple[Counts, bool]:
         """Return the signed PWM counts of currents (n,), A, and whether any current was limited."""
-        found = [
-            counts_for(current, step, largest)
-            for current, step, largest in zip(command, self._steps, self._largest, strict=True)
-        ]
-        counts = tuple(count * sign for (count, _), sign in zip(found, self._signs, strict=True))
-        return counts, any(limited for _, limited in found)
+        counts, is_limited = [], False
+        for current, step, largest, sign in zip(
+            command, self._steps, self._largest, self._signs, strict=True
+        ):
+            count, limited = counts_for(current, step, largest)
+            counts.append(sign * count)
+            is_limited = is_limited or limited
+        return tuple(counts), is_limited
 
     def _problem(self, values: FloatArray) -> OutOfRange | None:
         if values.shape != (number := len(self._steps),):

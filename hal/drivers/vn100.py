@@ -432,7 +432,8 @@ class ReadingConverter:
             self.not_finite += 1
             self.rejection = self._fault(q, rate, mag, accel)
             return None
-        has_rate = all(abs(value) <= settings.rate_range for value in rate)  # NaN compares false
+        (x, y, z), limit = rate, settings.rate_range
+        has_rate = abs(x) <= limit and abs(y) <= limit and abs(z) <= limit  # NaN compares false
         compared = sample[1:] if has_rate else (q, mag, accel)
         self._alike = self._alike + 1 if compared == self._sample else 0
         self._sample = compared
@@ -452,7 +453,7 @@ class ReadingConverter:
             self.out_of_range += finite
             self.not_finite += not finite
             rate = _ZERO_RATE
-        values = self._map @ np.array((*q, *rate, *mag, *accel))
+        values = self._map.dot(np.array((*q, *rate, *mag, *accel)))
         if not has_rate:
             values[4:7] = math.nan
         # Of the two equivalent quaternions q and -q, the one with a positive scalar part is returned.

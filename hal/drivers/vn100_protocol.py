@@ -341,8 +341,9 @@ class StreamParser:
         while position < end:
             start = _START.search(buffer, position)
             begin = end if start is None else start.start()
-            self._discard(position, begin)
-            position = begin
+            if begin > position:
+                self._discard(position, begin)
+                position = begin
             if start is None:
                 break
             span = self._span(position)

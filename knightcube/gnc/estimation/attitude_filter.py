@@ -137,19 +137,16 @@ class CommandCheck:
         size = min(square / len(newly), _DEPARTURES[1] ** 2)
         self._scale = math.sqrt(max(1.0, scale**2 + (size - scale**2) / _SCALE_OVER))
         for count, limit in _SUMS.items():
-            if count < len(self._totals) and self._exceeds(count, limit):
-                since_ns = self._totals[-count][0] - _BEFORE_NS
-                self.active = True
-                self._forget()
-                return since_ns
+            # The sums of the last `count` innovations about each axis are compared with the limit.
+            if count >= len(self._totals):
+                break
+            for total, earlier in zip(newly, self._totals[-1 - count][1], strict=True):
+                if abs(total - earlier) > limit:
+                    since_ns = self._totals[-count][0] - _BEFORE_NS
+                    self.active = True
+                    self._forget()
+                    return since_ns
         return None
-
-    def _exceeds(self, count: int, limit: float) -> bool:
-        """Return whether the sum of the last `count` innovations exceeds a limit about any axis."""
-        for total, earlier in zip(self._totals[-1][1], self._totals[-1 - count][1], strict=True):
-            if abs(total - earlier) > limit:
-                return True
-        return False
 
     def _explains(self, newest: Checkpoint) -> bool:
         """Return whether wrong coil currents and noise together can explain the newest innovation."""
@@ -543,7 +540,9 @@ class AttitudeFilter:
         replay = Replay(self._model, self._history.newest, measurements)
         replay.advance()
         self._history.replace_from(len(self._history), replay.checkpoints)
-        mine = next(c for c in replay.checkpoints if c.measurement is asked)
+        mine = replay.checkpoints[-1]
+        if mine.measurement is not asked:
+            mine = next(c for c in replay.checkpoints if c.measurement is asked)
         self.nis = mine.nis
         return mine.used
 

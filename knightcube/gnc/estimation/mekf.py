@@ -554,6 +554,9 @@ class PropagationModel:
         return rate_change(self.body, state, covariance, first, last)
 
 
+_SINCE = attrgetter("since_ns")
+
+
 class Replay:
     """A replay of measurements in order of time, with its results in `checkpoints`."""
 
@@ -564,8 +567,8 @@ class Replay:
         self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
         self._pending = deque(measurements)
         # The list contains the exposures that have not begun yet, with the next exposure as last element.
-        self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
-        self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
+        exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
+        self._exposures = sorted(exposures, key=_SINCE, reverse=True) if exposures else exposures
         self.checkpoints: list[Checkpoint] = []
 
     @property
