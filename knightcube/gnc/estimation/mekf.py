@@ -334,7 +334,9 @@ def _weighed(covariance: FloatArray, rows: FloatArray, noise: FloatArray) -> tup
 def _inverse(spread: FloatArray) -> FloatArray:
     """Return the inverse of a symmetric matrix (k, k), where k is at most 3, padded to (3, 3)."""
     s = np.eye(3)
-    s[: len(spread), : len(spread)] = spread
+    for k in range(len(spread)):
+        for m in range(len(spread)):
+            s[k, m] = spread[k, m]
     a, b, c, d, e, f = s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2]
     ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     cd, ce, cf = a * f - c * c, b * c - a * e, a * d - b * b

@@ -430,7 +430,9 @@ def _propagated_covariance(
             for j in range(len(covariance)):
                 moved[i, j] += transition[i, k] * covariance[k, j]
     after = covariance.copy()
-    after[:rows], after[:, :rows] = moved, moved.T
+    for i in range(rows):
+        for j in range(len(covariance)):
+            after[i, j] = after[j, i] = moved[i, j]
     for i in range(rows):
         for j in range(rows):
             among = 0.0

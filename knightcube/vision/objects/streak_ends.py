@@ -359,7 +359,9 @@ def _corners_of_regions(
             wanted = _widened(_spans_across(around, own, spans), margin, bottom - top)
             response = _response(light.T, around.T, own, wanted, single, k, scratch)
             found = _peaks(response.T, around, own, spans, limits, corners[total:])
-        corners[total : total + found] += np.array([left, top])
+        for n in range(total, total + found):
+            corners[n, 0] += left
+            corners[n, 1] += top
         counts[number] = found
         total += found
     return corners[:total].copy(), counts

@@ -681,7 +681,9 @@ def _fit_distorted(
                         normal[i, j] += squared * slope[axis, i] * slope[axis, j]
         normal[4, 4] += PRIOR**-2
         gradient[4] += distortion / PRIOR**2
-        step[:] = -np.linalg.solve(normal, gradient)
+        solution = np.linalg.solve(normal, gradient)
+        for i in range(len(step)):
+            step[i] = -solution[i]
         longest = float(np.abs(step).max())
         if not longest < 1.0 or abs(distortion + step[4]) > _MOST:
             return False, matrix, scale, distortion, normal, squares

@@ -372,11 +372,12 @@ def _fitted(
         for k in range(len(known)):
             normal[first + k, first + k] += known[k]
             gradient[first + k] += known[k] * held[k]
-        inverse[:] = np.linalg.inv(normal)
+        inverted = np.linalg.inv(normal)
         longest, sound = 0.0, True
         for i in range(count):
             step[i] = 0.0
             for j in range(count):
+                inverse[i, j] = inverted[i, j]
                 step[i] -= inverse[i, j] * gradient[j]
             longest = max(longest, abs(step[i]))
             sound &= i >= first or abs(step[i]) < 1.0
@@ -410,7 +411,8 @@ def _write_normal(
     bends = len(held) - int(delayed)
     bend, seen, predicted = np.zeros(8), np.empty(3), np.empty(3)
     slope, flat = np.empty((3, count)), np.empty(count)
-    bend[:bends] = held[:bends]
+    for k in range(bends):
+        bend[k] = held[k]
     normal[:], gradient[:] = 0.0, 0.0
     for star in range(len(observed)):
         _see(observed[star], scale, bend, seen)

@@ -335,7 +335,8 @@ def _look_up(
     windows = np.empty((len(runs), 2), dtype=np.uint32)
     side, corner, queries, count = np.empty(3), np.empty(3, dtype=np.int64), 0, 0
     for t in range(len(triangles)):
-        corner[:] = triangles[t]
+        for k in range(3):
+            corner[k] = triangles[t, k]
         a, b, c = sigma[corner[0]], sigma[corner[1]], sigma[corner[2]]
         spread = 1.6 * tolerance * math.sqrt((a * a + b * b + c * c) / 3.0)
         joined = _joined(direction, scales, distortion, corner, side)
@@ -746,7 +747,8 @@ def _choose(
     votes = _counted_votes(observed, star, scale)
     order = _most_voted(votes, min(_RANKED * most, len(votes)))
     pairs = np.empty((len(tried) + 3 * most, 2), dtype=np.int64)
-    pairs[: len(tried)] = tried
+    for k in range(len(tried)):
+        pairs[k, 0], pairs[k, 1] = tried[k, 0], tried[k, 1]
     matrices, scales = np.empty((most, 3, 3)), np.empty(most)
     seen, wanted = np.empty((3, 3)), np.empty((3, 3))
     known, count = len(tried), 0

@@ -756,8 +756,10 @@ def _multiply(
     change, light, vectors = scratch
     vector, out, shared, alone, begin = vectors[0], vectors[1], len(free), ALONE, 0
     for star in range(len(information)):
-        vector[star, :shared] = parameters[:shared]
-        vector[star, shared:] = parameters[shared + alone * star : shared + alone * (star + 1)]
+        for k in range(shared):
+            vector[star, k] = parameters[k]
+        for k in range(alone):
+            vector[star, shared + k] = parameters[shared + alone * star + k]
         for i in range(shared + alone):
             out[star, i] = _scalar_product(information[star, i], vector[star])
     change[:] = 0.0
