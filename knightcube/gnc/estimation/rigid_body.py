@@ -420,7 +420,7 @@ def _propagated_covariance(
 ) -> FloatArray:
     """Return the result of `error_state.propagated`, computed with loops."""
     rows, size = flow.shape
-    transition, moved = dt * flow, np.zeros((rows, len(covariance)))
+    transition, moved, after = dt * flow, np.zeros((rows, len(covariance))), covariance.copy()
     for i in range(rows):
         for j in range(size):
             for k in range(rows):
@@ -429,8 +429,6 @@ def _propagated_covariance(
         for k in range(size):
             for j in range(len(covariance)):
                 moved[i, j] += transition[i, k] * covariance[k, j]
-    after = covariance.copy()
-    for i in range(rows):
         for j in range(len(covariance)):
             after[i, j] = after[j, i] = moved[i, j]
     for i in range(rows):
