@@ -492,6 +492,7 @@ def fit_with_distortion(
     """
     corner = math.hypot(*field.half_width)
     pose = _DistortedPose(start.matrix, start.scale, 0.0)
+    points = np.ascontiguousarray(field.direction), np.ascontiguousarray(field.sigma)
     reference = sky.stars.direction[expected]
     seen: set[bytes] = set()
     fitted = None
@@ -503,15 +504,12 @@ def fit_with_distortion(
         if observed.tobytes() in seen:
             break
         seen.add(observed.tobytes())
-        cosines = pose.true(field.direction, corner) @ (pose.matrix @ reference.T)
-        nearest = cosines.argmax(axis=1)
-        rows = np.arange(len(field))
-        apart = np.sqrt(np.maximum(2.0 - 2.0 * cosines[rows, nearest], 0.0))
-        gate = np.maximum(_GATE_SIGMAS * field.sigma, _GATE_SHARE * corner) * pose.scale
-        within = np.flatnonzero((apart <= gate) & (cosines.argmax(axis=0)[nearest] == rows))
+        within, nearest = _agreeing(
+            *points, reference, np.ascontiguousarray(pose.matrix), pose.scale, pose.distortion, corner
+        )
         if len(within) < len(observed):
             break
-        observed, star = within, expected[nearest[within]]
+        observed, star = within, expected[nearest]
     assert fitted is not None  # there was a round
     squares = fitted[2]
     spread = max(1.0, math.sqrt(float(np.median(squares))) / _RAYLEIGH_MEDIAN)
@@ -531,6 +529,74 @@ def fit_with_distortion(
     refined = Refinement(pose.matrix, pose.scale, covariance[:4, :4], squares)
     seen_by = pose.true(field.direction, corner)
     return DistortedFit(observed, star, refined, pose.distortion, seen_by, from_lens)
+
+
+def _agreeing_numpy(
+    direction: FloatArray,
+    sigma: FloatArray,
+    reference: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    distortion: float,
+    corner: float,
+) -> tuple[IntArray, IntArray]:
+    """Return the observed points that match guide stars, and the indices in `reference` (e, 3), both (k,).
+
+    A point and a guide star match if they are nearest to each other and within the gate.
+    """
+    cosines = _true_numpy(direction, scale, distortion, corner) @ (matrix @ reference.T)
+    nearest = cosines.argmax(axis=1)
+    rows = np.arange(len(direction))
+    apart = np.sqrt(np.maximum(2.0 - 2.0 * cosines[rows, nearest], 0.0))
+    gate = np.maximum(_GATE_SIGMAS * sigma, _GATE_SHARE * corner) * scale
+    within = np.flatnonzero((apart <= gate) & (cosines.argmax(axis=0)[nearest] == rows))
+    return within, nearest[within]
+
+
+@compiled_form_of(_agreeing_numpy)
+def _agreeing(
+    direction: FloatArray,
+    sigma: FloatArray,
+    reference: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    distortion: float,
+    corner: float,
+) -> tuple[IntArray, IntArray]:
+    """See `_agreeing_numpy`."""
+    points, stars = len(direction), len(reference)
+    nearest, closest = np.zeros(points, dtype=np.int64), np.full(points, -2.0)
+    owner, true, cosine = np.zeros(stars, dtype=np.int64), np.empty((3, points)), np.empty(points)
+    for k in range(points):
+        _write_true(direction[k], scale, distortion, corner, true[:, k])
+    for star in range(stars):
+        x, y, z = _rotated(matrix, reference[star])
+        for k in range(points):
+            cosine[k] = x * true[0, k] + y * true[1, k] + z * true[2, k]
+        best = -2.0
+        for k in range(points):
+            if cosine[k] > best:
+                best, owner[star] = cosine[k], k
+            if cosine[k] > closest[k]:
+                closest[k], nearest[k] = cosine[k], star
+    within, matched, count = np.empty(points, dtype=np.int64), np.empty(points, dtype=np.int64), 0
+    for k in range(points):
+        gate = max(_GATE_SIGMAS * sigma[k], _GATE_SHARE * corner) * scale
+        if max(2.0 - 2.0 * closest[k], 0.0) <= gate * gate and owner[nearest[k]] == k:
+            within[count], matched[count] = k, nearest[k]
+            count += 1
+    return within[:count].copy(), matched[:count].copy()
+
+
+@loop_helper
+def _rotated(matrix: FloatArray, vector: FloatArray) -> tuple[float, float, float]:
+    """Return the product of a matrix (3, 3) and a vector (3,)."""
+    x, y, z = vector
+    return (
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -569,11 +635,19 @@ def _true(direction: FloatArray, scale: float, distortion: float, corner: float)
     """See `_true_numpy`."""
     out = np.empty_like(direction)
     for k in range(len(direction)):
-        x, y, z = direction[k]
-        factor = scale * _ratio(distortion * (x * x + y * y) / (z * z * corner * corner))
-        shrink = 1.0 / math.sqrt(factor * factor + (1.0 - factor * factor) * z * z)
-        out[k, 0], out[k, 1], out[k, 2] = x * factor * shrink, y * factor * shrink, z * shrink
+        _write_true(direction[k], scale, distortion, corner, out[k])
     return out
+
+
+@loop_helper
+def _write_true(
+    direction: FloatArray, scale: float, distortion: float, corner: float, out: FloatArray
+) -> None:
+    """Write an observed unit vector (3,), corrected for scale and distortion, to `out` (3,)."""
+    x, y, z = direction
+    factor = scale * _ratio(distortion * (x * x + y * y) / (z * z * corner * corner))
+    shrink = 1.0 / math.sqrt(factor * factor + (1.0 - factor * factor) * z * z)
+    out[0], out[1], out[2] = x * factor * shrink, y * factor * shrink, z * shrink
 
 
 @loop_helper
@@ -717,11 +791,7 @@ def _write_distorted(
     factor = scale * ratio
     shrink = 1.0 / math.sqrt(factor * factor + (1.0 - factor * factor) * z * z)
     x, y, z = x * factor * shrink, y * factor * shrink, z * shrink
-    px, py, pz = (
-        matrix[0, 0] * reference[0] + matrix[0, 1] * reference[1] + matrix[0, 2] * reference[2],
-        matrix[1, 0] * reference[0] + matrix[1, 1] * reference[1] + matrix[1, 2] * reference[2],
-        matrix[2, 0] * reference[0] + matrix[2, 1] * reference[1] + matrix[2, 2] * reference[2],
-    )
+    px, py, pz = _rotated(matrix, reference)
     off[0], off[1], off[2] = x - px, y - py, z - pz
     slope[0, 1], slope[0, 2] = pz, -py
     slope[1, 0], slope[1, 2] = -pz, px

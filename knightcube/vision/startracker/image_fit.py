@@ -22,7 +22,9 @@ a common variance, the brightest stars would dominate the fit, and the covarianc
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -188,14 +190,23 @@ class _Seen:
     def __post_init__(self) -> None:
         for name in ("observed", "reference"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
-        # The `whitener` is a pseudo-inverse, because a direction has no error along the line of sight.
-        spread = self.slopes @ np.linalg.cholesky(self.covariance)
-        across = np.swapaxes(spread, -1, -2)
-        object.__setattr__(self, "whitener", np.asarray(np.linalg.inv(across @ spread) @ across))
+        given = np.ascontiguousarray(self.slopes), np.ascontiguousarray(self.covariance)
+        object.__setattr__(self, "whitener", _whiteners(*given))
         late = self.unknowns.late
         late = np.einsum("nij,nj->ni", self.slopes, late) if len(late) else np.zeros((0, 3))
         object.__setattr__(self, "late", late)
         object.__setattr__(self, "before", np.append(self.unknowns.bend, np.ones(min(len(late), 1))))
+
+    def reweighted(
+        self, start: _FittedPose, squares: FloatArray, rounds: int
+    ) -> tuple[_FittedPose, FloatArray]:
+        """Return the pose and the chi-squares (n,) after `rounds` steps with Huber's weights.
+
+        The first weights follow from the chi-squares `squares` (n,) at the pose `start`.
+        """
+        given = self._given(start)
+        agreed, matrix, scale, held, inverse, squares = self._sound(_reweighted, *given, squares, rounds)
+        return self._pose(agreed, matrix, scale, held, inverse), squares
 
     def parameters(self, pose: _FittedPose) -> float:
         """Return the effective number of parameters that are determined by the stars and not by the prior."""
@@ -207,26 +218,39 @@ class _Seen:
 
         The fit ends after at most `steps` Gauss-Newton steps.
         """
+        given = self._given(start)
+        return self._pose(*self._sound(_fitted, *given, weight, steps))
+
+    def _given(self, start: _FittedPose) -> tuple[Any, ...]:
+        """Return the arguments of `_fitted` up to the kind of the scale."""
         bends, known = len(self.unknowns.bend), self.before
-        held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
+        return (
+            self.observed,
+            self.whitener,
+            self.reference,
+            self.late,
+            known,
+            np.ascontiguousarray(start.matrix),
+            float(start.scale),
+            np.append(start.bend[:bends], np.full(len(known) - bends, start.delay)),
+            self.unknowns.scale,
+        )
+
+    def _sound(self, fit: Callable[..., Any], *given: Any) -> Any:
+        """Return the result of a fit. Raises AttitudeError if the normal matrix is singular."""
         try:
-            agreed, matrix, scale, held, inverse = _fitted(
-                self.observed,
-                self.whitener,
-                self.reference,
-                self.late,
-                weight,
-                known,
-                np.ascontiguousarray(start.matrix),
-                float(start.scale),
-                held,
-                self.unknowns.scale,
-                steps,
-            )
+            return fit(*given)
         except np.linalg.LinAlgError as error:
-            raise AttitudeError(f"{len(weight)} stars are too close together for an attitude") from error
+            stars = len(self.observed)
+            raise AttitudeError(f"{stars} stars are too close together for an attitude") from error
+
+    def _pose(
+        self, agreed: bool, matrix: FloatArray, scale: float, held: FloatArray, inverse: FloatArray
+    ) -> _FittedPose:
+        """Return the results of a fit as a pose. Raises AttitudeError if the fit diverged."""
         if not agreed:
-            raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
+            raise AttitudeError(f"{len(self.observed)} stars do not agree on an attitude")
+        bends = len(self.unknowns.bend)
         bend = np.zeros(BENDS)
         bend[:bends] = held[:bends]
         return _FittedPose(matrix, scale, bend, float(held[bends:].sum()), inverse)
@@ -240,6 +264,39 @@ class _Seen:
         scale, delay = float(pose.scale), float(pose.delay)
         matrix = np.ascontiguousarray(pose.matrix)
         return _missed(self.observed, self.reference, self.late, matrix, scale, pose.bend, delay)
+
+
+def _whiteners_numpy(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the transformations (n, 2, 3) of direction errors into two components of unit variance.
+
+    Each transformation is a pseudo-inverse, because a direction has no error along the line of sight.
+    """
+    spread = slopes @ np.linalg.cholesky(covariance)
+    across = np.swapaxes(spread, -1, -2)
+    return np.asarray(np.linalg.inv(across @ spread) @ across)
+
+
+@compiled_form_of(_whiteners_numpy)
+def _whiteners(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """See `_whiteners_numpy`."""
+    out, across = np.empty((len(slopes), 2, 3)), np.empty((2, 3))
+    for star in range(len(slopes)):
+        # The columns of the product of slopes and Cholesky factor.
+        first = math.sqrt(covariance[star, 0, 0])
+        below = covariance[star, 1, 0] / first
+        second = math.sqrt(covariance[star, 1, 1] - below * below)
+        xx, xy, yy = 0.0, 0.0, 0.0
+        for axis in range(3):
+            across[0, axis] = first * slopes[star, axis, 0] + below * slopes[star, axis, 1]
+            across[1, axis] = second * slopes[star, axis, 1]
+            xx += across[0, axis] * across[0, axis]
+            xy += across[0, axis] * across[1, axis]
+            yy += across[1, axis] * across[1, axis]
+        determinant = xx * yy - xy * xy
+        for axis in range(3):
+            out[star, 0, axis] = (yy * across[0, axis] - xy * across[1, axis]) / determinant
+            out[star, 1, axis] = (xx * across[1, axis] - xy * across[0, axis]) / determinant
+    return out
 
 
 def _missed_numpy(
@@ -273,13 +330,29 @@ def _missed(
     """See `_missed_numpy`."""
     out = np.empty_like(observed)
     for star in range(len(observed)):
-        _see(observed[star], scale, bend, out[star])
-        for axis in range(3):
-            if len(late):
-                out[star, axis] -= delay * late[star, axis]
-            for k in range(3):
-                out[star, axis] -= matrix[axis, k] * reference[star, k]
+        _miss(observed, reference, late, matrix, scale, bend, delay, star, out[star])
     return out
+
+
+@loop_helper
+def _miss(
+    observed: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    bend: FloatArray,
+    delay: float,
+    star: int,
+    off: FloatArray,
+) -> None:
+    """Write the difference between observed and predicted unit vector of one star to `off` (3,)."""
+    _see(observed[star], scale, bend, off)
+    for axis in range(3):
+        if len(late):
+            off[axis] -= delay * late[star, axis]
+        for k in range(3):
+            off[axis] -= matrix[axis, k] * reference[star, k]
 
 
 def _fitted_numpy(
@@ -287,12 +360,12 @@ def _fitted_numpy(
     whitener: FloatArray,
     reference: FloatArray,
     late: FloatArray,
-    weight: FloatArray,
     known: FloatArray,
     matrix: FloatArray,
     scale: float,
     held: FloatArray,
     free_scale: bool,
+    weight: FloatArray,
     steps: int,
 ) -> _Fitted:
     """Return whether the fit converged, the matrix, the scale, lens errors and delay, and the covariance.
@@ -353,14 +426,34 @@ def _fitted(
     whitener: FloatArray,
     reference: FloatArray,
     late: FloatArray,
-    weight: FloatArray,
     known: FloatArray,
     matrix: FloatArray,
     scale: float,
     held: FloatArray,
     free_scale: bool,
+    weight: FloatArray,
     steps: int,
 ) -> _Fitted:
+    return _stepped(
+        observed, whitener, reference, late, known, matrix, scale, held, free_scale, weight, steps
+    )
+
+
+@loop_helper
+def _stepped(
+    observed: FloatArray,
+    whitener: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    known: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    held: FloatArray,
+    free_scale: bool,
+    weight: FloatArray,
+    steps: int,
+) -> _Fitted:
+    """Return the results of `_fitted_numpy`."""
     first = 4 if free_scale else 3
     count = first + len(known)
     matrix, held, step = matrix.copy(), held.copy(), np.empty(count)
@@ -390,6 +483,79 @@ def _fitted(
         if longest < _SETTLED:
             break
     return True, matrix, scale, held, inverse
+
+
+_Reweighted = tuple[bool, FloatArray, float, FloatArray, FloatArray, FloatArray]
+
+
+def _reweighted_numpy(
+    observed: FloatArray,
+    whitener: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    known: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    held: FloatArray,
+    free_scale: bool,
+    squares: FloatArray,
+    rounds: int,
+) -> _Reweighted:
+    """Return the results of `_fitted_numpy` and the chi-squares (n,) after steps with Huber's weights."""
+    seen, agreed, inverse = (observed, whitener, reference, late, known), True, np.zeros((0, 0))
+    bends, bend = len(held) - int(len(late) > 0), np.zeros(BENDS)
+    for _ in range(rounds):
+        weight = _PULL / np.maximum(np.sqrt(squares), _PULL)
+        agreed, matrix, scale, held, inverse = _fitted_numpy(
+            *seen, matrix, scale, held, free_scale, weight, 1
+        )
+        if not agreed:
+            break
+        bend[:bends] = held[:bends]
+        delay = float(held[bends:].sum())
+        missed = _missed_numpy(observed, reference, late, matrix, scale, bend, delay)
+        squares = np.sum(np.einsum("nij,nj->ni", whitener, missed) ** 2, axis=1)
+    return agreed, matrix, scale, held, inverse, squares
+
+
+@compiled_form_of(_reweighted_numpy)
+def _reweighted(
+    observed: FloatArray,
+    whitener: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    known: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    held: FloatArray,
+    free_scale: bool,
+    squares: FloatArray,
+    rounds: int,
+) -> _Reweighted:
+    """See `_reweighted_numpy`."""
+    squares, weight, off = squares.copy(), np.empty(len(squares)), np.empty(3)
+    bends, bend, delay = len(held) - int(len(late) > 0), np.zeros(8), 0.0
+    agreed, inverse = True, np.zeros((0, 0))
+    for _ in range(rounds):
+        for star in range(len(squares)):
+            weight[star] = _PULL / max(math.sqrt(squares[star]), _PULL)
+        agreed, matrix, scale, held, inverse = _stepped(
+            observed, whitener, reference, late, known, matrix, scale, held, free_scale, weight, 1
+        )
+        if not agreed:
+            break
+        bend[:bends] = held[:bends]
+        delay = held[bends] if len(late) else 0.0
+        for star in range(len(squares)):
+            _miss(observed, reference, late, matrix, scale, bend, delay, star, off)
+            squares[star] = 0.0
+            for row in range(2):
+                squares[star] += (
+                    whitener[star, row, 0] * off[0]
+                    + whitener[star, row, 1] * off[1]
+                    + whitener[star, row, 2] * off[2]
+                ) ** 2
+    return agreed, matrix, scale, held, inverse, squares
 
 
 @loop_helper
@@ -522,10 +688,8 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     An outlier affects the residuals of all stars in a fit. The influence of outliers is bounded before the
     scatter of the residuals is computed.
     """
-    for _ in range(_HUBER_ROUNDS):
-        # One step for each set of weights suffices, because only the residuals of the last fit are used.
-        pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL), steps=1)
-        squares = seen.squares(pose)
+    # One step for each set of weights suffices, because only the residuals of the last fit are used.
+    pose, squares = seen.reweighted(pose, squares, _HUBER_ROUNDS)
     # A star agrees with the fit if its residual is within the scatter of the majority of stars.
     # All stars are used if too few stars agree.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)

@@ -302,7 +302,41 @@ def expected_stars(
     sky: SkyIndex, matrix: FloatArray, half_width: tuple[float, float], count: int
 ) -> npt.NDArray[np.intp]:
     """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
-    return _expected_numpy(sky.stars.direction, sky.coarse, matrix, half_width, count)
+    across, down = float(half_width[0]), float(half_width[1])
+    return _expected(
+        sky.stars.direction, sky.coarse, *sky.boxes, np.ascontiguousarray(matrix), across, down, count
+    )
+
+
+def _expected_stars_numpy(
+    guide: FloatArray,
+    coarse: npt.NDArray[np.float32],
+    by_box: npt.NDArray[np.int32],
+    placed: FloatArray,
+    begin_of_box: npt.NDArray[np.int32],
+    matrix: FloatArray,
+    across: float,
+    down: float,
+    count: int,
+) -> npt.NDArray[np.intp]:
+    """See `expected_stars`; the boxes of the index are used only by the compiled form."""
+    return _expected_numpy(guide, coarse, matrix, (across, down), count)
+
+
+@compiled_form_of(_expected_stars_numpy)
+def _expected(
+    guide: FloatArray,
+    coarse: npt.NDArray[np.float32],
+    by_box: npt.NDArray[np.int32],
+    placed: FloatArray,
+    begin_of_box: npt.NDArray[np.int32],
+    matrix: FloatArray,
+    across: float,
+    down: float,
+    count: int,
+) -> npt.NDArray[np.intp]:
+    """See `_expected_stars_numpy`."""
+    return _inside(matrix, across, down, count, by_box, placed, begin_of_box)
 
 
 def _expected_numpy(

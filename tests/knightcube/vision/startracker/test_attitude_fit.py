@@ -22,6 +22,7 @@ from knightcube.vision.startracker.attitude_fit import (
     DistortedFit,
     Refinement,
     StarField,
+    _agreeing,
     _fit_distorted,
     _refined,
     _true,
@@ -277,3 +278,6 @@ def test_the_compiled_fit_of_the_distortion_equals_that_in_numpy(distortion: flo
             _fit_distorted, seen, reference, weight, np.eye(3), 0.99, distortion, 0.2, relative=1e-6
         )
         assert_forms_agree(_true, seen, 1.01, distortion, 0.2)
+        sigma = rng.uniform(0.5, 2.0, count) * SIGMA
+        assert len(_agreeing.numpy_form(seen, sigma, reference, turn, 1.0 / 1.02, 0.0, 0.2)[0]) == count
+        assert_forms_agree(_agreeing, seen, sigma, reference[::2].copy(), turn, 0.98, distortion, 0.2)

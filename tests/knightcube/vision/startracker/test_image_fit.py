@@ -23,6 +23,8 @@ from knightcube.vision.startracker.image_fit import (
     Unknowns,
     _fitted,
     _missed,
+    _reweighted,
+    _whiteners,
     attitude_by,
     fit_in_image,
 )
@@ -281,13 +283,22 @@ def test_the_compiled_fit_equals_that_in_numpy(scale: bool, bends: int, delayed:
     across = np.linalg.svd(observed[:, None, :])[2][:, 1:]
     known = draw.uniform(1.0, 4.0, bends + delayed)
     late = 1e-3 * draw.normal(size=(30 if delayed else 0, 3))
-    given = observed, 1e4 * across, reference, late, draw.uniform(0.0, 1.0, 30), known
-    assert_forms_agree(_fitted, *given, np.eye(3), 1.01, 1e-3 * known, scale, 8, relative=1e-7)
+    given = observed, 1e4 * across, reference, late, known, np.eye(3), 1.01, 1e-3 * known, scale
+    weight, squares = draw.uniform(0.0, 1.0, 30), draw.uniform(0.0, 20.0, 30)
+    assert_forms_agree(_fitted, *given, weight, 8, relative=1e-7)
+    assert_forms_agree(_reweighted, *given, squares, 5, relative=1e-7)
     bend = 1e-2 * draw.normal(size=8) if bends else np.zeros(8)
     assert_forms_agree(_missed, observed, reference, late, np.eye(3), 1.01, bend, 0.3)
-    agreed, matrix, *_ = _fitted.numpy_form(*given, np.eye(3), 1.01, 1e-3 * known, scale, 8)
+    agreed, matrix, *_ = _fitted.numpy_form(*given, weight, 8)
     assert agreed
     assert np.abs(np.mean(observed - reference @ matrix.T, axis=0)).max() < 1e-2
+
+
+def test_the_compiled_whitening_of_directions_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(5)
+    root = draw.normal(size=(20, 2, 2))
+    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    assert_forms_agree(_whiteners, 1e-4 * draw.normal(size=(20, 3, 2)), covariance)
 
 
 @pytest.mark.parametrize("scale", [False, True])

@@ -19,6 +19,7 @@ from knightcube.vision.startracker.attitude_fit import MatchStatus
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.verification import (
     Chance,
+    _expected,
     _first_match,
     order_probability,
     track,
@@ -165,6 +166,13 @@ def test_all_forms_match_the_same_stars_of_the_same_candidate(limit: float) -> N
         for expected in (np.empty(0, dtype=np.int64), np.unique(drawn.star[drawn.star >= 0])):
             given = field.direction, field.sigma, matrices, scales, *facts, limit, expected, *table
             assert_forms_agree(_first_match, *given, relative=1e-6)
+
+
+def test_all_forms_expect_the_same_stars() -> None:
+    table = SKY.stars.direction, SKY.coarse, *SKY.boxes
+    for seed, across, count in ((1, 0.1, 40), (2, 0.3, 500), (3, 0.05, 8)):
+        matrix = attitude_matrix(normalise(np.random.default_rng(seed).normal(size=4)))
+        assert_forms_agree(_expected, *table, matrix, across, 0.7 * across, count, compiled=seed == 1)
 
 
 def test_attitudes_that_are_not_numbers_match_no_star_in_any_form() -> None:
