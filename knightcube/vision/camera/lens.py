@@ -73,8 +73,10 @@ class Pinhole:
     def unit_vectors(self, points: FloatArray) -> FloatArray:
         """Return unit vectors (n, 3) to pixels (n, 2), in the camera frame (Sease, eq. (3.20), (3.21))."""
         offset = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
-        v = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1)
-        return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+        v = np.ones((*offset.shape[:-1], 3))
+        v[..., :2] = offset
+        v /= np.sqrt(np.einsum("...i,...i", v, v))[..., None]
+        return v
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
         """Return which pixel positions (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
@@ -183,22 +185,23 @@ class Lens:
             raise LensError(
                 f"{self.columns} x {self.rows} pixels, focal length {self.focal_length}: must be positive"
             )
-        if not np.all(np.isfinite([*self.centre, self.k1, self.k2])):
+        # Python floats are used, because numpy takes ten times as long for single numbers.
+        if not all(map(math.isfinite, (*self.centre, self.k1, self.k2))):
             raise LensError(f"centre {self.centre}, k1 {self.k1}, k2 {self.k2}: must be finite")
         if not (abs(self.aspect) < _MOST_SHAPE and abs(self.shear) < _MOST_SHAPE):
             text = f"aspect {self.aspect}, shear {self.shear}"
             raise LensError(f"{text}: must be between -{_MOST_SHAPE} and {_MOST_SHAPE}")
-        if not np.all(np.isfinite([self.p1, self.p2])):
+        if not (math.isfinite(self.p1) and math.isfinite(self.p2)):
             raise LensError(f"p1 {self.p1}, p2 {self.p2}: must be finite")
         object.__setattr__(self, "reach", _reach(self.k1, self.k2))
-        corner = float(np.max(np.hypot(*(self._corners() - self.centre).T))) / self.focal_length
+        corner = self._corner()
         if corner >= self._limit():
             raise LensError(
                 f"k1 {self.k1}, k2 {self.k2}: distortion folds the image back at"
                 f" {self._limit() * self.focal_length:.0f} px from the axis, but the detector extends to"
                 f" {corner * self.focal_length:.0f} px"
             )
-        if 6.0 * np.hypot(self.p1, self.p2) * corner > _MOST_TANGENTIAL:
+        if 6.0 * math.hypot(self.p1, self.p2) * corner > _MOST_TANGENTIAL:
             raise LensError(f"p1 {self.p1}, p2 {self.p2}: the distortion cannot be inverted at the corners")
 
     @classmethod
@@ -291,7 +294,17 @@ class Lens:
     @property
     def half_diagonal(self) -> float:
         """The angle from the boresight to the farthest corner of the detector, rad."""
+        if self.p1 == self.p2 == self.aspect == self.shear == 0.0:
+            return math.atan(float(self._undistorted(np.array([self._corner()]))[0]))
         return float(np.arccos(np.min(self.unit_vectors(self._corners())[:, 2])))
+
+    def _corner(self) -> float:
+        """Return the largest distance of a corner of the detector from the axis, in focal lengths."""
+        x, y = self.centre
+        across, down = (
+            max(place + 0.5, side - 0.5 - place) for place, side in ((x, self.columns), (y, self.rows))
+        )
+        return math.hypot(across, down) / self.focal_length
 
     def _corners(self) -> FloatArray:
         right, bottom = self.columns - 0.5, self.rows - 0.5
@@ -361,10 +374,10 @@ def _reach(k1: float, k2: float) -> float:
     """
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
-        return np.inf
+        return math.inf
     # This formula for the smaller positive root r^2 avoids cancellation and is also valid for k2 = 0.
-    denominator = -3.0 * k1 + np.sqrt(discriminant)
-    return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
+    denominator = -3.0 * k1 + math.sqrt(discriminant)
+    return math.sqrt(2.0 / denominator) if denominator > _NO_FOLD else math.inf
 
 
 def check_image(image: Image, camera: CameraModel) -> None:

@@ -345,7 +345,7 @@ def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSet
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
     # The place is undetermined if, for instance, all pixels of the source are saturated.
-    near &= np.trace(found.covariance, axis1=1, axis2=2) < 2.0 * far[:, 0] ** 2
+    near &= found.covariance[:, 0, 0] + found.covariance[:, 1, 1] < 2.0 * far[:, 0] ** 2
     limits = np.array(targets.pixels.shape)[::-1] - 0.5
     inside = ((found.points > -0.5) & (found.points < limits)).all(axis=1)
     return np.asarray(
@@ -364,7 +364,7 @@ def assemble(
     """Return the measured sources as `Detections`, in the order of the targets."""
     return Detections(
         found.points,
-        np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2)),
+        np.sqrt(0.5 * (found.covariance[:, 0, 0] + found.covariance[:, 1, 1])),
         found.covariance,
         found.flux,
         targets.level + found.sky,

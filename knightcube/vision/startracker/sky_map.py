@@ -24,7 +24,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel
 from knightcube.vision.startracker.attitude_fit import scale_slope
 
@@ -97,18 +97,61 @@ def _bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
     out = np.empty_like(direction)
     for k in range(len(direction)):
         x, y, z = direction[k]
-        tx, ty = x / z, y / z
-        square = tx * tx + ty * ty
-        along = bend[0] * tx + bend[1] * ty + (bend[4] + bend[5] * square) * square
-        # Displacement of the tangents by decentring and by pixels that are not square, multiplied by z.
-        dx = z * (square * bend[2] + tx * bend[6] + ty * bend[7])
-        dy = z * (square * bend[3] - ty * bend[6] + tx * bend[7])
-        inward = x * dx + y * dy
-        ox = x + along * x * z * z + dx - x * inward
-        oy = y + along * y * z * z + dy - y * inward
-        oz = z - along * z * (x * x + y * y) - z * inward
-        size = math.sqrt(ox * ox + oy * oy + oz * oz)
-        out[k, 0], out[k, 1], out[k, 2] = ox / size, oy / size, oz / size
+        out[k, 0], out[k, 1], out[k, 2] = _bent_one(x, y, z, bend)
+    return out
+
+
+@loop_helper
+def _bent_one(x: float, y: float, z: float, bend: FloatArray) -> tuple[float, float, float]:
+    """Return one unit vector corrected for the lens errors `bend` (8,)."""
+    tx, ty = x / z, y / z
+    square = tx * tx + ty * ty
+    along = bend[0] * tx + bend[1] * ty + (bend[4] + bend[5] * square) * square
+    # Displacement of the tangents by decentring and by pixels that are not square, multiplied by z.
+    dx = z * (square * bend[2] + tx * bend[6] + ty * bend[7])
+    dy = z * (square * bend[3] - ty * bend[6] + tx * bend[7])
+    inward = x * dx + y * dy
+    ox = x + along * x * z * z + dx - x * inward
+    oy = y + along * y * z * z + dy - y * inward
+    oz = z - along * z * (x * x + y * y) - z * inward
+    size = math.sqrt(ox * ox + oy * oy + oz * oz)
+    return ox / size, oy / size, oz / size
+
+
+# Maximum number of iterations that invert the lens errors, and step (rad) below which they end.
+# Each iteration reduces the error to a few per cent.
+_BEND_STEPS, _LEAST_STEP = 8, 1e-11
+
+
+def _unbent_numpy(direction: FloatArray, bend: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 3) that `bent` transforms into `direction` (n, 3); NaN for z <= 0."""
+    wanted = np.where(direction[:, 2:] > 0.0, direction, np.nan)
+    found = wanted
+    for _ in range(_BEND_STEPS):
+        step = wanted - _bent_numpy(found, bend)
+        found = found + step
+        found = found / np.linalg.norm(found, axis=1, keepdims=True)
+        if not np.any(np.abs(step) > _LEAST_STEP):
+            break
+    return found
+
+
+@compiled_form_of(_unbent_numpy)
+def _unbent(direction: FloatArray, bend: FloatArray) -> FloatArray:
+    """See `_unbent_numpy`."""
+    out = np.full(direction.shape, np.nan)
+    for k in range(len(direction)):
+        wx, wy, wz = direction[k]
+        x, y, z = wx, wy, wz
+        for _ in range(_BEND_STEPS if wz > 0.0 else 0):
+            bx, by, bz = _bent_one(x, y, z, bend)
+            step = max(abs(wx - bx), abs(wy - by), abs(wz - bz))
+            x, y, z = x + wx - bx, y + wy - by, z + wz - bz
+            size = math.sqrt(x * x + y * y + z * z)
+            x, y, z = x / size, y / size, z / size
+            out[k, 0], out[k, 1], out[k, 2] = x, y, z
+            if not step > _LEAST_STEP:
+                break
     return out
 
 
@@ -174,11 +217,6 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Maximum number of iterations that invert the lens errors, and step (px) below which they end.
-# Each iteration reduces the error to a few per cent.
-_BEND_STEPS, _LEAST_STEP = 8, 1e-7
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SkyMap:
     """The conversion between pixels and directions for a camera of known attitude.
@@ -209,14 +247,10 @@ class SkyMap:
         """Return the pixels (n, 2) of unit vectors (n, 3), ICRS, or NaN for directions not imaged."""
         if self.velocity is not None:
             directions = apparent(directions, self.velocity)
-        wanted = self.camera.project(directions @ attitude_matrix(self.quaternion).T)
-        points = wanted
-        for _ in range(_BEND_STEPS if self.bend.any() else 0):
-            step = wanted - self.camera.project(bent(self.camera.unit_vectors(points), self.bend))
-            points = points + step
-            if not np.any(np.abs(step) > _LEAST_STEP):
-                break
-        return self._exchanged(points)
+        seen = directions @ attitude_matrix(self.quaternion).T
+        if self.bend.any():
+            seen = _unbent(np.ascontiguousarray(seen), self.bend)
+        return self._exchanged(self.camera.project(seen))
 
     def _exchanged(self, points: FloatArray) -> FloatArray:
         """Return pixels (n, 2) with left and right swapped if the image shows the mirrored sky."""

@@ -467,7 +467,7 @@ def star_field(
     """Return the points of a frame as a `StarField`; their standard deviations are at least `least` px."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
-    pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
+    pixels = np.sqrt(0.5 * (seen.covariance[:, 0, 0] + seen.covariance[:, 1, 1]) + least**2)
     # At an angle a from the boresight, the angle of a pixel is proportional to cos^2 a along the radius.
     # Across the radius, the angle of a pixel is proportional to cos a.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
@@ -580,7 +580,8 @@ def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
     # Unlike k1, the coefficient `distortion` applies to tangents divided by the image corner's tangent.
     corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
     try:
-        return replace(Lens.of(camera), k1=found.distortion / corner**2)
+        k1 = found.distortion / corner**2
+        return Lens(camera.columns, camera.rows, camera.focal_length, camera.centre, k1)
     except LensError:
         return camera
 

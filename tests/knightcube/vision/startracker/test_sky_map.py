@@ -19,6 +19,7 @@ from knightcube.vision.startracker.sky_map import (
     ShortTrails,
     SkyMap,
     _bent,
+    _unbent,
     apparent,
     bend_slope,
     bent,
@@ -120,6 +121,9 @@ def test_the_compiled_lens_errors_equal_those_in_numpy() -> None:
     for k in range(8):
         assert_forms_agree(_bent, seen, 0.1 * np.eye(8)[k])
     assert_forms_agree(_bent, seen, draw.normal(0.0, 0.1, 8))
+    bend = draw.normal(0.0, 0.03, 8)
+    assert _bent.numpy_form(_unbent.numpy_form(seen, bend), bend) == pytest.approx(seen, abs=1e-9)
+    assert_forms_agree(_unbent, seen * np.where(np.arange(len(seen)) == 3, -1.0, 1.0)[:, None], bend)
 
 
 _BEND = np.array([0.02, -0.03, 0.004, 0.006, 0.05, -0.03, 0.01, -0.02])
