@@ -35,7 +35,7 @@ def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record
 
 
 @functools.cache
-def _names(kind: type) -> tuple[str, ...]:
+def _names(kind: type[Any]) -> tuple[str, ...]:
     """Return the names of the fields of a dataclass."""
     return tuple(field.name for field in fields(kind))
 

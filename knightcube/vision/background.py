@@ -326,7 +326,7 @@ def _share_uneven(level: FloatArray, noise: FloatArray) -> float:
             if 0 < column < across - 1:
                 steep |= _changes(level[row, column - 1], own, level[row, column + 1], floor)
             count += int(steep)
-    return count / (down * across)
+    return float(count / (down * across))
 
 
 @loop_helper

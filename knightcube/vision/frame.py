@@ -325,7 +325,7 @@ def _is_hot(signal: Image, row: int, column: int, noise: float, level: float) ->
     return brighter <= 1 and (alone or pair)
 
 
-def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
+def _are_hot_numpy(light: FloatArray, noise: FloatArray) -> BoolArray:
     """Return whether each of n windows of nine pixels contains one or two hot pixels, but no point of light.
 
     The array `light` (9, n) contains the counts above the background of the pixels of each window, and
@@ -335,6 +335,23 @@ def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
     alone = second < np.minimum(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
     pair = (highest > _PAIR * noise) & (third < _SHARPNESS * highest + _PAIR_NOISE * noise)
     return np.asarray(alone | pair)
+
+
+@compiled_form_of(_are_hot_numpy)
+def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
+    """See `_are_hot_numpy`."""
+    found = np.empty(len(noise), dtype=np.bool_)
+    for k in range(len(noise)):
+        highest, second, third = -np.inf, -np.inf, -np.inf
+        for pixel in range(9):
+            value = light[pixel, k]
+            third = max(third, min(second, value))
+            second = max(second, min(highest, value))
+            highest = max(highest, value)
+        alone = second < min(_SHARPNESS * highest + _NOISE * noise[k], _MOST * highest)
+        pair = highest > _PAIR * noise[k] and third < _SHARPNESS * highest + _PAIR_NOISE * noise[k]
+        found[k] = alone or pair
+    return found
 
 
 def _hot_among_numpy(
@@ -350,7 +367,9 @@ def _hot_among_numpy(
     around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND]) - level
     own = signal[row, column] - level
     # A hot pixel has at most one brighter neighbour, because up to two adjacent pixels can be hot.
-    hot = are_hot(np.concatenate([around, own[None]]), noise) & (np.count_nonzero(around > own, axis=0) <= 1)
+    hot = _are_hot_numpy(np.concatenate([around, own[None]]), noise) & (
+        np.count_nonzero(around > own, axis=0) <= 1
+    )
     return row[hot], column[hot]
 
 

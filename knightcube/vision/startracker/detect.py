@@ -334,10 +334,29 @@ def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
 
     The sources are at `points` (n, 2), px. The mask `odd` (n,) marks the sources that do not look like stars.
     """
+    return _among_odd(odd, np.ascontiguousarray(points))
+
+
+def _among_odd_numpy(odd: BoolArray, points: FloatArray) -> BoolArray:
+    """See `among_odd`."""
     x, y = points.T
     near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < _ABOUT**2
     strange = np.count_nonzero(near & odd, axis=1)
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * np.count_nonzero(near, axis=1)))
+
+
+@compiled_form_of(_among_odd_numpy)
+def _among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
+    """See `among_odd`."""
+    found = np.zeros(len(odd), dtype=np.bool_)
+    for one in range(len(odd)):
+        near, strange = 0, 0
+        for other in range(len(odd)):
+            across, down = points[one, 0] - points[other, 0], points[one, 1] - points[other, 1]
+            beside = across * across + down * down < _ABOUT**2
+            near, strange = near + int(beside), strange + int(beside & odd[other])
+        found[one] = strange >= _LEAST_ODD and strange > _ODD_PART * near
+    return found
 
 
 def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:

@@ -17,12 +17,14 @@ computed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.frame import are_hot
 from knightcube.vision.startracker.psf_fit import (
     FLUX,
@@ -145,28 +147,69 @@ def _noise_of(fitted: PsfFit, windows: StarWindows, settings: DetectionSettings)
 
 def start(windows: StarWindows) -> tuple[FloatArray, FloatArray]:
     """Return initial offsets (n, 2), px, and fluxes (n,), counts, from the middle 3 x 3 pixels."""
-    h = windows.half
-    core = np.maximum(windows.light[:, h - 1 : h + 2, h - 1 : h + 2], 0.0)
+    return _starts(windows.light, windows.noise)
+
+
+def _starts_numpy(light: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """See `start`; the windows have the counts `light` (n, k, k) and the noise (n,)."""
+    h = light.shape[1] // 2
+    core = np.maximum(light[:, h - 1 : h + 2, h - 1 : h + 2], 0.0)
     whole = np.maximum(core.sum(axis=(1, 2)), 1e-12)
     x = (core[:, :, 2] - core[:, :, 0]).sum(axis=1) / whole
     y = (core[:, 2] - core[:, 0]).sum(axis=1) / whole
     # The 3 x 3 pixels contain three quarters of the flux of a star of 1 px standard deviation.
-    flux = np.maximum(whole / 0.75, windows.noise)
+    flux = np.maximum(whole / 0.75, noise)
     return np.clip(np.stack([x, y], axis=-1), -0.6, 0.6), flux
+
+
+@compiled_form_of(_starts_numpy)
+def _starts(light: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """See `_starts_numpy`."""
+    h, offset, flux = light.shape[1] // 2, np.empty((len(light), 2)), np.empty(len(light))
+    for star in range(len(light)):
+        whole, x, y = 0.0, 0.0, 0.0
+        for row in range(-1, 2):
+            for column in range(-1, 2):
+                counts = max(light[star, h + row, h + column], 0.0)
+                whole, x, y = whole + counts, x + column * counts, y + row * counts
+        whole = max(whole, 1e-12)
+        offset[star, 0] = min(max(x / whole, -0.6), 0.6)
+        offset[star, 1] = min(max(y / whole, -0.6), 0.6)
+        flux[star] = max(whole / 0.75, noise[star])
+    return offset, flux
 
 
 def single_pixels(windows: StarWindows) -> BoolArray:
     """Return which windows (n,) show a hot pixel: one or two bright pixels with dark neighbours."""
     h = windows.half
     core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
-    return np.asarray(are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise))
+    hot = are_hot(np.ascontiguousarray(core.T), windows.noise)
+    return np.asarray(hot & (core.max(axis=1) > _LEAST_HOT * windows.noise))
 
 
 def crowded(middle: IntArray) -> BoolArray:
     """Return which stars (n,) have another star in their window of the first fit."""
+    return _crowded(np.ascontiguousarray(middle))
+
+
+def _crowded_numpy(middle: IntArray) -> BoolArray:
+    """See `crowded`."""
     x, y = middle.T
     near = (np.abs(x[:, None] - x) < _APART) & (np.abs(y[:, None] - y) < _APART)
     return np.asarray(np.count_nonzero(near, axis=1) > 1)
+
+
+@compiled_form_of(_crowded_numpy)
+def _crowded(middle: IntArray) -> BoolArray:
+    """See `crowded`."""
+    found = np.zeros(len(middle), dtype=np.bool_)
+    for one in range(len(middle)):
+        for other in range(one):
+            across, down = middle[one, 0] - middle[other, 0], middle[one, 1] - middle[other, 1]
+            near = (abs(across) < _APART) & (abs(down) < _APART)
+            found[one] |= near
+            found[other] |= near
+    return found
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
@@ -175,6 +218,11 @@ def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatA
     Each sixteenth of the area has the same total weight. Stars are in all parts of the frame, but foreground
     sources, such as the leaves of a tree, are in one part.
     """
+    return _spread_evenly(np.ascontiguousarray(middle), chosen)
+
+
+def _spread_evenly_numpy(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
+    """See `_evenly_spread`."""
     place = middle[chosen] - middle.min(axis=0)
     column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
     cell = row * 4 + column
@@ -182,6 +230,25 @@ def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatA
     first = rank < _MOST_OF_CELL
     count = np.bincount(cell[first], minlength=16)
     return chosen[first], 1.0 / count[cell[first]]
+
+
+@compiled_form_of(_spread_evenly_numpy)
+def _spread_evenly(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
+    """See `_evenly_spread`."""
+    left, top, right, bottom = middle[0, 0], middle[0, 1], middle[0, 0], middle[0, 1]
+    for star in range(len(middle)):
+        left, right = min(left, middle[star, 0]), max(right, middle[star, 0])
+        top, bottom = min(top, middle[star, 1]), max(bottom, middle[star, 1])
+    count, cell = np.zeros(16, dtype=np.int64), np.empty(len(chosen), dtype=np.int64)
+    first, kept = np.empty(len(chosen), dtype=np.int64), 0
+    for star in chosen:
+        column = (middle[star, 0] - left) * 4 // (right - left + 1)
+        own = (middle[star, 1] - top) * 4 // (bottom - top + 1) * 4 + column
+        if count[own] < _MOST_OF_CELL:
+            first[kept], cell[kept] = star, own
+            count[own] += 1
+            kept += 1
+    return first[:kept].copy(), 1.0 / count[cell[:kept]]
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
@@ -401,7 +468,10 @@ def measure(
     for chosen, saturated in parts:
         if not chosen.any():
             continue
-        some, before = targets.select(chosen), shapes.fitted.select(np.flatnonzero(chosen))
+        if chosen.all():
+            some, before = targets, shapes.fitted
+        else:
+            some, before = targets.select(chosen), shapes.fitted.select(np.flatnonzero(chosen))
         if saturated:
             widest = float(some.core.max(initial=0.0)) + REACH * spread.psf_sigma + 1.0
             half = int(np.clip(np.ceil(widest), LEAST_HALF, 2 * MOST_HALF))
@@ -476,10 +546,36 @@ def _shared(
 
 def _flux_sigma(found: PsfFit, windows: StarWindows, noise: NoiseModel) -> FloatArray:
     """Return the standard deviations (n,) of the fluxes, counts, due to sky noise and photon noise only."""
-    flux = np.where(found.flux > 0.0, found.flux, np.inf)[:, None, None]
-    seen = np.where(windows.good, found.model / flux, 0.0)
-    counted = NoiseModel(noise.photon).variance(found.model, windows.noise)
+    good = np.ascontiguousarray(windows.good)
+    return _flux_errors(found.model, good, np.ascontiguousarray(found.flux), windows.noise, noise.photon)
+
+
+def _flux_errors_numpy(
+    model: FloatArray, good: BoolArray, flux: FloatArray, noise: FloatArray, photon: float
+) -> FloatArray:
+    """Return the standard deviations (n,) of the fluxes (n,) for modelled counts (n, k, k), counts."""
+    counts = np.where(flux > 0.0, flux, np.inf)[:, None, None]
+    seen = np.where(good, model / counts, 0.0)
+    counted = NoiseModel(photon).variance(model, noise)
     return np.asarray(np.sum(seen * seen / counted, axis=(1, 2)) + 1e-30) ** -0.5
+
+
+@compiled_form_of(_flux_errors_numpy)
+def _flux_errors(
+    model: FloatArray, good: BoolArray, flux: FloatArray, noise: FloatArray, photon: float
+) -> FloatArray:
+    """See `_flux_errors_numpy`."""
+    out, size = np.empty(len(flux)), model.shape[1]
+    for star in range(len(flux)):
+        total, floor = 0.0, noise[star] ** 2
+        for row in range(size):
+            for column in range(size):
+                counts = model[star, row, column]
+                if good[star, row, column]:
+                    total += counts * counts / (floor + photon * max(counts, 0.0))
+        total = total / flux[star] ** 2 if flux[star] > 0.0 else 0.0
+        out[star] = 1.0 / math.sqrt(total + 1e-30)
+    return out
 
 
 def _centred(targets: StarTargets, spread: FrameSpread, settings: DetectionSettings) -> MeasuredStars:

@@ -760,9 +760,16 @@ def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int
     The overlap of two star images at the distance d is exp(-d^2 / 4 sigma^2), where sigma is the standard
     deviation of the PSF. An overlap below 1 % is set to 0.
     """
+    reach = half + _BEYOND * psf_sigma
+    return Pairs(*_pairs(np.ascontiguousarray(points), np.ascontiguousarray(flux), psf_sigma, reach))
+
+
+def _pairs_numpy(
+    points: FloatArray, flux: FloatArray, psf_sigma: float, reach: float
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the attributes of the `Pairs` of stars closer than `reach`, px, along both axes."""
     x, y = points.T
     across, down = x[:, None] - x, y[:, None] - y
-    reach = half + _BEYOND * psf_sigma
     near = (np.abs(across) < reach) & (np.abs(down) < reach) & (flux > 0.0)
     np.fill_diagonal(near, val=False)
     first, second = np.nonzero(near)
@@ -770,7 +777,28 @@ def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int
     each = np.minimum(np.exp(-square / (4.0 * psf_sigma**2)), _MOST_OVERLAP)
     overlap = np.zeros(len(points))
     np.maximum.at(overlap, first, np.where(each > _LEAST_OVERLAP, each, 0.0))
-    return Pairs(first, second, overlap)
+    return first, second, overlap
+
+
+@compiled_form_of(_pairs_numpy)
+def _pairs(
+    points: FloatArray, flux: FloatArray, psf_sigma: float, reach: float
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """See `_pairs_numpy`."""
+    count, overlap = 0, np.zeros(len(points))
+    first, second = np.empty(16, dtype=np.int64), np.empty(16, dtype=np.int64)
+    for one in range(len(points)):
+        for other in range(len(points)):
+            across, down = points[one, 0] - points[other, 0], points[one, 1] - points[other, 1]
+            if abs(across) < reach and abs(down) < reach and one != other and flux[other] > 0.0:
+                if count == len(first):
+                    first, second = np.append(first, first), np.append(second, second)
+                first[count], second[count] = one, other
+                count += 1
+                square = across * across + down * down
+                each = min(math.exp(-square / (4.0 * psf_sigma * psf_sigma)), _MOST_OVERLAP)
+                overlap[one] = max(overlap[one], each if each > _LEAST_OVERLAP else 0.0)
+    return first[:count].copy(), second[:count].copy(), overlap
 
 
 def neighbour_light(

@@ -337,11 +337,11 @@ def _smoothed_above(pixels: Image, limit: FloatArray) -> tuple[IntArray, Float32
             smooth[column] = (twice[column - 1] + twice[column]) + (twice[column] + twice[column + 1])
         for start in range(1, columns - 1, _SEGMENT):
             stop, some = min(start + _SEGMENT, columns - 1), False
-            part, limit = smooth[start:stop], bound[start:stop]
+            part, least = smooth[start:stop], bound[start:stop]
             for k in range(len(part)):
-                some |= part[k] > limit[k]
+                some |= part[k] > least[k]
             for k in range(len(part) if some else 0):
-                if part[k] > limit[k]:
+                if part[k] > least[k]:
                     index[count], found[count] = row * columns + start + k, part[k]
                     count += 1
     return index[:count].copy(), found[:count].copy()

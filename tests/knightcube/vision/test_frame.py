@@ -277,6 +277,9 @@ def test_the_compiled_hot_pixels_are_those_of_numpy_among_pairs_and_squares() ->
     assert_forms_agree(frame._hot_places, signal, np.ones_like(signal), 1.0)
     row, column = np.divmod(np.flatnonzero(signal > 5.0), 50)
     noise, level = draw.uniform(0.5, 1.5, len(row)), draw.normal(0.0, 1.0, len(row))
+    assert_forms_agree(
+        are_hot, draw.uniform(0.0, 30.0, (9, 200)) * draw.choice([0.1, 1.0, 9.0], 200), np.ones(200)
+    )
     for pixels in (signal, np.clip(signal + 20.0, 0.0, 255.0).astype(np.uint8)):
         assert_forms_agree(frame.hot_among, pixels, row, column, noise, level)
     assert len(frame.hot_among.numpy_form(signal, row, column, noise, level)[0]) > 20

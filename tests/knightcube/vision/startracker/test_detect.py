@@ -17,7 +17,14 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.detect import Quality, _on_wings, confirmed, detect, measure_near
+from knightcube.vision.startracker.detect import (
+    Quality,
+    _among_odd,
+    _on_wings,
+    confirmed,
+    detect,
+    measure_near,
+)
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Method, survey
 from knightcube.vision.streaks.geometry import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
@@ -401,3 +408,10 @@ def test_the_compiled_search_of_peaks_on_wings_equals_that_in_numpy() -> None:
     place, height = draw.integers(0, 200, (60, 2)), -np.sort(-(10.0 ** draw.uniform(1.0, 5.0, 60)))
     core = np.where(draw.uniform(size=60) < 0.2, draw.uniform(1.0, 6.0, 60), 0.0)
     assert_forms_agree(_on_wings, place, height, core)
+
+
+def test_the_compiled_search_of_odd_neighbourhoods_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(5)
+    odd, points = draw.random(80) < 0.6, draw.uniform(0.0, 150.0, (80, 2))
+    assert 5 < np.count_nonzero(_among_odd.numpy_form(odd, points)) < 75
+    assert_forms_agree(_among_odd, odd, points)

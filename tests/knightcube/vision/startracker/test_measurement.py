@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.startracker.measurement import METHODS, single_pixels
+from knightcube.vision.startracker.measurement import (
+    METHODS,
+    _crowded,
+    _flux_errors,
+    _spread_evenly,
+    _starts,
+    single_pixels,
+)
 from knightcube.vision.startracker.psf_fit import cut, light
+from tests.support.compiled_forms import assert_forms_agree
 
 PLACES = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.4]])
 WIDTH = 0.9
@@ -72,3 +80,22 @@ def test_only_sharp_pixels_well_above_the_noise_are_hot(noise: float) -> None:
     middle = np.array([[9 * k + 4, 4] for k in range(len(cores))])
     windows = cut(pixels, middle, 4, np.zeros(len(cores)), np.full(len(cores), noise), np.inf)
     assert single_pixels(windows).tolist() == [True, False, True, False]
+
+
+def test_the_compiled_measurements_of_windows_equal_those_in_numpy() -> None:
+    draw = np.random.default_rng(1)
+    model = draw.uniform(-1.0, 30.0, (6, 7, 7))
+    model[2] *= -1.0
+    flux, noise = model.sum(axis=(1, 2)), draw.uniform(1.0, 4.0, 6)
+    assert_forms_agree(_starts, model - 10.0, noise)
+    assert_forms_agree(_flux_errors, model, draw.random(model.shape) < 0.9, flux, noise, 0.5)
+
+
+def test_the_compiled_choice_of_stars_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(2)
+    middle = draw.integers(0, 120, (60, 2))
+    assert 10 < np.count_nonzero(_crowded.numpy_form(middle)) < 60
+    assert_forms_agree(_crowded, middle)
+    chosen = np.flatnonzero(draw.random(60) < 0.9)
+    assert len(_spread_evenly.numpy_form(middle, chosen)[0]) < len(chosen)
+    assert_forms_agree(_spread_evenly, middle, chosen)

@@ -404,3 +404,10 @@ def test_the_compiled_light_of_neighbours_equals_that_in_numpy() -> None:
     shift, share = draw.normal(size=(4, 9, 2)), np.array([0.1, 0.4, 0.4, 0.1])
     own = draw.integers(0, 3, 9)
     assert_forms_agree(psf_fit._summed_light, own, place, np.arange(9.0), width, shift, share, 3, 4)
+
+
+def test_the_compiled_search_of_neighbours_equals_that_in_numpy() -> None:
+    draw = np.random.default_rng(8)
+    points, flux = draw.uniform(0.0, 60.0, (40, 2)), draw.normal(1.0, 1.0, 40)
+    assert len(psf_fit._pairs.numpy_form(points, flux, 1.0, 7.0)[0]) > 32
+    assert_forms_agree(psf_fit._pairs, points, flux, 1.0, 7.0)
