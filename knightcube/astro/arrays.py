@@ -27,17 +27,27 @@ def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record
     """
     # Indices select rows of many arrays faster than a mask.
     rows = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
-    kept = (
+    kind: Any = type(record)
+    kept = [
         getattr(record, name) if name in common else getattr(record, name).take(rows, axis=0)
-        for name in _names(type(record))
-    )
-    return type(record)(*kept)
+        for name in _names(kind)
+    ]
+    selected: Record = kind(*kept)
+    return selected
 
 
 @functools.cache
 def _names(kind: type[Any]) -> tuple[str, ...]:
     """Return the names of the fields of a dataclass."""
     return tuple(field.name for field in fields(kind))
+
+
+def median(values: FloatArray) -> float:
+    """Return the median of finite `values` (n,), several times as fast as numpy.median for small n."""
+    ordered, middle = np.sort(values, axis=None), values.size // 2
+    if values.size % 2:
+        return float(ordered[middle])
+    return 0.5 * (float(ordered[middle - 1]) + float(ordered[middle]))
 
 
 def tangent_basis(direction: Iterable[float]) -> FloatArray:

@@ -295,6 +295,17 @@ def _three_sorted(one: float, two: float, three: float) -> tuple[float, float, f
     return min(less, three), max(less, min(more, three)), max(more, three)
 
 
+def least_of_neighbours(grid: FloatArray) -> FloatArray:
+    """Return the minimum of the values of a grid (down, across) in the 3 x 3 cells around each cell."""
+    least = grid.copy()
+    np.minimum(least[1:], grid[:-1], out=least[1:])
+    np.minimum(least[:-1], grid[1:], out=least[:-1])
+    wide = least.copy()
+    np.minimum(wide[:, 1:], least[:, :-1], out=wide[:, 1:])
+    np.minimum(wide[:, :-1], least[:, 1:], out=wide[:, :-1])
+    return wide
+
+
 def _is_uneven(background: Background) -> bool:
     """Return whether the level of many blocks changes by more than their noise, and does so smoothly.
 

@@ -19,7 +19,7 @@ from enum import Enum
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
 
 _STRETCH = 32_768
@@ -455,7 +455,7 @@ def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None)
     if given is not None or highest >= top or not len(counts):
         return top
     at_top = int(np.count_nonzero(counts == highest))
-    step = max(1.0, _PLATEAU_REACH * float(highest - np.median(counts)))
+    step = max(1.0, _PLATEAU_REACH * float(highest - median(counts)))
     below = int(np.count_nonzero(counts >= highest - step)) - at_top
     flat = at_top >= _LEAST_PLATEAU and at_top > _PILED_UP * below
     return float(highest) if flat else top

@@ -25,7 +25,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices, cross_matrix
+from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices, cross_matrix, median
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import from_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -512,7 +512,7 @@ def fit_with_distortion(
         observed, star = within, expected[nearest]
     assert fitted is not None  # there was a round
     squares = fitted[2]
-    spread = max(1.0, math.sqrt(float(np.median(squares))) / _RAYLEIGH_MEDIAN)
+    spread = max(1.0, math.sqrt(median(squares)) / _RAYLEIGH_MEDIAN)
     kept = squares <= (_OUTLIER * spread) ** 2
     if kept.sum() >= 4 and not kept.all():
         observed, star = observed[kept], star[kept]

@@ -12,8 +12,8 @@ from enum import IntFlag
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
-from knightcube.compiled import compiled_form_of
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, median, select
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.frame import label_pixels, saturation_level
 from knightcube.vision.startracker.measurement import (
@@ -105,6 +105,8 @@ class Detections:
 
     def scaled(self, unit: float) -> Detections:
         """Return the sources with all fluxes and backgrounds multiplied by `unit`."""
+        if unit == 1.0:
+            return self
         return replace(self, flux=self.flux * unit, background=self.background * unit)
 
     def stars(self) -> Detections:
@@ -161,31 +163,88 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
     so that a bright cloud does not exclude the stars beside it. Up to `most` peaks outside the open sky are
     also selected, so that the widths of foreground sources are measured.
     """
+    return _worth_measuring(peaks.place, peaks.height, peaks.core, open_sky, shape[0], shape[1], most)
+
+
+def _worth_measuring_numpy(
+    place: IntArray,
+    height: FloatArray,
+    core: FloatArray,
+    open_sky: BoolArray,
+    rows: int,
+    columns: int,
+    most: int,
+) -> IntArray:
+    """See `worth_measuring`; the arguments are the attributes of the peaks and the shape of the frame."""
     compared = np.sort(
         np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
     )
-    compared = compared[~on_wings(peaks.select(compared))]
+    compared = compared[~_on_wings_numpy(place[compared], height[compared], core[compared])]
     parts = (compared[open_sky[compared]], compared[~open_sky[compared]])
-    return np.sort(np.concatenate([part[_spread(peaks.select(part), shape, most)] for part in parts]))
+    return np.sort(np.concatenate([part[_spread(place[part], (rows, columns), most)] for part in parts]))
 
 
-def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
+def _spread(place: IntArray, shape: tuple[int, int], most: int) -> IntArray:
     """Return the indices of up to `most` peaks, at most a quarter of `most` in each sixteenth of the area."""
-    row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
+    row, column = (place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")
-    rank = np.empty(len(peaks), dtype=np.int64)
-    rank[order] = np.arange(len(peaks)) - np.searchsorted(cell[order], cell[order])
+    rank = np.empty(len(place), dtype=np.int64)
+    rank[order] = np.arange(len(place)) - np.searchsorted(cell[order], cell[order])
     return np.flatnonzero(rank < max(4, most // 4))[:most]
 
 
-def on_wings(peaks: Peaks) -> BoolArray:
-    """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
-    return _on_wings(peaks.place, peaks.height, peaks.core)
+@compiled_form_of(_worth_measuring_numpy)
+def _worth_measuring(
+    place: IntArray,
+    height: FloatArray,
+    core: FloatArray,
+    open_sky: BoolArray,
+    rows: int,
+    columns: int,
+    most: int,
+) -> IntArray:
+    """See `_worth_measuring_numpy`."""
+    compared, chosen = np.empty(len(place), dtype=np.int64), np.empty(len(place), dtype=np.int64)
+    seen, kept, in_cell = np.zeros(2, np.int64), np.zeros(2, np.int64), np.zeros((2, _CELLS**2), np.int64)
+    count, total, limit = 0, 0, max(4, most // 4)
+    for peak in range(len(place)):
+        side = int(open_sky[peak])
+        if seen[side] == _MOST_COMPARED:
+            continue
+        seen[side] += 1
+        # Peaks beyond the last that is selected are compared only with peaks of the other kind.
+        if kept[side] < most and not _is_hidden(place, height, core, compared[:count], peak):
+            row, column = place[peak, 1] * _CELLS // rows, place[peak, 0] * _CELLS // columns
+            cell = row * _CELLS + column
+            if in_cell[side, cell] < limit:
+                in_cell[side, cell] += 1
+                kept[side] += 1
+                chosen[total] = peak
+                total += 1
+        compared[count] = peak
+        count += 1
+        if kept[0] >= most and kept[1] >= most:
+            break
+    return chosen[:total].copy()
+
+
+@loop_helper
+def _is_hidden(place: IntArray, height: FloatArray, core: FloatArray, higher: IntArray, peak: int) -> bool:
+    """Return whether a peak may be a local maximum on the wings of one of the `higher` peaks (k,)."""
+    for other in higher:
+        across, down = place[peak, 0] - place[other, 0], place[peak, 1] - place[other, 1]
+        square = across * across + down * down
+        if square < _WINGS_END**2:
+            apart = max(math.sqrt(square) - core[other], 0.0)
+            wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
+            if height[peak] < height[other] * wing:
+                return True
+    return False
 
 
 def _on_wings_numpy(place: IntArray, height: FloatArray, core: FloatArray) -> BoolArray:
-    """See `on_wings`; the highest peak is first."""
+    """Return which peaks (p,) may be local maxima on the wings of a brighter star; the highest is first."""
     x, y = place.T
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
     # Only peaks closer than 60 px are compared: at 60 px, the wings are a millionth of the peak.
@@ -195,21 +254,6 @@ def _on_wings_numpy(place: IntArray, height: FloatArray, core: FloatArray) -> Bo
     wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
     hidden = height[lower] < height[higher] * wing
     return np.bincount(lower[hidden], minlength=len(x)) > 0
-
-
-@compiled_form_of(_on_wings_numpy)
-def _on_wings(place: IntArray, height: FloatArray, core: FloatArray) -> BoolArray:
-    """See `_on_wings_numpy`."""
-    hidden = np.zeros(len(place), dtype=np.bool_)
-    for lower in range(len(place)):
-        for higher in range(lower):
-            across, down = place[lower, 0] - place[higher, 0], place[lower, 1] - place[higher, 1]
-            square = across * across + down * down
-            if square < _WINGS_END**2:
-                apart = max(math.sqrt(square) - core[higher], 0.0)
-                wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
-                hidden[lower] |= height[lower] < height[higher] * wing
-    return hidden
 
 
 def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
@@ -398,7 +442,7 @@ def assemble(
 def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     """Return quality flags STREAK and CLUTTER (p,) of peaks, which are derived from the bright areas."""
     noise = sky.smooth_noise
-    restless = noise.at(*peaks.place.T) > _RESTLESS * np.median(noise.values)
+    restless = noise.at(*peaks.place.T) > _RESTLESS * median(noise.values)
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if long.any() and frame_shape(areas).kind is not FrameKind.STREAKS:

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrices
+from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrices, median
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -257,7 +257,11 @@ class _Seen:
 
     def squares(self, pose: _FittedPose) -> FloatArray:
         """Return the chi-square of each star (n,) for a pose, with two degrees of freedom."""
-        return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, self.missed(pose)) ** 2, axis=1))
+        return np.asarray(np.sum(self.whitened(pose) ** 2, axis=1))
+
+    def whitened(self, pose: _FittedPose) -> FloatArray:
+        """Return the two residual components of unit variance of each star (n, 2) for a pose."""
+        return np.asarray((self.whitener @ self.missed(pose)[:, :, None])[:, :, 0])
 
     def missed(self, pose: _FittedPose) -> FloatArray:
         """Return the difference between observed and predicted unit vector of each star (n, 3)."""
@@ -692,7 +696,7 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     pose, squares = seen.reweighted(pose, squares, _HUBER_ROUNDS)
     # A star agrees with the fit if its residual is within the scatter of the majority of stars.
     # All stars are used if too few stars agree.
-    agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
+    agree = squares <= _FARTHEST * max(1.0, median(squares) / _MEDIAN)
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
     return seen.fitted(pose, agree.astype(np.float64)), agree

@@ -188,6 +188,14 @@ def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
     return [(0.5 * node * trail, 0.5 * weight) for node, weight in zip(nodes, weights, strict=True)]
 
 
+def nodes(trail: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the nodes (m, n, 2), px, and weights (m,) of `path` as arrays."""
+    if not trail.any():
+        return np.zeros((1, *trail.shape)), np.ones(1)
+    shift, share = zip(*path(trail), strict=True)
+    return np.array(shift), np.array(share)
+
+
 def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | None = None) -> FloatArray:
     """Return the fraction of each star's flux in each pixel of its window (n, k, k), rows first.
 
@@ -415,13 +423,13 @@ def fit(
     (n,) are in counts, and the initial widths (n,) are standard deviations of the Gaussians, px.
     """
     values = np.concatenate([offset, flux[:, None], np.zeros((len(flux), 1)), width[:, None]], axis=1)
-    shift, share = zip(*path(windows.trail), strict=True)
+    shift, share = nodes(windows.trail)
     found = _solve(
         np.ascontiguousarray(windows.light),
         np.ascontiguousarray(windows.good),
         np.ascontiguousarray(windows.noise),
-        np.array(shift),
-        np.array(share),
+        shift,
+        share,
         values,
         (noise.photon, noise.mismatch),
         5 if free_width else 4,
@@ -815,9 +823,8 @@ def neighbour_light(
     (n,), px.
     """
     place = (middle + offset)[pairs.second] - middle[pairs.first]
-    shift, share = zip(*path(windows.trail[pairs.second]), strict=True)
     counts = np.maximum(flux, 0.0)[pairs.second]
-    given = place, counts, width[pairs.second], np.array(shift), np.array(share)
+    given = place, counts, width[pairs.second], *nodes(windows.trail[pairs.second])
     return _summed_light(pairs.first, *given, len(middle), windows.half)
 
 

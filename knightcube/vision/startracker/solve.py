@@ -562,8 +562,10 @@ def _split_doubt(seen: FrameSolution, chosen: IntArray) -> FloatArray:
     doubt = np.zeros((3, 3))
     if seen.kind is not FrameKind.POINTS:
         return doubt
-    apart = np.delete(seen.points, chosen, axis=0) - seen.points[chosen, None]
-    parts = apart[np.einsum("nmi,nmi->nm", apart, apart) < _SPLIT_PX**2]
+    rest = np.ones(len(seen.points), dtype=np.bool_)
+    rest[chosen] = False
+    apart = seen.points[rest] - seen.points[chosen, None]
+    parts = apart[apart[..., 0] ** 2 + apart[..., 1] ** 2 < _SPLIT_PX**2]
     chance = apart[..., 0].size * math.pi * _SPLIT_PX**2 / (seen.camera.columns * seen.camera.rows)
     if len(parts) > chance + _SPLIT_SIGMAS * math.sqrt(chance) + _SPLIT_SHARE * len(chosen):
         half = np.einsum("ni,nj->ij", parts, parts) / (4.0 * len(parts) * seen.camera.focal_length**2)

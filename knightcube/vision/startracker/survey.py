@@ -19,7 +19,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import (
     MAD_TO_SIGMA,
@@ -28,6 +28,7 @@ from knightcube.vision.background import (
     estimate_background,
     in_blocks,
     interpolation_weights,
+    least_of_neighbours,
     median_of_neighbours,
 )
 from knightcube.vision.frame import (
@@ -166,7 +167,7 @@ def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackgroun
         Surface(own, shape),
         Surface(smooth.level, shape),
         Surface(smooth_noise_up, shape),
-        correlation_of(float(np.median(own_smooth)), float(np.median(own))),
+        correlation_of(median(own_smooth), median(own)),
     )
 
 
@@ -211,12 +212,10 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
     background is not interpolated at every pixel. The result is empty if at most `most` pixels exceed the
     lowest threshold.
     """
-    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
-
     columns = pixels.shape[1]
     # Level and noise are interpolated between the centres of adjacent blocks.
     limit = background.level + HOT_SIGMAS * background.noise
-    lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
+    lowest = least_of_neighbours(limit)
     if np.issubdtype(pixels.dtype, np.integer):
         # A comparison with an integer threshold is four times as fast as in floating point.
         lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
@@ -663,9 +662,9 @@ def frame_shape(areas: Areas) -> FrameShape:
         and long >= _STREAKED_PART * (long + short)
         and share_one_rotation(areas.centre[chosen][streaks], areas.direction[chosen][streaks])
     ):
-        return FrameShape(FrameKind.STREAKS, float(np.median(areas.length[chosen][streaks])))
+        return FrameShape(FrameKind.STREAKS, median(areas.length[chosen][streaks]))
     if short:
-        return FrameShape(FrameKind.POINTS, float(np.median(areas.length[chosen][points & ~streaks])))
+        return FrameShape(FrameKind.POINTS, median(areas.length[chosen][points & ~streaks]))
     return FrameShape(FrameKind.NEITHER, 0.0)
 
 

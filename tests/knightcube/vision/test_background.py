@@ -20,6 +20,7 @@ from knightcube.vision.background import (
     estimate_background,
     in_blocks,
     interpolation_weights,
+    least_of_neighbours,
     median_of_neighbours,
 )
 from tests.support.compiled_forms import assert_forms_agree
@@ -112,10 +113,12 @@ def test_moments_of_blocks_are_those_of_the_values_near_the_median(size: int, si
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (2, 3), (7, 1), (9, 12)])
-def test_the_median_of_neighbours_equals_a_median_filter(shape: tuple[int, int]) -> None:
+def test_median_and_minimum_of_neighbours_are_those_of_filters(shape: tuple[int, int]) -> None:
     grid = np.random.default_rng(shape).integers(0, 30, shape).astype(float)
     expected = ndimage.median_filter(grid, size=3, mode="nearest")
     assert median_of_neighbours(grid).tolist() == expected.tolist()
+    lowest = ndimage.minimum_filter(grid, size=3, mode="nearest")
+    assert least_of_neighbours(grid).tolist() == lowest.tolist()
 
 
 @pytest.mark.parametrize(("first", "stride"), [(0, 1), (1, 2), (2, 4)])

@@ -20,7 +20,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.detect import (
     Quality,
     _among_odd,
-    _on_wings,
+    _worth_measuring,
     confirmed,
     detect,
     measure_near,
@@ -403,11 +403,14 @@ def test_a_noisy_raw_frame_gives_few_false_stars_and_a_dark_one_too() -> None:
         assert 5 <= len(detect(read_image(SKY / name)).stars()) <= 60
 
 
-def test_the_compiled_search_of_peaks_on_wings_equals_that_in_numpy() -> None:
+@pytest.mark.parametrize("most", [8, 40, 400])
+def test_the_compiled_choice_of_peaks_equals_that_in_numpy(most: int) -> None:
     draw = np.random.default_rng(4)
     place, height = draw.integers(0, 200, (60, 2)), -np.sort(-(10.0 ** draw.uniform(1.0, 5.0, 60)))
     core = np.where(draw.uniform(size=60) < 0.2, draw.uniform(1.0, 6.0, 60), 0.0)
-    assert_forms_agree(_on_wings, place, height, core)
+    given = place, height, core, draw.random(60) < 0.7, 200, 200, most
+    assert 8 <= len(_worth_measuring.numpy_form(*given)) < 60
+    assert_forms_agree(_worth_measuring, *given, compiled=most == 40)
 
 
 def test_the_compiled_search_of_odd_neighbourhoods_equals_that_in_numpy() -> None:
