@@ -41,8 +41,9 @@ from knightcube.vision.streaks.first_guess import (
     motions_by_scan,
     scan_angles,
 )
-from knightcube.vision.streaks.frame import BrightRegions, prepare_frame
+from knightcube.vision.streaks.frame import BrightRegions, PreparedFrame, prepare_frames
 from knightcube.vision.streaks.geometry import (
+    GAUSSIAN,
     CameraMotion,
     Course,
     Shutter,
@@ -69,6 +70,7 @@ from knightcube.vision.streaks.joint_fit import (
     true_ends,
     unbroken,
 )
+from knightcube.vision.streaks.psf_profile import fit_profile
 from knightcube.vision.streaks.streak_result import (
     REASONS,
     LikelihoodSettings,
@@ -279,6 +281,8 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
     if ends > _IN_PLACE and misfit(done.evaluation) > _SHAKEN:
         done = _vibrating(camera, done) or done
+    if ends > _IN_PLACE and misfit(done.evaluation) > _WORST_FIRST:
+        done = fit_profile(camera, done) or done
     # With a wrong rotation angle, the model has large residuals at one end of each streak.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
@@ -682,14 +686,33 @@ def estimate_motion(
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
-    binning, frame, regions, sigma = prepare_frame(pixels, pinhole, saturation, settings)
-    line_time_sigma, settings, pinhole = settings.line_time_sigma, binning.settings(settings), binning.pinhole
-    shutter = Shutter(settings.delay_per_row / exposure, pinhole.centre[1])
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, line_time_sigma=settings.line_time_sigma)
+    best = seen
+    for attempt, prepared in enumerate(prepare_frames(pixels, pinhole, saturation, settings)):
+        found = _attempt(prepared, seen, settings, prior_rate, prior_sigma, prior_course)
+        if not attempt or found.rate is not None:
+            best = found
+        if best.status is not StreakStatus.FAILED:
+            break
+    return best
+
+
+def _attempt(
+    prepared: PreparedFrame,
+    seen: MotionResult,
+    settings: LikelihoodSettings,
+    prior_rate: FloatArray | None,
+    prior_sigma: float,
+    prior_course: Course | None,
+) -> MotionResult:
+    """Return the result of `estimate_motion` for a prepared frame; `seen` is a result without stars."""
+    binning, frame, regions, sigma = prepared
+    settings, pinhole = binning.settings(settings), binning.pinhole
+    shutter = Shutter(settings.delay_per_row / seen.exposure, pinhole.centre[1])
     camera = FitProblem(frame, pinhole, shutter, settings, sigma, settings.rate_model == "accelerating")
     if prior_course is not None and settings.rate_model != "constant":
         camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
-    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
-    seen = replace(seen, line_time_sigma=line_time_sigma)
+    seen = replace(seen, hot_pixels=frame.hot_pixels)
     if len(regions) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     spots = float(np.median(regions.length[:_BRIGHTEST])) < _SPOT
@@ -787,21 +810,27 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     """Return the motion of the joint fit that starts from the preliminary fit `first`.
 
     If the joint fit does not succeed, the motion is marked as REJECTED. A rejected motion is fitted again
-    with a vibration if its residuals show one.
+    with a vibration if its residuals show one, and then with a point-spread profile learned from the frame.
     """
+    if first.scene.profile != GAUSSIAN:
+        camera = replace(camera, work=WorkBudget())
     last, found = _candidate(camera, seen, first)
-    if found.possible or first.scene.motion.vibration.exists:
+    if found.possible or first.scene.motion.vibration.exists or first.scene.profile != GAUSSIAN:
         return found
     start = first
     if last is not None:
         scene = last.scene.select(np.flatnonzero(last.scene.trusted))
         scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
         start = replace(last, scene=scene, windows=camera.windows(scene), hidden=None)
-    vibrating = _vibrating(replace(camera, growing=bool(start.free[3])), start)
-    if vibrating is None:
-        return found
-    shaken = _candidate(camera, seen, vibrating)[1]
-    return shaken if shaken.possible else found
+    camera = replace(camera, growing=bool(start.free[3]))
+    for fit_again in (_vibrating, fit_profile):
+        again = fit_again(camera, start)
+        if again is not None and again.scene.profile != GAUSSIAN:
+            camera = replace(camera, work=WorkBudget())
+        other = None if again is None else _candidate(camera, seen, again)[1]
+        if other is not None and other.possible:
+            return other
+    return found
 
 
 def _candidate(

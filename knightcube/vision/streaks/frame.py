@@ -8,6 +8,7 @@ excluded.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -268,16 +269,19 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     return replace(frame, signal=signal.reshape(-1), sums=box_sum(signal).reshape(-1), floor=floor)
 
 
-# Displacements (px) at which the autocorrelation is measured; pixel noise affects only zero displacement.
-_NEAR, _FAR = 1, 3
+# Ratio of the two displacements at which the autocorrelation is measured.
+_FARTHER = 3
 # Maximum number of bright regions from which the point-spread width is estimated.
 _MOST_WIDTH_REGIONS = 12
 # Minimum number of bright regions from which the point-spread width is estimated.
 _LEAST_WIDTH_REGIONS = 3
 
 
-def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | None:
+def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions, near: int = 1) -> float | None:
     """Return the standard deviation (px) of the PSF without pixel convolution, or None if unknown.
+
+    The autocorrelation is measured at displacements of `near` px and three times `near` px. Pixel noise
+    affects only the displacement zero.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
     to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and along rows is also Gaussian,
@@ -293,12 +297,12 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     with np.errstate(divide="ignore", invalid="ignore"):
         for step in (1, columns):
             correlation = []
-            for distance in (_NEAR * step, _FAR * step):
+            for distance in (near * step, _FARTHER * near * step):
                 beside = frame.signal.take(pixel + distance, mode="clip")
                 beside = beside + frame.signal.take(pixel - distance, mode="clip")
                 correlation.append(np.bincount(owner, light * beside, count))
             fallen += np.log(correlation[0] / correlation[1])
-        variance = (_FAR**2 - _NEAR**2) / (4.0 * fallen)
+        variance = near**2 * (_FARTHER**2 - 1) / (4.0 * fallen)
     known = variance[np.isfinite(variance) & (variance > 0.0)]
     if len(known) < _LEAST_WIDTH_REGIONS:
         return None
@@ -395,27 +399,43 @@ _WIDE = 2.2
 _WIDER = 1.5
 
 
-_Prepared = tuple[Binning, ReducedFrame, BrightRegions, float]
+# Minimum ratio of measured to configured point-spread width for which a second attempt uses a binned frame.
+_BLURRED = 1.2
+# Point-spread width (px) for which the frame of a second attempt is binned.
+_SECOND_WIDTH = 2.0
+
+
+PreparedFrame = tuple[Binning, ReducedFrame, BrightRegions, float]
 """A frame prepared for the fit, its bright regions, and its point-spread width (binned px)."""
 
 
-def prepare_frame(
+def prepare_frames(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
-) -> _Prepared:
-    """Return the frame, binned for the configured point-spread width or for a much larger measured width."""
-    prepared = _prepared(pixels, pinhole, saturation, settings, settings.psf_sigma)
-    binning, frame, regions, _ = prepared
-    if binning.size > 1:
-        return prepared
-    sigma = measured_psf_sigma(frame, regions)
-    if sigma is None or sigma <= max(_WIDE, _WIDER * settings.psf_sigma):
-        return prepared
-    return _prepared(pixels, pinhole, saturation, settings, sigma)
+) -> Iterator[PreparedFrame]:
+    """Yield the frame for a first attempt, and a binned frame for a second attempt if the PSF seems blurred.
+
+    The first frame is binned for the configured point-spread width or for a much larger measured width. The
+    autocorrelation of a ring decreases faster at small displacements than that of a Gaussian of the same
+    width. A large width is therefore measured again, at larger displacements.
+    """
+
+    def prepared(sigma: float) -> PreparedFrame:
+        return _prepared(pixels, pinhole, saturation, settings, sigma)
+
+    first = binning, frame, regions, _ = prepared(settings.psf_sigma)
+    sigma = measured_psf_sigma(frame, regions) if binning.size == 1 else None
+    if sigma is not None and sigma > _WIDER * settings.psf_sigma:
+        sigma = max(sigma, measured_psf_sigma(frame, regions, near=2) or 0.0)
+        if sigma > _WIDE:
+            first = prepared(sigma)
+    yield first
+    if first[0].size == 1 and sigma is not None and sigma > _BLURRED * settings.psf_sigma:
+        yield prepared(_SECOND_WIDTH)
 
 
 def _prepared(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
-) -> _Prepared:
+) -> PreparedFrame:
     """Return the frame, binned for a PSF with the standard deviation `sigma`, px."""
     binning = Binning.suited(pinhole, sigma)
     frame = reduce_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)

@@ -770,17 +770,36 @@ class Course:
         return np.eye(3) * (_COURSE_SHARE * self.sigma / exposure) ** 2
 
 
+@dataclass(frozen=True, slots=True)
+class PsfProfile:
+    """Profile of the point spread function (PSF), equal in all directions: a sum of concentric Gaussians.
+
+    Attributes:
+        widths: standard deviation of each Gaussian, as a fraction of the width of the scene.
+        shares: fraction of the flux in each Gaussian; the sum is 1. The image of a defocused star has a dark
+            centre, so that shares may be negative.
+    """
+
+    widths: tuple[float, ...]
+    shares: tuple[float, ...]
+
+
+GAUSSIAN = PsfProfile((1.0,), (1.0,))
+"""The profile of a PSF that is one Gaussian."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakScene:
     """The unknowns of the fit: the motion, the width of the point spread function (PSF), and the stars.
 
     Attributes:
         motion: rotation of the camera over the exposure.
-        width: standard deviation of the PSF convolved with a pixel, px.
+        width: standard deviation of the PSF convolved with a pixel, px; the unit of the widths in `profile`.
         stars: positions of the n stars at mid-exposure (n, 2), px.
         light: flux of each star over the exposure (n,), counts.
         sky: sky level around each star minus the frame's background (n,), counts per pixel.
         trusted: mask (n,) of the stars that contribute to the fit of motion and PSF width.
+        profile: profile of the PSF.
     """
 
     motion: CameraMotion
@@ -789,6 +808,7 @@ class StreakScene:
     light: FloatArray
     sky: FloatArray
     trusted: BoolArray
+    profile: PsfProfile = GAUSSIAN
 
     @classmethod
     def of(cls, motion: CameraMotion, sigma: float, stars: FloatArray, light: FloatArray) -> StreakScene:
@@ -803,7 +823,7 @@ class StreakScene:
 
     def select(self, chosen: BoolArray | IntArray) -> StreakScene:
         """Return the scene with only the `chosen` stars, given as a mask or as indices."""
-        return select(self, chosen, "motion", "width")
+        return select(self, chosen, "motion", "width", "profile")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
         """Return the scene with m additional stars at `stars` (m, 2), px, which do not affect the motion."""

@@ -45,10 +45,10 @@ from knightcube.vision.streaks.normal_equations import (
     consistent_stars,
     estimates_of,
     evaluate,
-    light_of,
     solve,
     star_equations,
 )
+from knightcube.vision.streaks.scene_images import light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 # Number of processed pixels per frame after which no further motion is fitted.
@@ -171,7 +171,7 @@ class FitProblem:
 
     def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
         """Return the normal equations for `scene`, see `normal_equations.evaluate`."""
-        self.work.evaluated(len(windows.slot))
+        self.work.evaluated(len(windows.slot) * len(scene.profile.widths))
         growth = self.growing or (self.undecided and clip > 0.0)
         return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
 

@@ -30,6 +30,7 @@ from knightcube.vision.streaks import streak_model
 from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows, at_pixels
 from knightcube.vision.streaks.frame import MEDIAN_ERROR
 from knightcube.vision.streaks.geometry import Shutter, StreakScene
+from knightcube.vision.streaks.scene_images import model_images
 
 SHARED = 7
 """Number of parameters that all stars share: rate (3), acceleration (3) and point-spread width (1)."""
@@ -161,25 +162,6 @@ def _matrices(geometry: FloatArray, light: FloatArray, trusted: BoolArray) -> Fl
             out[b, i, 7], out[b, i, 8] = geometry[b, i, 6] * light[b], geometry[b, i, 7] * light[b]
         out[b, 5, 6], out[b, 0, 9], out[b, 6, 10] = shared, 1.0, 1.0
     return out
-
-
-def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
-    """Return the modelled counts (m,) of all stars of `scene` on the m fitted pixels, without sky level."""
-    images, spots, _ = model_images(pinhole, shutter, scene, windows)
-    return windows.total(images, spots, scene.light, np.zeros_like(scene.sky))[:-1]
-
-
-def model_images(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
-) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return the images that are combined to model long streaks, and the images and derivatives of spots.
-
-    The last image of each long streak is an uninitialised buffer for the residuals.
-    """
-    camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
-    images = streak_model.images(*camera, scene.stars[long], scene.width, windows.strips)
-    spots = streak_model.spot_derivatives(*camera, scene.stars[spot], scene.sigma, windows.patches)
-    return images, *spots
 
 
 def _add(

@@ -19,6 +19,7 @@ from scipy.special import chdtri
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray
 from knightcube.vision.streaks.fit_windows import SLOWEST
 from knightcube.vision.streaks.geometry import (
+    GAUSSIAN,
     PIXEL_VARIANCE,
     CameraMotion,
     DistortedPinhole,
@@ -60,14 +61,20 @@ class Displacement:
 
 
 def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement of streak ends that explains the residuals, or None if no end is visible."""
+    """Return the displacement of streak ends that explains the residuals, or None if no end is visible.
+
+    The errors of a learned profile of the PSF are as large elsewhere on the streaks as at their ends. Only
+    larger residuals at the ends then show a displacement.
+    """
     light = scene.light[left.star, None, None].astype(np.float32)
     change = light * (left.images[:, 3] + left.images[:, 4])
     near = _sensitive(left, change)
     elsewhere = (left.weight > 0.0) & ~near
     squares = left.weight * left.residual * left.residual
     usual = float(np.mean(squares[elsewhere], dtype=np.float64)) if elsewhere.any() else 1.0
-    return _displacement(left, squares, change, near, min(usual, 1.0))
+    if scene.profile == GAUSSIAN:
+        usual = min(usual, 1.0)
+    return _displacement(left, squares, change, near, usual)
 
 
 def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
@@ -371,6 +378,8 @@ _SAME_SPREAD = 0.02
 _END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
+# Minimum uncertainty (px) of streak ends if the profile of the PSF was learned from the frame.
+_LEARNED_FLOOR = 0.04
 # Ratio of the uncertainty of the streak ends to the significant displacement that explains their residuals.
 _END_SHOWN = 1.5
 # Ratio of the uncertainty of the streak ends to the upper limit of their displacement.
@@ -588,13 +597,15 @@ def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, mi
     width along and across the streaks. Significant residuals at the streak ends indicate a different profile
     of the PSF or an unresolved fast vibration, which shifts the apparent ends.
     """
-    described = sigma**2 + PIXEL_VARIANCE
+    described, learned = sigma**2 + PIXEL_VARIANCE, scene.profile != GAUSSIAN
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
-    if beyond <= 0.0:
+    if beyond <= 0.0 and not learned:
         return 0.0
-    another = _END_SHARE * float(np.sqrt(beyond)) * max(misfit, 1.0)
+    another = _END_SHARE * float(np.sqrt(max(beyond, 0.0))) * max(misfit, 1.0)
     ends = end_displacement(left, scene)
     if ends is None:
         return another
     seen = np.hypot(_END_SHOWN * ends.shown, _END_CHANCE * ends.chance)
+    if learned:
+        return float(np.hypot(_LEARNED_FLOOR, seen))
     return min(another, float(np.hypot(_END_FLOOR, seen)))

@@ -22,7 +22,8 @@ from knightcube.compiled import compiled_form_of
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST
 from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
-from knightcube.vision.streaks.normal_equations import model_images, residuals
+from knightcube.vision.streaks.normal_equations import residuals
+from knightcube.vision.streaks.scene_images import model_images
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0

@@ -234,4 +234,5 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "ring 8 px, hole 4 px": Imperfection(Optics((ring(8.0, 4.0),), radius=9.0)),
     "ring 8 px, hole 6 px": Imperfection(Optics((ring(8.0, 6.0),), radius=9.0)),
     "stray light, wide": Imperfection(electrons=_wide_light, gain=5.0, known={"gain": 5.0}),
+    "ring 4 px, hole 2 px": Imperfection(Optics((ring(4.0, 2.0),), radius=6.0)),
 }

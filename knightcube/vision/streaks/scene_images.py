@@ -1,0 +1,92 @@
+"""Model images of all stars of a scene, for any profile of the point spread function (PSF).
+
+The images of long streaks and of spots are computed for Gaussian PSFs, see `streak_model`. Images and
+derivatives are linear in the PSF, so that those of another profile are sums over its Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from knightcube.astro.arrays import Float32Array, FloatArray
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks.fit_windows import FitWindows
+from knightcube.vision.streaks.geometry import GAUSSIAN, Shutter, StreakScene
+
+ModelImages = tuple[Float32Array, FloatArray, FloatArray]
+"""Images that are combined to model long streaks, images of spots, and the derivatives of these images."""
+
+# Number of images of a streak that depend on the PSF, and index of the derivative with respect to the width.
+_OF_PSF, _BY_WIDTH = 6, 5
+# Index of the derivative with respect to the width among the derivatives of a spot.
+_SPOT_BY_WIDTH = 8
+
+
+def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
+    """Return the modelled counts (m,) of all stars of `scene` on the m fitted pixels, without sky level."""
+    return _light(scene, windows, model_images(pinhole, shutter, scene, windows))
+
+
+def gaussian_lights(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
+) -> Float32Array:
+    """Return the counts (k, m) of all stars on the m fitted pixels if the PSF were one of its k Gaussians."""
+    parts = _images_of_gaussians(pinhole, shutter, scene, windows)
+    return np.stack([_light(part, windows, images) for part, images in parts])
+
+
+def _light(scene: StreakScene, windows: FitWindows, images: ModelImages) -> Float32Array:
+    """Return the counts (m,) of all stars on the m fitted pixels, given the result of `model_images`."""
+    return windows.total(images[0], images[1], scene.light, np.zeros_like(scene.sky))[:-1]
+
+
+def model_images(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> ModelImages:
+    """Return the images that are combined to model long streaks, and the images and derivatives of spots.
+
+    The last image of each long streak is an uninitialised buffer for the residuals.
+    """
+    if scene.profile == GAUSSIAN:
+        return _gaussian_images(pinhole, shutter, scene, windows)
+    parts = _images_of_gaussians(pinhole, shutter, scene, windows)
+    scaled = [_share(scene, *each, share) for each, share in zip(parts, scene.profile.shares, strict=True)]
+    images, spots, change = scaled[0]
+    for other in scaled[1:]:
+        images[:, :_OF_PSF] += other[0][:, :_OF_PSF]
+        spots += other[1]
+        change += other[2]
+    return images, spots, change
+
+
+def _share(scene: StreakScene, part: StreakScene, images: ModelImages, share: float) -> ModelImages:
+    """Return the images of one Gaussian of the PSF with its `share` of the flux.
+
+    A change of the scene's width changes the widths of all Gaussians in proportion.
+    """
+    streaks, spots, change = images
+    streaks[:, :_OF_PSF] *= np.float32(share)
+    streaks[:, _BY_WIDTH] *= np.float32(part.width / scene.width)
+    change[:, _SPOT_BY_WIDTH] *= (part.width / scene.width) ** 2 * scene.sigma / part.sigma
+    return streaks, share * spots, share * change
+
+
+def _gaussian_images(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
+) -> ModelImages:
+    """Return the result of `model_images` for a Gaussian PSF of the width of the `scene`."""
+    camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
+    images = streak_model.images(*camera, scene.stars[long], scene.width, windows.strips)
+    spots = streak_model.spot_derivatives(*camera, scene.stars[spot], scene.sigma, windows.patches)
+    return images, *spots
+
+
+def _images_of_gaussians(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
+) -> Iterator[tuple[StreakScene, ModelImages]]:
+    """Yield a scene with each Gaussian of the PSF of `scene`, and its model images."""
+    for width in scene.profile.widths:
+        part = replace(scene, width=width * scene.width, profile=GAUSSIAN)
+        yield part, _gaussian_images(pinhole, shutter, part, windows)
