@@ -41,7 +41,7 @@ from knightcube.vision.streaks.geometry import (
     streak_pinhole,
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
-from knightcube.vision.streaks.normal_equations import light_of
+from knightcube.vision.streaks.scene_images import light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 
 # Distance below which streaks overlap, in half-widths of the pixel strip around a bright streak.
@@ -237,10 +237,12 @@ def _scenes(
     hidden = near.copy()
     hidden[fitted] = False
     foreign = _foreign(camera.pinhole, course, motion, known)
-    fit, subtracted = (
-        StreakScene(course, width, known.places[k], known.light[k], np.zeros(len(known.light[k])), leading[k])
-        for k in (fitted, hidden)
-    )
+
+    def scene(k: IntArray | BoolArray) -> StreakScene:
+        sky, profile = np.zeros(len(known.light[k])), motion.psf_profile
+        return StreakScene(course, width, known.places[k], known.light[k], sky, leading[k], profile)
+
+    fit, subtracted = scene(fitted), scene(hidden)
     return fit.with_stars(motion.stars[foreign], motion.flux[foreign]), subtracted
 
 

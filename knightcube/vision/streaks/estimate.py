@@ -539,6 +539,7 @@ def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> Motio
         flux=scene.light,
         significance=significance,
         psf_sigma=scene.sigma,
+        psf_profile=scene.profile,
         misfit=misfit(last.evaluation, kept[np.argsort(-significance, kind="stable")[:10]]),
         rate_model="accelerating" if last.free[3] else "constant",
         residual=spread / camera.pinhole.focal_length,
@@ -587,7 +588,7 @@ def _rejection(
             not result.misfit < settings.worst_misfit and not known.aside < settings.worst_displacement,
             f"the streaks do not fit the model: misfit {result.misfit:.1f}",
         ),
-        (verdict is StreakVerdict.REJECTED, "the motion divides streaks into segments or joins several"),
+        (verdict is StreakVerdict.REJECTED, _WRONG_ENDS),
         (
             max(common.across, common.along) > settings.worst_shaking,
             f"the body vibrated: all streaks vary together by {common.across:.2f} px across and "
@@ -616,6 +617,8 @@ _AT_REST = 4.0
 _SPOT = 2.2
 # Number of the brightest regions whose median length shows whether a frame is free of streaks.
 _BRIGHTEST = 12
+# Reason reported if the streak check rejects a motion.
+_WRONG_ENDS = "the motion divides streaks into segments or joins several"
 # Reason reported if no fitted motion passes the streak check.
 _NO_CONSISTENT_MOTION = "no motion is consistent with the brightness and the ends of the streaks"
 # Reason reported if no motion could be fitted.
@@ -824,6 +827,9 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
         start = replace(last, scene=scene, windows=camera.windows(scene), hidden=None)
     camera = replace(camera, growing=bool(start.free[3]))
     for fit_again in (_vibrating, fit_profile):
+        # No profile of the PSF explains streaks whose ends contradict the motion.
+        if fit_again is fit_profile and found.result.reason == _WRONG_ENDS:
+            break
         again = fit_again(camera, start)
         if again is not None and again.scene.profile != GAUSSIAN:
             camera = replace(camera, work=WorkBudget())

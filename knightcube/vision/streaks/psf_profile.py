@@ -59,11 +59,11 @@ def fit_profile(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
         flux = float(shares.sum())
         profile = PsfProfile(_WIDTHS, tuple((shares / flux).tolist()))
         scene = replace(scene, profile=profile, light=scene.light * flux)
-        done = iterate(camera, scene, fit.free, ROUGH, windows)
-        if done is None:
+        again = iterate(camera, scene, fit.free, ROUGH, windows)
+        if again is None:
             return None
-        scene, windows = done.scene, camera.windows(done.scene)
-    return replace(done, windows=windows)
+        fit, scene, windows = again, again.scene, camera.windows(again.scene)
+    return replace(fit, windows=windows)
 
 
 def _without_doubles(scene: StreakScene) -> StreakScene:

@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import from_rotation_vector
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Lens, Pinhole
 from knightcube.vision.frame import FrameState, frame_state
-from knightcube.vision.streaks.geometry import Course
+from knightcube.vision.streaks.geometry import GAUSSIAN, Course, PsfProfile
 
 _UNCALIBRATED = CameraKnowledge()
 
@@ -224,6 +224,7 @@ class MotionResult(FrameMotion):
         faint_flux: (m,) counts.
         faint_significance: flux of each of the m faint stars divided by its standard deviation (m,).
         psf_sigma: fitted standard deviation of the PSF, px.
+        psf_profile: fitted profile of the PSF.
         misfit: median chi-square per degree of freedom of the bright stars.
         rate_model: fitted model of the rate, `constant` or `accelerating`.
         acceleration: fitted angular acceleration (3,), rad/s^2, or None if it was not fitted.
@@ -243,6 +244,7 @@ class MotionResult(FrameMotion):
     faint_flux: FloatArray = field(default_factory=no_rows())
     faint_significance: FloatArray = field(default_factory=no_rows())
     psf_sigma: float = float("nan")
+    psf_profile: PsfProfile = GAUSSIAN
     misfit: float = float("nan")
     rate_model: RateModel = "constant"
     acceleration: FloatArray | None = None

@@ -17,6 +17,7 @@ from knightcube.vision.streaks.frame import (
     ReducedFrame,
     find_bright_regions,
     measured_psf_sigma,
+    prepare_frames,
     reduce_frame,
     without_glare,
     without_mosaic,
@@ -210,3 +211,12 @@ def test_a_frame_that_saturates_below_the_described_level_is_recognised() -> Non
     found = _found(scene, pixels)
     assert _nees(found, scene) < _HONEST
     assert found.misfit < 1.5
+
+
+@pytest.mark.parametrize(("sigma", "sizes"), [(1.0, [1]), (1.5, [1, 2]), (3.0, [2])])
+def test_a_blurred_frame_is_prepared_again_with_larger_pixels(sigma: float, sizes: list[int]) -> None:
+    """A frame of the configured width is prepared once, and one of a very large width only with binning."""
+    scene = real_sky(2, 1.2, 60.0, 1.0, replace(CAMERA, psf_sigma=sigma))
+    settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
+    frames = prepare_frames(scene.pixels, CAMERA.pinhole, SATURATION, settings)
+    assert [binning.size for binning, *_ in frames] == sizes

@@ -37,8 +37,8 @@ from knightcube.vision.streaks.normal_equations import (
     EliminatedEquations,
     Evaluation,
     Solution,
-    light_of,
 )
+from knightcube.vision.streaks.scene_images import light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
 from tests.support.compiled_forms import assert_forms_agree

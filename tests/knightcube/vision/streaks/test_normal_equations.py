@@ -24,12 +24,12 @@ from knightcube.vision.streaks.normal_equations import (
     eliminate,
     estimates_of,
     evaluate,
-    light_of,
     rate_covariance,
     residuals,
     solve,
     star_equations,
 )
+from knightcube.vision.streaks.scene_images import light_of
 from tests.support.compiled_forms import assert_forms_agree
 
 _SIZE = SHARED + ALONE

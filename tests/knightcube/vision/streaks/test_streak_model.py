@@ -18,7 +18,7 @@ from knightcube.vision.streaks.geometry import (
     sensitivities,
     sensitivities_and_velocity,
 )
-from knightcube.vision.streaks.normal_equations import light_of
+from knightcube.vision.streaks.scene_images import light_of
 from knightcube.vision.streaks.streak_model import IMAGES
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree

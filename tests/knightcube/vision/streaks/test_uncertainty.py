@@ -18,6 +18,7 @@ from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
     DistortedPinhole,
+    PsfProfile,
     Shutter,
     StreakScene,
     sensitivities,
@@ -176,11 +177,11 @@ def test_scatter_of_the_stars_beyond_their_noise_increases_the_rates_covariance(
 
 
 def test_short_streaks_of_another_point_spread_are_rejected_with_a_reason() -> None:
-    scene = real_sky(12, np.radians(70.0), 12.0, 0.2, replace(CAMERA, psf_sigma=1.5))
+    scene = real_sky(12, np.radians(70.0), 8.0, 0.2, replace(CAMERA, psf_sigma=1.5))
     settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
     result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
     assert result.rate is None
-    assert "point spread is 1.4" in result.reason
+    assert "point spread is 1.49" in result.reason
 
 
 def test_two_stars_give_a_rate_with_a_large_covariance() -> None:
@@ -412,6 +413,10 @@ def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: p
     ends = Displacement(0.04, 0.1)
     shown = np.array([uncertainty._END_FLOOR, uncertainty._END_SHOWN * 0.04, uncertainty._END_CHANCE * 0.1])
     assert found(difference, 1.0, ends) == pytest.approx(float(np.linalg.norm(shown)))
+    # With a learned profile, the difference of the variances does not limit the uncertainty.
+    scene = replace(scene, profile=PsfProfile((0.5, 1.0), (-0.5, 1.5)))
+    shown[0] = uncertainty._LEARNED_FLOOR
+    assert found(0.0, 1.0, ends) == pytest.approx(float(np.linalg.norm(shown)))
 
 
 def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -> None:
