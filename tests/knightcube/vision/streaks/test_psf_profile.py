@@ -65,7 +65,7 @@ def test_without_a_learned_profile_rings_give_no_rate(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("cycles", [40.0, 90.0])
-def test_a_fast_vibration_is_not_taken_for_a_ring(cycles: float) -> None:
+def test_a_fast_vibration_is_not_treated_as_a_ring(cycles: float) -> None:
     """A vibration along a line widens streaks like a ring, but not at their ends: no rate, or a true one."""
 
     def shake(times: FloatArray) -> FloatArray:
