@@ -82,8 +82,39 @@ def counts_at(
         signal[p] = counts
         if counts + level < 0.95 * saturation:
             weight[p] = 1.0 / math.sqrt(variance)
-            expected += random / variance
+            expected += random * weight[p] * weight[p]
     return signal, weight, expected
+
+
+def _equations_with_numpy(
+    images: FloatArray, target: FloatArray, sums: FloatArray, line: FloatArray
+) -> FloatArray:
+    products = np.append(images @ line, line @ line)
+    right = np.append(sums[-1], line @ target)
+    whole = np.vstack([np.column_stack([sums[:-1], products[:-1]]), products, right])
+    return np.asarray(whole)
+
+
+@compiled_form_of(_equations_with_numpy)
+def equations_with(images: FloatArray, target: FloatArray, sums: FloatArray, line: FloatArray) -> FloatArray:
+    """Return the normal equations (k + 2, k + 1) of k images (k, p) and one more image `line` (p,).
+
+    The array `sums` (k + 1, k) contains the normal equations of the k images, see `equations`.
+    """
+    size, first, last = len(images), 0, len(line)
+    while first < last and line[first] == 0.0:
+        first += 1
+    while last > first and line[last - 1] == 0.0:
+        last -= 1
+    whole, own = np.empty((size + 2, size + 1)), line[first:last]
+    for k in range(size):
+        for other in range(size):
+            whole[k, other] = sums[k, other]
+        whole[size, k] = whole[k, size] = _dot(images[k, first:last], own, last - first)
+        whole[size + 1, k] = sums[size, k]
+    whole[size, size] = _dot(own, own, last - first)
+    whole[size + 1, size] = _dot(own, target[first:last], last - first)
+    return whole
 
 
 def brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[FloatArray, float]:

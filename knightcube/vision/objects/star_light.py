@@ -22,7 +22,13 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.objects.brightness import SHAPE_ERROR, brightnesses, counts_at, equations
+from knightcube.vision.objects.brightness import (
+    SHAPE_ERROR,
+    brightnesses,
+    counts_at,
+    equations,
+    equations_with,
+)
 from knightcube.vision.objects.streak_ends import Segmented
 from knightcube.vision.objects.streak_images import (
     path_among_stars,
@@ -146,11 +152,10 @@ class StarLight:
         others = [streak_images(self._near, path[None], psf_sigma, False)[0] for path in known]
         self._stars = np.concatenate([images, *others]) if others else images
         self._stars *= self._weight
-        sums = equations(self._stars, self._target)
-        self._normal, self._right = sums[:-1], sums[-1]
+        self._sums = equations(self._stars, self._target)
         self._power = float(self._target @ self._target)
         self.pixels = len(self._near)
-        self._brightness, self.chi_square = brightnesses(self._normal, self._right, self._power)
+        self._brightness, self.chi_square = brightnesses(self._sums[:-1], self._sums[-1], self._power)
 
     def chi_square_with(self, ends: FloatArray) -> float:
         """Return the chi-square of stars and an object between `ends` (2, 2), px (see `explain`)."""
@@ -252,7 +257,10 @@ class StarLight:
         signal, weight, _ = self._counts(pixels)
         regions = self._segmented.regions
         own = regions.labels[pixels[:, 1], pixels[:, 0]]
-        weight[(own != label) & np.isin(own, regions.label)] = 0.0
+        other = np.zeros(max(own.max(initial=0), label, regions.label.max(initial=0)) + 1, dtype=np.bool_)
+        other[regions.label] = True
+        other[label] = False
+        weight[other[own]] = 0.0
         target = signal
         if len(self._known):
             paths = [*self._known, self._path(ends, among_stars)]
@@ -306,7 +314,9 @@ class StarLight:
                 break
         misfit = (power + solution[0] * (solution[0] * sums[0, 0] - 2.0 * sums[5, 0])) / count
         covariance = inverse[1:, 1:] / solution[0] ** 2 * max(misfit, 1.0)
-        sigma = np.sqrt([np.linalg.eigvalsh(covariance[k : k + 2, k : k + 2])[1] for k in (0, 2)])
+        # The larger eigenvalue of a symmetric matrix of two rows has a closed form.
+        xx, yy, xy = covariance[[0, 2], [0, 2]], covariance[[1, 3], [1, 3]], covariance[[0, 2], [1, 3]]
+        sigma = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
         return LocatedEnds(ends, sigma, misfit)
 
     def excess(self, region: IntArray) -> float:
@@ -325,12 +335,8 @@ class StarLight:
 
     def _with_line(self, line: FloatArray) -> tuple[FloatArray, float]:
         """Return brightnesses (k + 1,) of k stars and an object of image `line` (p,), and chi-square."""
-        stars = len(self._normal)
-        normal = np.empty((stars + 1, stars + 1))
-        normal[:stars, :stars], normal[stars, stars] = self._normal, line @ line
-        normal[stars, :stars] = normal[:stars, stars] = self._stars @ line
-        right = np.append(self._right, line @ self._target)
-        brightness, chi_square = brightnesses(normal, right, self._power)
+        sums = equations_with(self._stars, self._target, self._sums, line)
+        brightness, chi_square = brightnesses(sums[:-1], sums[-1], self._power)
         # Without rounding errors, chi-square would never be larger than without the object.
         return brightness, min(chi_square, self.chi_square)
 

@@ -354,9 +354,15 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     y, x = np.divmod(pixel[owner == int(np.argmax(flux))], seen.shape[1])
     # The initial guess of the ends is the uniform line with the same moments as the bright pixels.
     points, weight = np.stack([x, y], axis=-1).astype(float), seen[y, x]
-    points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
-    spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
-    guess = line_of(points.mean(axis=0), spread, LEAST_LINE_PX)
+    # The 80th percentile is computed here, because `np.percentile` takes ten times as long.
+    place = 0.8 * (len(weight) - 1)
+    below, above = int(place), min(int(place) + 1, len(weight) - 1)
+    ordered = np.partition(weight, (below, above))
+    bright = ordered[below] + (place - below) * (ordered[above] - ordered[below])
+    points = points[weight >= 0.5 * bright]
+    middle = points.mean(axis=0)
+    spread = (points - middle).T @ (points - middle) / len(points) if len(points) > 1 else np.eye(2)
+    guess = line_of(middle, spread, LEAST_LINE_PX)
     return _fit_line(patch, left, guess + patch.corner)
 
 

@@ -8,7 +8,13 @@ from scipy.optimize import nnls
 
 from knightcube.errors import FlightError
 from knightcube.vision.objects import brightness
-from knightcube.vision.objects.brightness import brightnesses, counts_at, equations, pixel_weights
+from knightcube.vision.objects.brightness import (
+    brightnesses,
+    counts_at,
+    equations,
+    equations_with,
+    pixel_weights,
+)
 from tests.support.compiled_forms import assert_forms_agree
 
 
@@ -96,7 +102,13 @@ def test_all_forms_return_the_same_equations_and_weights() -> None:
     images = draw.normal(size=(4, 30))
     images[0, :9], images[1, 12:], images[2] = 0.0, 0.0, 0.0
     images[3, :20] = 0.0
-    assert_forms_agree(equations, images, draw.normal(size=30))
+    target = draw.normal(size=30)
+    assert_forms_agree(equations, images, target)
+    whole = equations(images, target)
+    # One more image adds a row and a column to the equations.
+    given = images[:3], target, equations(images[:3], target), images[3]
+    assert_forms_agree(equations_with, *given)
+    assert equations_with(*given) == pytest.approx(whole)
     for saturation in (60.0, np.inf):
         assert_forms_agree(pixel_weights, draw.normal(20.0, 30.0, (6, 9)), 5.0, 4.0, 2.0, saturation)
 

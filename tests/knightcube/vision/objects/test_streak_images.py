@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.objects.streak_images import (
+    _area,
+    _bell,
     _path_among_stars,
     _paths_on_circles,
     fitted_line,
@@ -158,3 +161,20 @@ def test_all_forms_solve_regularised_normal_equations() -> None:
     sums = np.vstack([images @ images.T, images @ np.arange(20.0)])
     assert_forms_agree(solved, sums, relative=1e-6)
     np.testing.assert_allclose(solved(sums)[[1, 4]], [solved(sums[[0, 1, 2, 5]][:, :3])[1], 0.0], rtol=1e-4)
+
+
+def test_the_tabulated_normal_density_and_its_integral_are_accurate() -> None:
+    points = np.concatenate([np.linspace(-10.0, 10.0, 801) + 0.0013, [-9.0, 9.0, 0.0]])
+    bells = [_bell(float(x)) for x in points]
+    areas = [_area(float(x)) for x in points]
+    assert bells == pytest.approx(np.exp(-0.5 * points**2) / np.sqrt(2.0 * np.pi), abs=1e-12)
+    assert areas == pytest.approx(ndtr(points), abs=1e-12)
+
+
+@pytest.mark.parametrize("points", [3, 40])
+def test_a_path_that_is_undefined_has_no_light(points: int) -> None:
+    """A path that leaves the half-space ahead of the camera has points without a place in the image."""
+    pixels = pixels_near(np.array([[20.0, 20.0]]), 6.0, 50, 50)
+    paths = np.full((1, points, 2), np.nan)
+    for form in (streak_images.numpy_form, streak_images.loop_form):
+        assert np.all(form(pixels, paths, 1.0, True) == 0.0)
