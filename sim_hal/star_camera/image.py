@@ -548,14 +548,13 @@ class AttitudeHistory:
         """
         last = len(self.times) - 1
         kept = np.arange(last + 1)
-        stride = 2
-        while stride < 2 * last:
-            thinned = np.append(np.arange(0, last, stride), last)
+        # The longest intervals are tried first, because the rate is nearly constant in most exposures.
+        for power in range((last - 1).bit_length(), 0, -1):
+            thinned = np.append(np.arange(0, last, 1 << power), last)
             guess = _interpolate(self.times[thinned], self.quaternions[thinned], self.times)
-            if np.max(quaternion.angle_between(guess, self.quaternions)) > tolerance:
+            if np.max(quaternion.angle_between(guess, self.quaternions)) <= tolerance:
+                kept = thinned
                 break
-            kept = thinned
-            stride *= 2
         times = self.times[kept]
         parts = np.maximum(1, np.ceil(_turns(self.quaternions[kept]) / longest_turn)).astype(int)
         within = np.concatenate([np.arange(part) / part for part in parts])
@@ -622,7 +621,7 @@ def _poisson(
         return _exact(model, light.reshape(-1), dark, rng).reshape(light.shape)
     signal = light + np.float32(variance)
     np.sqrt(signal, out=signal)
-    signal *= _normal(light.shape, rng)
+    signal *= standard_normal(light.shape, rng)
     signal += light
     signal += np.float32(dark)
     bright = np.flatnonzero(light > faint)
@@ -630,7 +629,7 @@ def _poisson(
     return signal
 
 
-def _normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
+def standard_normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
     """Return standard normal random numbers four times as fast as the generator of numpy.
 
     A 16-bit number selects one of 65,536 slices of equal probability, and the draw is the centre of the
@@ -641,7 +640,8 @@ def _normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
     words = rng.integers(0, 2**64, size=(count + 3) // 4, dtype=np.uint64)
     slices = words.view(np.uint16)[:count]
     normal = _slice_middles().take(slices)
-    outer = np.flatnonzero((slices < OUTER_SLICES) | (slices >= SLICES - OUTER_SLICES))
+    # The sum of 16-bit numbers wraps around, so that the slices of both tails become the lowest numbers.
+    outer = np.flatnonzero(slices + np.uint16(OUTER_SLICES) < 2 * OUTER_SLICES)
     chance = (slices[outer] + rng.uniform(2.0**-32, 1.0, size=len(outer))) / SLICES
     normal[outer] = ndtri(chance)
     return np.asarray(normal.reshape(shape))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from scipy.stats import kstest
 
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
@@ -73,18 +72,6 @@ def test_darkness_reads_the_pedestal_with_the_stated_noise() -> None:
         assert dark.dtype == np.uint16
         assert dark.mean() == pytest.approx(200.0, abs=0.1)
         assert dark.std() == pytest.approx(np.hypot(16 * sigma, 12**-0.5), rel=0.01)
-
-
-def test_the_drawn_noise_is_normal_and_not_correlated_between_pixels() -> None:
-    """A Kolmogorov-Smirnov test of some rows of each frame refuses one frame in a hundred by chance."""
-    frames = [earth_camera._normal(LOGARITHMIC, 2.0, np.random.default_rng(seed)) for seed in range(20)]
-    passed = [kstest(frame[::51].ravel() / 2.0, "norm").pvalue > 0.01 for frame in frames]
-    assert sum(passed) >= 18
-    noise = np.concatenate(frames) / 2.0
-    assert noise.std() == pytest.approx(1.0, rel=2e-3)
-    assert np.abs(noise).max() < 4.4
-    beside = [np.mean(noise[1:] * noise[:-1]), np.mean(noise[:, 1:] * noise[:, :-1])]
-    assert np.abs(beside).max() < 2e-3
 
 
 def test_the_linear_cameras_noise_is_that_of_the_charge() -> None:

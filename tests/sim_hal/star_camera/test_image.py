@@ -13,12 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
+from scipy.stats import kstest
 
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro import catalogue, quaternion
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.star_camera import StarCameraModel, expected_electrons, render, scatter_hot_pixels
-from sim_hal.star_camera.image import counts
+from sim_hal.star_camera.image import counts, standard_normal
 from tests.sim_hal.star_camera.scenes import (
     POINTING,
     at_pixels,
@@ -93,6 +94,18 @@ def test_moments_scale_with_gain_and_exposure() -> None:
     _check_moments(
         _frames(model, image, 200, exposure=0.5), np.full((96, 96), mean), np.full((96, 96), variance)
     )
+
+
+def test_the_drawn_noise_is_normal_and_not_correlated_between_pixels() -> None:
+    """A Kolmogorov-Smirnov test of some rows of each frame refuses one frame in a hundred by chance."""
+    frames = [standard_normal((512, 512), np.random.default_rng(seed)) for seed in range(20)]
+    passed = [kstest(frame[::51].ravel(), "norm").pvalue > 0.01 for frame in frames]
+    assert sum(passed) >= 18
+    noise = np.concatenate(frames)
+    assert noise.std() == pytest.approx(1.0, rel=2e-3)
+    assert 4.6 < np.abs(noise).max() < 5.9
+    beside = [np.mean(noise[1:] * noise[:-1]), np.mean(noise[:, 1:] * noise[:, :-1])]
+    assert np.abs(beside).max() < 2e-3
 
 
 def test_the_background_has_gaussian_tails() -> None:
