@@ -28,7 +28,9 @@ from knightcube.gnc.estimation.estimate import (
 )
 from knightcube.gnc.estimation.mekf import (
     _corrected,
+    _corrected_about_thread,
     correct,
+    correct_about_thread,
     innovation,
     keep_attitude,
     release_attitude,
@@ -231,3 +233,52 @@ def test_a_correction_computed_with_loops_equals_the_correction_computed_with_nu
             assert used is (first is not None)
             assert (LATENCY in changed) is (used and not considers_age and not first)
             assert_forms_agree(_corrected, *seen, gate, rate_gate, considers_age, relative=1e-12)
+
+
+@pytest.mark.parametrize("kept", [0, 1])
+def test_a_correction_about_the_thread_equals_that_by_the_innovation(kept: int) -> None:
+    """Samples of known and of estimated age correct all states, all states but the age, or only the rate."""
+    rng = np.random.default_rng(63)
+    exposure = MeanRateMeasurement(0, 10, np.zeros(3), RATE_COVARIANCE)
+    state = STATE._replace(kept=((exposure, STATE.quaternion),) * kept)
+    root = rng.normal(0.0, 0.1, (SIZE + 3 * kept, SIZE + 3 * kept))
+    covariance = root @ root.T
+    spread = rng.normal(0.0, 0.1, (3, 3))
+    aging = RateChange((0.02, -0.04, 0.03), spread @ spread.T)
+    attitude = AttitudeMeasurement(10**9, np.array((0.1, 0.2, 0.3, 0.9)), 0.1 * np.eye(3) + 0.01)
+    rate = RateMeasurement(10**9, rng.normal(0.0, 1.0, 3), 0.1 * np.eye(3) + 0.01)
+    for measurement, change in (
+        (attitude, None),
+        (rate, None),
+        (replace(attitude, latency=0.04), None),
+        (replace(rate, latency=0.04), aging),
+    ):
+        found = innovation(state, measurement, True, change)
+        for gate, rate_gate in ((np.inf, np.inf), (np.inf, 0.0), (0.0, np.inf)):
+            expected = correct(state, covariance, found, gate, rate_gate, considers_age=change is not None)
+            done, value = correct_about_thread(state, covariance, measurement, change, gate, rate_gate)
+            assert value == pytest.approx(found.value[0], rel=1e-12)
+            assert done.used is expected.used is (gate > 0.0)
+            assert done.square == pytest.approx(expected.square, rel=1e-12)
+            assert done.spread == pytest.approx(expected.spread, rel=1e-12)
+            np.testing.assert_allclose(
+                difference(done.state, state), difference(expected.state, state), atol=1e-12
+            )
+            np.testing.assert_allclose(done.covariance, expected.covariance, atol=1e-12)
+            for (_, stored), (_, other) in zip(done.state.kept, expected.state.kept, strict=True):
+                assert stored == pytest.approx(other, abs=1e-12)
+
+
+@pytest.mark.parametrize("is_rate", [True, False])
+def test_a_correction_about_the_thread_with_loops_equals_that_with_numpy(is_rate: bool) -> None:
+    rng = np.random.default_rng(64)
+    root = rng.normal(0.0, 0.1, (SIZE + 3, SIZE + 3))
+    for size in (SIZE, SIZE + 3):
+        covariance = (root @ root.T)[:size, :size].copy()
+        for gate, rate_gate, considers_age in (
+            (np.inf, np.inf, True),
+            (np.inf, 0.0, False),
+            (0.0, 1.0, True),
+        ):
+            seen = covariance, is_rate, 0.05, -0.3, 0.02, gate, rate_gate, considers_age
+            assert_forms_agree(_corrected_about_thread, *seen, relative=1e-12)
