@@ -158,3 +158,13 @@ def configurations(known_deg: float | None = 0.1) -> list[ListKind]:
         for noise in (0.1, 0.5)
         for false in (0, 2, 5)
     ]
+
+
+def spread_field(count: int, magnitude: bool = False) -> StarField:
+    """Return `count` points in random directions near the boresight; magnitudes are known if requested."""
+    draw = np.random.default_rng(count)
+    tangent = draw.uniform(-0.1, 0.1, (count, 2))
+    direction = np.column_stack([tangent, np.ones(count)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    brightness = np.arange(float(count)) if magnitude else None
+    return StarField(direction, np.full(count, 1e-5), (0.1, 0.1), magnitude=brightness)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import IntArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.vision.startracker import lost_in_space
 from knightcube.vision.startracker.attitude_fit import (
@@ -22,23 +21,25 @@ from knightcube.vision.startracker.attitude_fit import (
 from knightcube.vision.startracker.index import CELLS, FINE, OCTAVE
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import (
-    BatchSizes,
     IdentificationSettings,
     _choose,
     _look_up,
-    batches_of,
     identify,
     look_up,
-    middle_sized,
-    neighbours,
     scale_steps,
-    spread_batches,
-    triples,
 )
+from knightcube.vision.startracker.observed_triangles import triples
 from knightcube.vision.startracker.verification import _first_match
 from tests.pace import ordinary_seconds
 from tests.support.compiled_forms import assert_forms_agree
-from tests.support.star_lists import ListKind, StarList, configurations, draw, draw_random
+from tests.support.star_lists import (
+    ListKind,
+    StarList,
+    configurations,
+    draw,
+    draw_random,
+    spread_field,
+)
 
 SKY = default_index()
 ARCSECOND = np.pi / 648_000.0
@@ -258,31 +259,6 @@ def test_repeated_points_in_one_direction_are_not_identified() -> None:
     assert identify(field, SKY).status is MatchStatus.NO_MATCH
 
 
-def test_the_triangles_of_neighbours_join_a_star_with_two_of_its_five_nearest() -> None:
-    """The triangles join each star with two of its five nearest neighbours.
-
-    The stars are on a great circle at increasing distances, so the neighbours can be counted by hand.
-    """
-    angle = np.cumsum(np.arange(1, 46)) * 1e-4
-    direction = np.stack([np.sin(angle), np.zeros(45), np.cos(angle)], axis=1)
-    field = StarField(direction, np.full(45, 1e-5), (0.2, 0.2))
-    expected = set()
-    # Only the 40 brightest stars are centres of triangles.
-    for centre in range(40):
-        near = sorted(range(45), key=lambda other: abs(angle[other] - angle[centre]))[1:6]
-        expected |= {tuple(sorted((centre, a, b))) for a in near for b in near if a < b}
-    found = neighbours(field)
-    assert {tuple(row) for row in found.tolist()} == expected
-    assert len(found) == len(expected)
-
-
-def test_all_triangles_of_a_field_occur_once_the_brightest_first() -> None:
-    found = triples(6)
-    assert len({tuple(row) for row in found.tolist()}) == len(found) == 20
-    assert all(a < b < c for a, b, c in found.tolist())
-    assert found[:, 2].tolist() == sorted(found[:, 2].tolist())
-
-
 @pytest.mark.parametrize(
     ("kind", "seed", "most"),
     [(ListKind(false_stars=2), 1, 600_000), (ListKind(known_deg=None), 2, 600_000), (ListKind(), 3, 300)],
@@ -336,85 +312,6 @@ def test_identification_by_compiled_forms_gives_the_same_answers(
     assert {one.status for one in expected} == {MatchStatus.IDENTIFIED, MatchStatus.NO_MATCH}
 
 
-def _spread_field(count: int, magnitude: bool = False) -> StarField:
-    draw = np.random.default_rng(count)
-    tangent = draw.uniform(-0.1, 0.1, (count, 2))
-    direction = np.column_stack([tangent, np.ones(count)])
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    brightness = np.arange(float(count)) if magnitude else None
-    return StarField(direction, np.full(count, 1e-5), (0.1, 0.1), magnitude=brightness)
-
-
-def test_batches_begin_with_triangles_of_the_brightest_stars() -> None:
-    """The batches of the brightest stars have their stated sizes, divided by the root of the scale steps.
-
-    Triangles with faint stars follow, and are computed last.
-    """
-    asked = []
-    faint = np.array([[3, 4, 5]])
-
-    def spread() -> list[IntArray]:
-        asked.append(True)
-        return [faint, faint[:0]]
-
-    sizes = BatchSizes((60, 100), (40, 80))
-    found = batches_of(_spread_field(30), sizes, 1, spread)
-    first, second = next(found), next(found)
-    assert not asked
-    whole = triples(12)
-    assert np.array_equal(first[0], whole[:60])
-    assert np.array_equal(second[0], whole[60:160])
-    assert not first[1]
-    assert not second[1]
-    ((third, with_faint),) = found
-    assert np.array_equal(third, faint)
-    assert with_faint
-    steps = [len(triangles) for triangles, _ in batches_of(_spread_field(30), sizes, 4, spread)]
-    assert steps == [30, 50, 1]
-    assert [len(t) for t, _ in batches_of(_spread_field(30), sizes, 10_000, spread)] == [20, 20, 1]
-    # All ten triangles of five stars are in the first batch.
-    assert [len(t) for t, _ in batches_of(_spread_field(5), sizes, 1, spread)] == [10]
-    assert [len(t) for t, _ in batches_of(_spread_field(12), sizes, 1, spread)] == [60, 100, 1]
-
-
-def test_spread_batches_contain_triangles_of_medium_size() -> None:
-    """The longest side is between 0.2 and 0.5 field widths; many or unranked points add their neighbours.
-
-    Larger triangles follow only if the field has too few triangles of medium size.
-    """
-    field, sizes = _spread_field(40), BatchSizes((10,), (100, 300))
-    chosen = middle_sized(field, 400, 100)
-    assert len(chosen) == 400
-    assert len({tuple(row) for row in chosen.tolist()}) == 400
-    corner = field.direction[chosen]
-    sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
-    lowest, highest, largest = lost_in_space._MIDDLE_SIZES
-    assert sides.min() >= 0.2 * lowest
-    assert sides.max() <= 0.2 * highest
-    every = triples(40)
-    corner = field.direction[every]
-    sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
-    fitting = int(np.count_nonzero((sides >= 0.2 * lowest) & (sides <= 0.2 * highest)))
-    assert len(middle_sized(field, 100_000, 100)) == fitting
-    more = middle_sized(field, 100_000, fitting + 50)
-    assert np.array_equal(more[:fitting], middle_sized(field, 100_000, 0))
-    assert len({tuple(row) for row in more.tolist()}) == fitting + 50
-    corner = field.direction[more[fitting:]]
-    sides = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
-    assert sides.min() > 0.2 * highest
-    assert sides.max() <= 0.2 * largest
-    first, second = spread_batches(field, sizes)
-    assert np.array_equal(first, chosen[:100])
-    assert np.array_equal(second[:300], chosen[100:])
-    assert np.array_equal(second[300:], neighbours(field))
-    ranked = spread_batches(_spread_field(40, magnitude=True), sizes)
-    assert [len(batch) for batch in ranked] == [100, 300]
-    assert len(spread_batches(_spread_field(65, magnitude=True), sizes)[1]) > 300
-    assert len(spread_batches(_spread_field(64, magnitude=True), sizes)[1]) == 300
-    assert triples(7, shuffled=True).tolist() != triples(7).tolist()
-    assert sorted(triples(7, shuffled=True).tolist()) == sorted(triples(7).tolist())
-
-
 def test_matches_are_ranked_by_the_number_of_matches_with_the_same_pairs() -> None:
     draw = np.random.default_rng(2)
     observed = draw.integers(0, 6, (300, 3)).astype(np.uint16)
@@ -457,7 +354,7 @@ def test_the_frame_of_three_directions_rotates_with_them() -> None:
 def test_candidates_are_the_attitudes_of_the_matches_with_the_most_votes() -> None:
     """A candidate has the attitude of its match; a match with two known pairs is not a new candidate."""
     turn = attitude_matrix(np.array([0.2, 0.4, -0.1, 0.9]) / np.linalg.norm([0.2, 0.4, -0.1, 0.9]))
-    field = _spread_field(8)
+    field = spread_field(8)
     guide = stretched(field.direction, 1.04) @ turn
     observed = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [4, 5, 6], [7, 3, 2]], dtype=np.uint16)
     star = np.array([[0, 1, 2], [0, 1, 3], [4, 5, 6], [5, 4, 6], [7, 3, 2]], dtype=np.uint16)
@@ -517,7 +414,7 @@ def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
 
 def test_sides_of_triangles_are_sorted_with_their_opposite_corners() -> None:
     """The first corner is opposite to the shortest side; the orientation is that of the sorted corners."""
-    field, triangles = _spread_field(9), triples(9)
+    field, triangles = spread_field(9), triples(9)
     scales = np.random.default_rng(3).uniform(0.9, 1.15, len(triangles))
     corners, sides, left = lost_in_space._forms(field.direction, triangles, scales)
     for row, (abc, three, is_left) in enumerate(zip(corners, sides, left, strict=True)):
