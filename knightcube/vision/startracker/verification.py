@@ -308,7 +308,7 @@ def expected_stars(
     )
 
 
-def _expected_stars_numpy(
+def _expected_numpy(
     guide: FloatArray,
     coarse: npt.NDArray[np.float32],
     by_box: npt.NDArray[np.int32],
@@ -320,10 +320,17 @@ def _expected_stars_numpy(
     count: int,
 ) -> npt.NDArray[np.intp]:
     """See `expected_stars`; the boxes of the index are used only by the compiled form."""
-    return _expected_numpy(guide, coarse, matrix, (across, down), count)
+    cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
+    # The search covers twice as many stars of the sky as needed for `count` stars in an average field.
+    # The factor of two is needed because stars are less dense near the galactic poles.
+    brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ coarse[:, :brightest] > cosine)
+    x, y, z = matrix @ guide[near].T
+    inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
+    return np.asarray(near[inside][:count])
 
 
-@compiled_form_of(_expected_stars_numpy)
+@compiled_form_of(_expected_numpy)
 def _expected(
     guide: FloatArray,
     coarse: npt.NDArray[np.float32],
@@ -335,26 +342,8 @@ def _expected(
     down: float,
     count: int,
 ) -> npt.NDArray[np.intp]:
-    """See `_expected_stars_numpy`."""
-    return _inside(matrix, across, down, count, by_box, placed, begin_of_box)
-
-
-def _expected_numpy(
-    guide: FloatArray,
-    coarse: npt.NDArray[np.float32],
-    matrix: FloatArray,
-    half_width: tuple[float, float],
-    count: int,
-) -> npt.NDArray[np.intp]:
-    across, down = half_width
-    cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
-    # The search covers twice as many stars of the sky as needed for `count` stars in an average field.
-    # The factor of two is needed because stars are less dense near the galactic poles.
-    brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
-    near = np.flatnonzero(matrix[2].astype(np.float32) @ coarse[:, :brightest] > cosine)
-    x, y, z = matrix @ guide[near].T
-    inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
-    return np.asarray(near[inside][:count])
+    """See `_expected_numpy`."""
+    return _inside(matrix, across, down, count, guide, by_box, placed, begin_of_box)
 
 
 @loop_helper
@@ -472,8 +461,8 @@ def _first_match_numpy(
     for number in range(len(scales)):
         matrix, scale = matrices[number], float(scales[number])
         if not given:
-            widths = across * scale, down * scale
-            expected = _expected_numpy(guide, coarse, matrix, widths, _most_expected(len(direction)))
+            table, most = (guide, coarse, by_box, placed, begin_of_box), _most_expected(len(direction))
+            expected = _expected_numpy(*table, matrix, across * scale, down * scale, most)
         if len(expected) < least:
             continue
         variance = (sigma * scale) ** 2
@@ -546,7 +535,7 @@ def _first_match(
         scale = scales[number]
         if not given:
             expected = _inside(
-                matrices[number], across * scale, down * scale, most, by_box, placed, begin_of_box
+                matrices[number], across * scale, down * scale, most, guide, by_box, placed, begin_of_box
             )
         if len(expected) < least:
             continue
@@ -602,6 +591,7 @@ def _inside(
     across: float,
     down: float,
     count: int,
+    guide: FloatArray,
     by_box: npt.NDArray[np.int32],
     placed: FloatArray,
     begin_of_box: npt.NDArray[np.int32],
@@ -610,6 +600,8 @@ def _inside(
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
     chord = math.sqrt(2.0 - 2.0 * cosine)
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    if brightest < _FEW_BRIGHTEST:
+        return _first_inside(matrix, across, down, cosine, guide[:brightest], count)
     boxes = round((len(begin_of_box) - 1) ** (1.0 / 3.0))
     lowest, highest = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     for axis in range(3):
@@ -624,13 +616,8 @@ def _inside(
                     star = by_box[at]
                     if star >= brightest:
                         break
-                    gx, gy, gz = placed[at, 0], placed[at, 1], placed[at, 2]
-                    z = matrix[2, 0] * gx + matrix[2, 1] * gy + matrix[2, 2] * gz
-                    if z <= cosine:
-                        continue
-                    if abs(matrix[0, 0] * gx + matrix[0, 1] * gy + matrix[0, 2] * gz) > across * z:
-                        continue
-                    if abs(matrix[1, 0] * gx + matrix[1, 1] * gy + matrix[1, 2] * gz) > down * z:
+                    x, y, z = placed[at, 0], placed[at, 1], placed[at, 2]
+                    if not _in_field(matrix, across, down, cosine, x, y, z):
                         continue
                     # The stars found so far are sorted, and only the brightest are kept.
                     if found == count and star > stars[found - 1]:
@@ -645,6 +632,42 @@ def _inside(
     for k in range(found):
         inside[k] = stars[k]
     return inside
+
+
+@loop_helper
+def _first_inside(
+    matrix: FloatArray, across: float, down: float, cosine: float, guide: FloatArray, count: int
+) -> IntArray:
+    """Return the indices of the first `count` of the stars `guide` (n, 3) that are in the field.
+
+    In a wide field, a search of all bright stars is faster than a search of many boxes.
+    """
+    found, stars = 0, np.empty(count, dtype=np.int64)
+    for star in range(len(guide)):
+        x, y, z = guide[star, 0], guide[star, 1], guide[star, 2]
+        if _in_field(matrix, across, down, cosine, x, y, z):
+            stars[found] = star
+            found += 1
+            if found == count:
+                break
+    return stars[:found].copy()
+
+
+@loop_helper
+def _in_field(
+    matrix: FloatArray, across: float, down: float, cosine: float, x: float, y: float, z: float
+) -> bool:
+    """Return whether the direction (x, y, z) is in the field; `cosine` is that of the image corners."""
+    along = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
+    return (
+        along > cosine
+        and abs(matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z) <= across * along
+        and abs(matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z) <= down * along
+    )
+
+
+# Number of brightest guide stars below which all of them are searched instead of boxes.
+_FEW_BRIGHTEST = 8_000
 
 
 @loop_helper
