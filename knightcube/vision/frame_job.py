@@ -48,7 +48,7 @@ from knightcube.vision.startracker.solve import (
     solve_points,
 )
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Survey, survey
-from knightcube.vision.startracker.verification import PRIOR_SIGMAS
+from knightcube.vision.startracker.tracking import PRIOR_SIGMAS
 from knightcube.vision.streaks.geometry import streak_pinhole
 from knightcube.vision.streaks.streak_result import (
     FrameMotion,

@@ -32,7 +32,8 @@ from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind
-from knightcube.vision.startracker.verification import PRIOR_SIGMAS, expected_stars, track
+from knightcube.vision.startracker.tracking import PRIOR_SIGMAS, track
+from knightcube.vision.startracker.verification import expected_stars
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
 from knightcube.vision.streaks.streak_result import (
     FrameMotion,
