@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -69,6 +70,7 @@ class Piece:
         return f"{self.kind:9} {self.lines:4} {self.name}"
 
 
+@cache
 def pieces(root: Path = ROOT) -> list[Piece]:
     """Return all files, classes and functions of the product, the longest first.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,10 +19,18 @@ def forbidden(module: str, path: str) -> bool:
     )
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield all statements within a node, at any depth. An expression contains no import."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.expr):
+            yield child
+            yield from statements(child)
+
+
 def imports(source: str) -> list[str]:
     """Return the modules that a source imports. `from a import b` counts as `a` and as `a.b`."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in statements(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -43,6 +52,14 @@ def imports(source: str) -> list[str]:
 )
 def test_studies_and_test_modules_are_refused(module: str, path: str, refused: bool) -> None:
     assert forbidden(module, path) is refused
+
+
+def test_an_import_is_found_in_any_statement() -> None:
+    source = (
+        "def f():\n  with a:\n    try: b\n    except C:\n      if d: pass\n      else: import e\n"
+        "match g:\n  case 1: from h import i\n"
+    )
+    assert imports(source) == ["e", "h", "h.i"]
 
 
 def test_no_test_imports_a_study_or_another_test() -> None:

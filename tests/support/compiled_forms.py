@@ -7,7 +7,9 @@ only the implementations with numpy and with loops are compared.
 from __future__ import annotations
 
 import copy
+import functools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -75,9 +77,15 @@ def _compiled(hot: HotFunction[Any, Any], args: tuple[Any, ...]) -> list[Any]:
     global compiling_s  # noqa: PLW0603
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     begun = time.process_time()
-    results = _called(hot.compiled_form(), args)
+    results = _called(_compiled_form(hot), args)
     compiling_s += time.process_time() - begun
     return results
+
+
+@functools.cache
+def _compiled_form(hot: HotFunction[Any, Any]) -> Callable[..., Any]:
+    """Return the compiled implementation, which all tests of this process share."""
+    return hot.compiled_form()
 
 
 def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:
