@@ -485,10 +485,8 @@ class ModeControl:
         elif self.mode in ORBITAL and rate is not None:
             self._pointing.watch_rate(rate, now_ns)
         elif self.mode is Mode.SAFE and rate is not None and Mode.ACQUIRE in self._modes:
-            barred, steering = bool(_barred(self._facts)), self._steering
-            self._attitude.watch_safe(
-                rate, barred, steering.begin_detumbling, steering.begin_sun_acquisition, now_ns
-            )
+            barred, law = bool(_barred(self._facts)), self._steering
+            self._attitude.watch_safe(rate, barred, law.begin_detumbling, law.begin_sun_acquisition, now_ns)
         if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
             self._fire(trigger, "", now_ns)
         if estimate is not None and self.mode in _HOLDING:

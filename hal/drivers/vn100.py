@@ -456,14 +456,13 @@ class ReadingConverter:
         values = self._map.dot(np.array((*q, *rate, *mag, *accel)))
         if not has_rate:
             values[4:7] = math.nan
-        # Of the two equivalent quaternions q and -q, the one with a positive scalar part is returned.
-        quaternion = values[:4] / math.copysign(norm, values[3])
         length = item.layout.length if isinstance(item, BinaryPacket) else item.length
         return ImuReading(
             time_ns=item.arrival_ns - round(length * self._byte_ns),
             arrival_ns=item.arrival_ns,
             device_time_ns=device_ns,
-            quaternion=quaternion,
+            # Of the two equivalent quaternions q and -q, the one with a positive scalar part is returned.
+            quaternion=values[:4] / math.copysign(norm, values[3]),
             rate=values[4:7],
             field=values[7:10] - self._field_offset,
             acceleration=values[10:],

@@ -231,8 +231,7 @@ def _look_up(
     windows = np.empty((len(runs), 2), dtype=np.uint32)
     side, corner, queries, count = np.empty(3), np.empty(3, dtype=np.int64), 0, 0
     for t in range(len(triangles)):
-        for k in range(3):
-            corner[k] = triangles[t, k]
+        corner[0], corner[1], corner[2] = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         a, b, c = sigma[corner[0]], sigma[corner[1]], sigma[corner[2]]
         spread = 1.6 * tolerance * math.sqrt((a * a + b * b + c * c) / 3.0)
         joined = _joined(direction, scales, distortion, corner, side)

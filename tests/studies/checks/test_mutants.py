@@ -127,7 +127,7 @@ def test_killed_survived_and_equivalent(
     )
     monkeypatch.setattr(mutants, "ROOT", repository)
     monkeypatch.setattr(mutants, "EQUIVALENT", known)
-    monkeypatch.setattr(mutants, "LIMIT_S", 20.0)
+    monkeypatch.setattr(mutants, "LIMIT_S", 300.0)
     out = tmp_path / "results.jsonl"
     assert main(["--only", "knightcube/product.py:6", "--out", str(out), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
