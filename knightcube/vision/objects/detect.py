@@ -543,10 +543,11 @@ class Judge:
         If a streak differs from the streak of a star only near its ends, stars without an object fit most of
         its length nearly as well. For a `uniform` streak, it is therefore sufficient that the object explains
         nearly all light that stars do not explain. A line is rejected if it explains only a small part of the
-        light that remains after subtraction of the stars.
+        light that remains after subtraction of the stars. Light in other regions does not count for a
+        `uniform` streak, because not all stars of other regions are modelled.
         """
         gained = light.chi_square - found.chi_square
-        remains = found.chi_square - light.expected
+        remains = found.unexplained if uniform else found.chi_square - light.expected
         most = found.misfit <= 0.5 * found.misfit_of_stars and remains <= _MOST_UNEXPLAINED * gained
         most |= uniform and remains <= _LEAST_UNEXPLAINED * gained
         # A saturated point has a position error of 0.1 px, so that residuals in its wings exceed the noise.
@@ -574,14 +575,16 @@ class Judge:
         """Return the object between `ends`, or None if stars explain the pixels.
 
         The order of the ends is the order that gives the slower motion relative to the stars. The ends are
-        located from the light along the whole streak. If the fit of the object along the streak is poor, the
+        located from the light along the whole streak. If light in other regions is much stronger than the
+        object, only a uniform streak is accepted. If the fit of the object along the streak is poor, the
         stars of the region are fitted and included. Returns None also if the located streak is the streak of
         a star.
         """
         rough = light.explain(ends)
         gained = light.chi_square - rough.chi_square
-        if gained < improvement or rough.chi_square - light.expected > _HOPELESS * gained:
+        if gained < improvement or rough.unexplained > _HOPELESS * gained:
             return None
+        only_uniform = rough.chi_square - light.expected > _HOPELESS * gained
         located = self._located(ends, light, stars, improvement)
         if not stars and (located is None or located[2].misfit > _GOOD_FIT):
             own = np.flatnonzero(self.segmented.regions.label == region_along(self.segmented, ends))
@@ -589,7 +592,7 @@ class Judge:
             again = self._located(ends, self._light(ends, stars), stars, improvement) if stars else located
             if again is None or located is None or again[2].misfit < located[2].misfit:
                 located = again
-        if located is None:
+        if located is None or (only_uniform and located[0].misfit > _UNIFORM):
             return None
         found_ends, light, found = located
         ends, sigma = found_ends.ends, found_ends.sigma

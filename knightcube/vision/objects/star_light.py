@@ -77,11 +77,13 @@ class Explanation:
     """Quality of the hypothesis that the pixels of a region show stars and one object of `flux` counts.
 
     The attribute `chi_square` belongs to the best-fitting sum of star streaks and the object's streak. The
-    attributes `misfit` and `misfit_of_stars` are the chi-squares per pixel along the object's streak, with
-    the object and with stars only.
+    attribute `unexplained` is the excess of chi-square over its expected value, without the pixels of bright
+    regions that the object's streak does not touch. The attributes `misfit` and `misfit_of_stars` are the
+    chi-squares per pixel along the object's streak, with the object and with stars only.
     """
 
     chi_square: float
+    unexplained: float
     misfit: float
     misfit_of_stars: float
     flux: float
@@ -173,12 +175,23 @@ class StarLight:
         line, (brightness, chi_square) = lines[best], fits[best]
         along = np.flatnonzero(line > 0.05 * line.max())
         if not len(along):
-            return Explanation(chi_square, np.inf, np.inf, 0.0)
-        target, stars = self._target[along], self._stars[:, along]
-        missed = target - brightness[:-1] @ stars - line[along] * brightness[-1]
-        by_stars = target - self._brightness @ stars
-        misfit, of_stars = (float(each @ each) / len(each) for each in (missed, by_stars))
-        return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
+            return Explanation(chi_square, chi_square - self.expected, np.inf, np.inf, 0.0)
+        missed = self._target - brightness[:-1] @ self._stars - line * brightness[-1]
+        own = np.ascontiguousarray(~self._in_others(self._near, _labels_along(self._segmented, ends)))
+        expected = self._counts(self._near[own])[2]
+        unexplained = float(missed[own] @ missed[own]) - expected
+        by_stars = self._target[along] - self._brightness @ self._stars[:, along]
+        misfit, of_stars = (float(each @ each) / len(each) for each in (missed[along], by_stars))
+        return Explanation(chi_square, unexplained, misfit, of_stars, float(brightness[-1]))
+
+    def _in_others(self, pixels: IntArray, labels: IntArray) -> BoolArray:
+        """Return which pixels (p, 2) belong to bright regions other than those with the given `labels`."""
+        regions = self._segmented.regions
+        found = regions.labels[pixels[:, 1], pixels[:, 0]]
+        others = np.zeros(regions.labels.max(initial=0) + 1, dtype=np.bool_)
+        others[regions.label] = True
+        others[labels] = False
+        return np.asarray(others[found])
 
     def _object_images(self, ends: FloatArray) -> list[FloatArray]:
         """Return the weighted images (p,) of objects with paths straight in the image and among stars."""
@@ -255,12 +268,7 @@ class StarLight:
         rows, columns = self._segmented.signal.shape
         pixels = pixels_near(curve, _REACH * self._psf_sigma, rows, columns)
         signal, weight, _ = self._counts(pixels)
-        regions = self._segmented.regions
-        own = regions.labels[pixels[:, 1], pixels[:, 0]]
-        other = np.zeros(max(own.max(initial=0), label, regions.label.max(initial=0)) + 1, dtype=np.bool_)
-        other[regions.label] = True
-        other[label] = False
-        weight[other[own]] = 0.0
+        weight[self._in_others(pixels, np.array([label]))] = 0.0
         target = signal
         if len(self._known):
             paths = [*self._known, self._path(ends, among_stars)]
@@ -347,11 +355,16 @@ class StarLight:
 
 def region_along(segmented: Segmented, ends: FloatArray) -> int:
     """Return the label of the region that contains most of the line between two ends (2, 2), px, or 0."""
-    labels = segmented.regions.labels
-    column, row = np.clip(np.rint(straight_path(ends)), 0, np.array(labels.shape[::-1]) - 1).T.astype(int)
-    shares = np.bincount(labels[row, column])
+    shares = np.bincount(_labels_along(segmented, ends))
     shares[0] = 0
     return int(np.argmax(shares))
+
+
+def _labels_along(segmented: Segmented, ends: FloatArray) -> IntArray:
+    """Return the labels (m,) of the regions at points on the line between two ends (2, 2), px, or 0."""
+    labels = segmented.regions.labels
+    column, row = np.clip(np.rint(straight_path(ends)), 0, np.array(labels.shape[::-1]) - 1).T.astype(int)
+    return np.asarray(labels[row, column])
 
 
 def light_on_path(segmented: Segmented, path: FloatArray, psf_sigma: float) -> FloatArray:

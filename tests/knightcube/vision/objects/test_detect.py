@@ -614,8 +614,38 @@ def test_an_object_decreases_chi_square_and_explains_its_pixels(
 ) -> None:
     """An object gains enough, explains its streak twice as well as stars, and most of the remaining light."""
     light = _light(chi_square=900.0 + remains + gained)
-    found = Explanation(900.0 + remains, misfit, of_stars, 1e4)
+    found = Explanation(900.0 + remains, remains, misfit, of_stars, 1e4)
     assert _judge()._is_object(light, found, 600.0, uniform) == expected
+
+
+@pytest.mark.parametrize(("uniform", "unexplained"), [(True, 1700.0), (True, 1900.0), (False, 1700.0)])
+def test_light_in_other_regions_does_not_count_for_a_uniform_streak(
+    uniform: bool, unexplained: float
+) -> None:
+    light = _light(chi_square=6500.0)
+    found = Explanation(5900.0, unexplained, 1.0, 2.5, 1e4)
+    assert _judge()._is_object(light, found, 600.0, uniform) == (uniform and unexplained < 1800.0)
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "unexplained", "misfit", "found"),
+    [
+        (3299.0, 2399.0, 1.3, True),
+        (3301.0, 2399.0, 1.3, False),
+        (3301.0, 2399.0, 1.1, True),
+        (3301.0, 2401.0, 1.1, False),
+    ],
+)
+def test_beside_bright_regions_only_a_uniform_streak_is_an_object(
+    chi_square: float, unexplained: float, misfit: float, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The light that remains is compared with the decrease of chi-square by the object, which is 600."""
+    ends = np.array([[60.0, 80.0], [300.0, 250.0]])
+    rough = Explanation(chi_square, unexplained, 1.0, 9.0, 1e4)
+    light = _light(chi_square=chi_square + 600.0, explain=lambda _: rough)
+    located = LocatedEnds(ends, np.ones(2), misfit), light, rough
+    monkeypatch.setattr(Judge, "_located", lambda *_: located)
+    assert (_judge()._candidate(ends, (), light, (), 600.0) is not None) == found
 
 
 def test_stars_explain_pixels_with_a_small_chi_square() -> None:
@@ -740,7 +770,7 @@ def test_an_object_has_accurate_ends_inside_the_image(
     """A streak that the border truncates, or whose ends are vague, may belong to two stars."""
     ends = np.array([first, (300.0, 250.0)])
     found = LocatedEnds(ends, np.array([0.2, sigma]), 1.0)
-    fitted = Explanation(900.0, 1.0, 9.0, 1e4)
+    fitted = Explanation(900.0, 0.0, 1.0, 9.0, 1e4)
     light = _light(located=lambda *_: found, explain=lambda _: fitted)
     monkeypatch.setattr(Judge, "_light", lambda *_: light)
     located = _judge()._located(ends, light, (), 600.0)
@@ -767,9 +797,9 @@ def test_a_poorly_fitted_object_is_reported_only_if_it_remains_beside_fitted_sta
         misfit = beside_stars if stars else alone
         if misfit is None:
             return None
-        return LocatedEnds(ends, np.ones(2), misfit), light, Explanation(900.0, misfit, 9.0, misfit)
+        return LocatedEnds(ends, np.ones(2), misfit), light, Explanation(900.0, 0.0, misfit, 9.0, misfit)
 
-    light = _light(explain=lambda _: Explanation(900.0, 1.0, 9.0, 1e4))
+    light = _light(explain=lambda _: Explanation(900.0, 0.0, 1.0, 9.0, 1e4))
     judge = _judge()
     own = dataclasses.replace(judge.segmented.regions, label=np.array([7]))
     judge = dataclasses.replace(judge, segmented=dataclasses.replace(judge.segmented, regions=own))

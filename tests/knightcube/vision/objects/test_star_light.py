@@ -242,6 +242,24 @@ def test_stars_and_an_object_are_compared_by_chi_square() -> None:
     arguments = _segmented(noisy), corners, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0
     known = StarLight(*arguments, [straight_path(ends)])
     assert known.chi_square == pytest.approx(found.chi_square, rel=0.05)
+    assert found.unexplained == pytest.approx(found.chi_square - light.expected)
+
+
+def test_light_in_other_regions_is_not_unexplained() -> None:
+    """The pixels near the trial stars contain a point of light that belongs to another region."""
+    ends = np.array([[225.0, 232.0], [262.0, 252.0]])
+    image = np.zeros((512, 512))
+    deposit(image, straight_path(ends), 12_000.0, 1.0)
+    noisy = 500.0 + image + np.random.default_rng(9).normal(0.0, np.sqrt(_NOISE**2 + image))
+    deposit(noisy, np.array([[245.0, 230.0]]), 5_000.0, 1.0)
+    corners = np.array([[225.0, 232.0], [262.0, 252.0], [245.0, 230.0]])
+    light = StarLight(_segmented(noisy), corners, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
+    found = light.explain(ends)
+    assert found.chi_square - light.expected > 600.0
+    assert abs(found.unexplained) < 250.0
+    # A line that touches the point leaves the light of both regions unexplained.
+    across = light.explain(np.array([[225.0, 232.0], [245.0, 230.0]]))
+    assert across.unexplained == pytest.approx(across.chi_square - light.expected, abs=100.0)
 
 
 @pytest.mark.parametrize("corners", [2, 4])
