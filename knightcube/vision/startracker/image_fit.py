@@ -548,7 +548,8 @@ def _reweighted(
         )
         if not agreed:
             break
-        bend[:bends] = held[:bends]
+        for k in range(bends):
+            bend[k] = held[k]
         delay = held[bends] if len(late) else 0.0
         for star in range(len(squares)):
             _miss(observed, reference, late, matrix, scale, bend, delay, star, off)
