@@ -383,6 +383,7 @@ class ModeControl:
         self._steering, self._facts, self._recorder = steering, services.facts, services.recorder
         self._events, self._low_rate = services.events, detumble.low_rate
         self._modes = body.control.modes
+        self._acquires = Mode.ACQUIRE in self._modes
         self._initial = Mode.named(modes.initial)
         if self._initial not in body.control.modes:
             starts = ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))
@@ -466,14 +467,14 @@ class ModeControl:
         """
         # A body that acquires its attitude needs a known rate; it needs an estimate only for steering.
         measured = estimate is not None and accurate
-        if Mode.ACQUIRE in self._modes:
+        if self._acquires:
             measured = rate is not None and (measured or estimate is None or self.mode not in STEERING)
         self._measured_ns = now_ns if measured else self._measured_ns
         if self.mode is Mode.BOOT:
             self._boot(measured and coils_answer, now_ns)
         blind = (now_ns - self._measured_ns) * 1e-9
         missing = "estimate" if estimate is None else "estimate accurate enough for control"
-        missing = "body rate" if Mode.ACQUIRE in self._modes and rate is None else missing
+        missing = "body rate" if self._acquires and rate is None else missing
         self._facts.update(
             facts.BLIND,
             blind > self._settings.blind_limit,
@@ -484,7 +485,7 @@ class ModeControl:
             self._brake(estimate, rate, now_ns)
         elif self.mode in ORBITAL and rate is not None:
             self._pointing.watch_rate(rate, now_ns)
-        elif self.mode is Mode.SAFE and rate is not None and Mode.ACQUIRE in self._modes:
+        elif self._acquires and self.mode is Mode.SAFE and rate is not None:
             barred, law = bool(_barred(self._facts)), self._steering
             self._attitude.watch_safe(rate, barred, law.begin_detumbling, law.begin_sun_acquisition, now_ns)
         if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
@@ -548,7 +549,7 @@ class ModeControl:
 
     def _return_to(self, before: Mode) -> Trigger:
         """Return the trigger that continues the flight after a low battery has ended the mode `before`."""
-        if Mode.ACQUIRE in self._modes:
+        if self._acquires:
             return Trigger.CHARGED_ACQUIRE
         demo = before is Mode.TESTBED_DEMO or (before is Mode.BOOT and self._initial is Mode.TESTBED_DEMO)
         return Trigger.CHARGED_DEMO if demo else Trigger.CHARGED_HOLD

@@ -292,7 +292,7 @@ def propagate(
     longest_step: float = LONGEST_STEP,
 ) -> tuple[FilterState, FloatArray]:
     """Propagate over `duration` s under one coil command, in steps of at most `longest_step` s."""
-    steps = max(1, math.ceil(duration / longest_step - 1e-9))
+    steps = 1 if duration <= longest_step else math.ceil(duration / longest_step - 1e-9)
     steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
     x, y, z = torquing.driven
     quaternion, rate, covariance = _propagated(
