@@ -651,12 +651,10 @@ def _in_field(
     matrix: FloatArray, across: float, down: float, cosine: float, x: float, y: float, z: float
 ) -> bool:
     """Return whether the direction (x, y, z) is in the field; `cosine` is that of the image corners."""
-    along = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
-    return (
-        along > cosine
-        and abs(matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z) <= across * along
-        and abs(matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z) <= down * along
-    )
+    along: float = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
+    right: float = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z
+    below: float = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z
+    return along > cosine and abs(right) <= across * along and abs(below) <= down * along
 
 
 # Number of brightest guide stars below which all of them are searched instead of boxes.
