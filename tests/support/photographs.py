@@ -61,7 +61,7 @@ def _areas(many: int, few: int) -> FloatArray:
     edges, step = np.arange(many, dtype=np.float64), many / few
     begin = step * np.arange(few)[:, None]
     overlap = np.minimum(edges + 1.0, begin + step) - np.maximum(edges, begin)
-    return np.maximum(overlap, 0.0) / step
+    return np.asarray(np.maximum(overlap, 0.0) / step)
 
 
 def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:

@@ -28,7 +28,7 @@ from knightcube.vision.startracker.solve import (
     solve_motion,
 )
 from knightcube.vision.startracker.survey import FrameKind
-from knightcube.vision.startracker.verification import PRIOR_SIGMAS
+from knightcube.vision.startracker.tracking import PRIOR_SIGMAS
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.flight.loop.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
