@@ -24,6 +24,8 @@ from knightcube.compiled import compiled_form_of, loop_helper
 
 _STRETCH = 32_768
 """Number of pixels that are summed in one step, small enough for the processor's cache."""
+_AT_ONCE = 32
+"""Number of pixels that are compared with a threshold in one step."""
 
 
 def box_sum(image: Image) -> Image:
@@ -295,12 +297,25 @@ def _hot_places(signal: Image, variance: Image, least: float) -> tuple[IntArray,
     found, count = np.empty((2, rows * columns), dtype=np.int64), 0
     lowest = np.float32(HOT_SIGMAS * math.sqrt(least))
     for row in range(1, rows - 1):
-        for column in range(1, columns - 1):
-            own = signal[row, column]
-            if own > lowest and _is_hot(signal, row, column, math.sqrt(variance[row, column]), 0.0):
-                found[0, count], found[1, count] = row, column
-                count += 1
+        for begin in range(1, columns - 1, _AT_ONCE):
+            stop = min(begin + _AT_ONCE, columns - 1)
+            if not _any_above(signal[row, begin:stop], lowest):
+                continue
+            for column in range(begin, stop):
+                own = signal[row, column]
+                if own > lowest and _is_hot(signal, row, column, math.sqrt(variance[row, column]), 0.0):
+                    found[0, count], found[1, count] = row, column
+                    count += 1
     return found[0, :count].copy(), found[1, :count].copy()
+
+
+@loop_helper
+def _any_above(values: Image, threshold: np.float32) -> bool:
+    """Return whether any of `values` (k,) exceeds the `threshold`; the count permits vector instructions."""
+    above = np.int32(0)
+    for k in range(len(values)):
+        above += np.int32(values[k] > threshold)
+    return bool(above > 0)
 
 
 @loop_helper

@@ -198,12 +198,12 @@ def _add(
         out.crowds.append(SharedPixels(star[held], matrix[held], first, view.common, crowded, drawn))
 
 
-_Pixels = tuple[IntArray, BoolArray, Float32Array, Float32Array, Float32Array]
+Pixels = tuple[IntArray, BoolArray, Float32Array, Float32Array, Float32Array]
 """Attributes `slot`, `inside`, `signal`, `floor` and `ceiling` of `BlockPixels`."""
 
 
 def residuals(
-    total: Float32Array, pixels: _Pixels, limits: tuple[float, float]
+    total: Float32Array, pixels: Pixels, limits: tuple[float, float]
 ) -> tuple[Float32Array, Float32Array]:
     """Return weights and residuals of pixels for the modelled counts `total` of all fitted pixels.
 
@@ -237,7 +237,7 @@ def _sum_products_numpy(
     images: Float32Array,
     of_blocks: tuple[IntArray, FloatArray],
     total: Float32Array,
-    of_pixels: _Pixels,
+    of_pixels: Pixels,
     limits: tuple[float, float],
 ) -> None:
     """Add weighted products of the images of b blocks of p pixels to the normal equations of their stars.
@@ -273,7 +273,7 @@ def _sum_products(
     images: Float32Array,
     of_blocks: tuple[IntArray, FloatArray],
     total: Float32Array,
-    of_pixels: _Pixels,
+    of_pixels: Pixels,
     limits: tuple[float, float],
 ) -> None:
     (star, matrix), (gain, clip) = of_blocks, limits

@@ -12,26 +12,31 @@ the rotation vectors at the start and the end of the exposure, which move the en
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST
 from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
-from knightcube.vision.streaks.normal_equations import residuals
+from knightcube.vision.streaks.normal_equations import Pixels, residuals
 from knightcube.vision.streaks.scene_images import model_images
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
 # Part of this residual limit, as a fraction of the brightest modelled pixel of the same line.
 _FOREIGN_SHARE = 0.6
+# Margin (standard deviations) to saturation below which a pixel is excluded, as in `normal_equations`.
+_MARGIN = 3.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class StreakResiduals:
     """Residuals of the streaks that determine the motion, on b blocks of pixels.
 
@@ -50,26 +55,154 @@ class StreakResiduals:
     weight: Float32Array
     residual: Float32Array
 
+    @functools.cached_property
+    def line_sums(self) -> LineSums:
+        """The sums over each line of pixels for displacements across the paths and for the rate."""
+        return self.sums_of_lines(2)
+
+    def sums_of_lines(self, rows: int) -> LineSums:
+        """Return the sums over each line of pixels for the first `rows` of the four rotations and rates."""
+        return LineSums(*_line_sums(self.images, self.weight, self.residual, rows))
+
+
+class LineSums(NamedTuple):
+    """Sums over the pixels of each of l lines of products of r images, see `_ROTATION_IMAGES`.
+
+    The arrays contain the weighted products of two images `gram` (l, r, r), the weighted products of image
+    and residual `score` (l, r), the weighted squared residuals `squares` (l,), and the number of fitted
+    pixels `used` (l,).
+    """
+
+    gram: FloatArray
+    score: FloatArray
+    squares: FloatArray
+    used: IntArray
+
+
+# Images whose products with the residuals determine the rotation, the rate, and the rotations at both ends.
+_ROTATION_IMAGES = (1, 0, 3, 4)
+
+
+def _line_sums_numpy(
+    images: Float32Array, weight: Float32Array, residual: Float32Array, rows: int
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Return the attributes of `LineSums` for the attributes of `StreakResiduals`."""
+    images = images[:, _ROTATION_IMAGES[:rows]]
+    weighted = (images * weight[:, None]).transpose(0, 2, 1, 3)
+    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, rows, rows).astype(np.float64)
+    score = (weighted @ residual[..., None]).reshape(-1, rows).astype(np.float64)
+    squares = np.sum(weight * residual * residual, axis=2).reshape(-1).astype(np.float64)
+    return gram, score, squares, np.count_nonzero(weight, axis=2).reshape(-1)
+
+
+@compiled_form_of(_line_sums_numpy)
+def _line_sums(
+    images: Float32Array, weight: Float32Array, residual: Float32Array, rows: int
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    blocks, lines, size = weight.shape
+    gram, score = np.empty((blocks * lines, rows, rows)), np.empty((blocks * lines, rows))
+    squares, used = np.empty(blocks * lines), np.empty(blocks * lines, np.int64)
+    weighted = np.empty((rows + 1, size), np.float32)
+    for b in range(blocks):
+        for i in range(lines):
+            line, weights, left = b * lines + i, weight[b, i], residual[b, i]
+            used[line] = np.count_nonzero(weights)
+            _multiply(weighted[rows], weights, left)
+            squares[line] = _scalar_product(weighted[rows], left)
+            for r in range(rows):
+                image = images[b, _ROTATION_IMAGES[r], i]
+                score[line, r] = _scalar_product(weighted[rows], image)
+                _multiply(weighted[r], weights, image)
+                for c in range(r + 1):
+                    gram[line, r, c] = _scalar_product(weighted[c], image)
+                    gram[line, c, r] = gram[line, r, c]
+    return gram, score, squares, used
+
+
+@loop_helper
+def _multiply(out: Float32Array, one: Float32Array, other: Float32Array) -> None:
+    for k in range(len(out)):
+        out[k] = one[k] * other[k]
+
+
+@loop_helper
+def _scalar_product(one: Float32Array, other: Float32Array) -> np.float32:
+    total = np.float32(0.0)
+    for k in range(len(one)):
+        total += one[k] * other[k]
+    return total
+
 
 def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
     """Return the residuals of the fit on the pixels of the long streaks that determine the motion."""
     scene, windows = fit.scene, fit.windows
     images, spots, _ = model_images(camera.pinhole, camera.shutter, scene, windows)
     of_block = windows.long[windows.strips.star]
-    light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
-    peak = light.max(axis=2, keepdims=True, initial=0.0)
     view = windows.on_strips
     pixels = view.slot, view.inside, view.signal, view.floor, view.ceiling
-    weight, residual = residuals(
-        windows.total(images, spots, scene.light, scene.sky), pixels, (view.gain, 0.0)
+    total = windows.total(images, spots, scene.light, scene.sky)
+    chosen = np.flatnonzero(scene.trusted[of_block])
+    star, gain = of_block[chosen], float(view.gain)
+    own, weight, residual = _chosen_residuals(images, scene.light[star], chosen, total, pixels, gain)
+    return StreakResiduals(star, windows.strips.time[chosen], own, weight, residual)
+
+
+def _chosen_residuals_numpy(
+    images: Float32Array,
+    light: FloatArray,
+    chosen: IntArray,
+    total: Float32Array,
+    pixels: Pixels,
+    gain: float,
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Return images, weights and residuals of the blocks `chosen` (c,), see `StreakResiduals`.
+
+    The array `light` (c,) is the flux of the star of each chosen block. The modelled counts `total` of all
+    fitted pixels, the attributes `pixels` of all blocks, and the `gain` are those of
+    `normal_equations.residuals`. Pixels that contain flux of another star get the weight 0.
+    """
+    slot, inside, signal, floor, ceiling = (values[chosen] for values in pixels)
+    weight, residual = residuals(total, (slot, inside, signal, floor, ceiling), (gain, 0.0))
+    peak = (images[chosen, 0] * light[:, None, None].astype(np.float32)).max(
+        axis=2, keepdims=True, initial=0.0
     )
     with np.errstate(divide="ignore"):
         foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
     weight[foreign] = 0.0
-    chosen = np.flatnonzero(scene.trusted[of_block])
-    return StreakResiduals(
-        of_block[chosen], windows.strips.time[chosen], images[chosen], weight[chosen], residual[chosen]
-    )
+    return images[chosen], weight, residual
+
+
+@compiled_form_of(_chosen_residuals_numpy)
+def _chosen_residuals(
+    images: Float32Array,
+    light: FloatArray,
+    chosen: IntArray,
+    total: Float32Array,
+    pixels: Pixels,
+    gain: float,
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    slot, inside, signal, floor, ceiling = pixels
+    (_, lines, size), count = slot.shape, len(chosen)
+    own = np.empty((count, images.shape[1], lines, size), np.float32)
+    weight, residual = np.empty((count, lines, size), np.float32), np.empty((count, lines, size), np.float32)
+    per_count, margin, least = np.float32(1.0 / gain), np.float32(_MARGIN), np.float32(0.0)
+    sigmas, share = np.float32(_FOREIGN_SIGMAS), np.float32(_FOREIGN_SHARE)
+    for c in range(count):
+        b, flux = chosen[c], np.float32(light[c])
+        own[c] = images[b]
+        for i in range(lines):
+            peak = least
+            for k in range(size):
+                peak = max(peak, images[b, 0, i, k] * flux)
+            for k in range(size):
+                model = total[slot[b, i, k]]
+                variance = max(model, least) * per_count + floor[b, i, k]
+                deviation, off = np.float32(math.sqrt(variance)), signal[b, i, k] - model
+                good = inside[b, i, k] and model + margin * deviation < ceiling[b, i, k]
+                residual[c, i, k] = off if good else least
+                known = good and abs(off) <= sigmas * deviation + share * peak
+                weight[c, i, k] = np.float32(1.0) / variance if known else least
+    return own, weight, residual
 
 
 # Number of time bins over the exposure for the estimate of the motion common to all streaks.
@@ -105,14 +238,13 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
     velocity = paths(camera.pinhole, scene.motion, np.repeat(stars, LINES, axis=0), time.reshape(-1)).velocity
     tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    light = scene.light[star, None]
+    light = np.repeat(scene.light[star], LINES)
     place = np.clip(((time + 0.5) * _BINS).astype(np.int64), 0, _BINS - 1).reshape(-1)
     within = (np.abs(time) < 0.5).reshape(-1)
     owner = np.repeat(star, LINES)
-    found = []
-    for image, way in ((left.images[:, 1], normal), (left.images[:, 0], tangent)):
-        score = (light * np.sum(left.weight * left.residual * image, axis=2)).reshape(-1)
-        information = (light**2 * np.sum(left.weight * image * image, axis=2)).reshape(-1)
+    sums, found = left.line_sums, []
+    for row, way in ((0, normal), (1, tangent)):
+        score, information = light * sums.score[:, row], light**2 * sums.gram[:, row, row]
         cell = (owner * _BINS + place)[within]
         found.append(_common_rms(cell, score[within, None] * way[within], information[within]))
     return CommonMotion(*found)
@@ -316,41 +448,27 @@ def _rotation_sums(
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     flow = image_flow(camera.pinhole, path.position)
     across, along = (np.einsum("li,lij->lj", way, flow) for way in (normal, tangent))
-    used = np.count_nonzero(left.weight, axis=2).reshape(-1)
-    squares = np.sum(left.weight * left.residual * left.residual, axis=2).reshape(-1)
-    scatter = np.bincount(star, squares) / np.maximum(np.bincount(star, used), 1)
+    sums = left.line_sums if rows == 2 else left.sums_of_lines(rows)
+    scatter = np.bincount(star, sums.squares) / np.maximum(np.bincount(star, sums.used), 1)
     trust = 1.0 / np.maximum(scatter, 1.0)[star]
     light = scene.light[star]
     design = np.stack([across, -along / speed[:, None], -along, along][:rows], axis=1)
     place = np.clip(((time / _RANGE + 1.0) * 0.5 * _FINE_BINS).astype(np.int64), 0, _FINE_BINS - 1)
-    pixels = left.images, left.weight, left.residual
-    information, gradient = _binned_equations(pixels, design, (light, trust, place), _FINE_BINS)
+    products = sums.gram * (trust * light**2)[:, None, None], sums.score * (trust * light)[:, None]
+    information, gradient = _binned_equations(*products, design, place, _FINE_BINS)
     middles = _RANGE * (2.0 * (np.arange(_FINE_BINS) + 0.5) / _FINE_BINS - 1.0)
     return _RotationSums(middles, information, gradient, camera.pinhole.focal_length)
 
 
-# Images whose products with the residuals determine the rotation, the rate, and the rotations at both ends.
-_ROTATION_IMAGES = (1, 0, 3, 4)
-_Pixels = tuple[Float32Array, Float32Array, Float32Array]
-"""Attributes `images`, `weight` and `residual` of `StreakResiduals`."""
-_LinesInTime = tuple[FloatArray, FloatArray, IntArray]
-"""Flux of the star, weight of the star, and time bin of each line of pixels (l,)."""
-
-
 def _binned_equations_numpy(
-    pixels: _Pixels, design: FloatArray, lines: _LinesInTime, bins: int
+    gram: FloatArray, score: FloatArray, design: FloatArray, place: IntArray, bins: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information (bins, r, 3, r, 3) and the gradient (bins, r, 3) of `_RotationSums`.
 
-    The matrices `design` (l, r, 3) are the derivatives of each line's r displacements with respect to the
-    three components of a rotation.
+    The arrays `gram` (l, r, r) and `score` (l, r) are the information and the gradient of the displacements
+    of l lines of pixels, and `place` (l,) is the time bin of each line. The matrices `design` (l, r, 3) are
+    the derivatives of each line's r displacements with respect to the three components of a rotation.
     """
-    (images, weight, residual), (light, trust, place), rows = pixels, lines, design.shape[1]
-    images = images[:, _ROTATION_IMAGES[:rows]]
-    weighted = (images * weight[:, None]).transpose(0, 2, 1, 3)
-    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, rows, rows)
-    gram = gram * (trust * light**2)[:, None, None]
-    score = (weighted @ residual[..., None]).reshape(-1, rows) * (trust * light)[:, None]
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(bins))
     of_line = np.einsum("lia,lij,ljb->liajb", design, gram, design, optimize=True)
@@ -359,29 +477,19 @@ def _binned_equations_numpy(
 
 @compiled_form_of(_binned_equations_numpy)
 def _binned_equations(
-    pixels: _Pixels, design: FloatArray, lines: _LinesInTime, bins: int
+    gram: FloatArray, score: FloatArray, design: FloatArray, place: IntArray, bins: int
 ) -> tuple[FloatArray, FloatArray]:
-    (images, weight, residual), (light, trust, place), rows = pixels, lines, design.shape[1]
+    lines, rows, _ = design.shape
     information, gradient = np.zeros((bins, rows, 3, rows, 3)), np.zeros((bins, rows, 3))
-    count = images.shape[2]
-    for line in range(len(place)):
-        b, of_block, at = line // count, line % count, place[line]
+    for line in range(lines):
+        at = place[line]
         for i in range(rows):
-            one, score = _ROTATION_IMAGES[i], 0.0
-            for k in range(images.shape[3]):
-                score += weight[b, of_block, k] * residual[b, of_block, k] * images[b, one, of_block, k]
-            score *= trust[line] * light[line]
             for c in range(3):
-                gradient[at, i, c] += design[line, i, c] * score
-            for j in range(rows):
-                other, gram = _ROTATION_IMAGES[j], 0.0
-                for k in range(images.shape[3]):
-                    product = images[b, one, of_block, k] * images[b, other, of_block, k]
-                    gram += weight[b, of_block, k] * product
-                gram *= trust[line] * light[line] ** 2
-                for c in range(3):
+                gradient[at, i, c] += design[line, i, c] * score[line, i]
+                for j in range(rows):
+                    product = design[line, i, c] * gram[line, i, j]
                     for d in range(3):
-                        information[at, i, c, j, d] += design[line, i, c] * gram * design[line, j, d]
+                        information[at, i, c, j, d] += product * design[line, j, d]
     return information, gradient
 
 
