@@ -552,13 +552,17 @@ def _summits_numpy(flat: Float32Array, place: IntArray, columns: int) -> BoolArr
 
 @compiled_form_of(_summits_numpy)
 def _summits(flat: Float32Array, place: IntArray, columns: int) -> BoolArray:
-    out = np.ones(len(place), dtype=np.bool_)
+    out, size = np.empty(len(place), dtype=np.bool_), len(flat)
+    margin = columns + 2
     for p in range(len(place)):
-        value = flat[place[p]]
+        own, highest = place[p], True
         for down in range(-1, 2):
             for beside in range(-2, 3):
-                if out[p] and flat[(place[p] + down * columns + beside) % len(flat)] > value:
-                    out[p] = False
+                at = own + down * columns + beside
+                if own < margin or own >= size - margin:
+                    at %= size
+                highest &= flat[at] <= flat[own]
+        out[p] = highest
     return out
 
 
@@ -843,7 +847,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     return _solved(one, other, overlap, (1.0 + _RIDGE) * seen)
 
 
-def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
+def _solved_numpy(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution (k,) of sparse symmetric linear equations by conjugate gradients.
 
     The e nonzero matrix elements `overlap` (e,) are in the rows `one` (e,) and columns `other` (e,).
@@ -864,3 +868,33 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
         size, before = float(residual @ residual), size
         direction = residual + size / before * direction
     return np.asarray(x * scale)
+
+
+@compiled_form_of(_solved_numpy)
+def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
+    k, scale, matrix, size = len(right), np.ones(len(right)), overlap.copy(), 0.0
+    for e in range(len(one)):
+        if one[e] == other[e]:
+            scale[one[e]] = 1.0 / math.sqrt(overlap[e])
+    for e in range(len(one)):
+        matrix[e] *= scale[one[e]] * scale[other[e]]
+    x, residual, direction = np.zeros(k), right * scale, right * scale
+    for i in range(k):
+        size += residual[i] * residual[i]
+    enough = _SOLVED**2 * size
+    for _ in range(_MOST_GRADIENTS):
+        if size <= enough:
+            break
+        image, along, before = np.zeros(k), 0.0, size
+        for e in range(len(one)):
+            image[one[e]] += matrix[e] * direction[other[e]]
+        for i in range(k):
+            along += direction[i] * image[i]
+        length, size = size / along, 0.0
+        for i in range(k):
+            x[i] += length * direction[i]
+            residual[i] -= length * image[i]
+            size += residual[i] * residual[i]
+        for i in range(k):
+            direction[i] = residual[i] + size / before * direction[i]
+    return x * scale

@@ -12,9 +12,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import estimate_background
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import (
@@ -180,13 +181,33 @@ def _significant_numpy(sums: Float32Array, floor: Float32Array, threshold: float
 @compiled_form_of(_significant_numpy)
 def _significant(sums: Float32Array, floor: Float32Array, threshold: float) -> IntArray:
     found, count = np.empty(len(sums), dtype=np.int64), 0
-    square = threshold * threshold
-    # Each index is stored without a branch, because the processor could not predict a branch.
-    for pixel in range(len(sums)):
-        own = float(sums[pixel])
-        found[count] = pixel
-        count += (own > 0.0) & (own * own > square * floor[pixel])
+    bright = np.zeros(_AT_ONCE, dtype=np.uint8)
+    groups = bright.view(np.uint64)
+    for begin in range(0, len(sums), _AT_ONCE):
+        size = min(_AT_ONCE, len(sums) - begin)
+        _mark_bright(bright[:size], sums[begin : begin + size], floor[begin : begin + size], threshold)
+        for group in range((size + 7) // 8):
+            # Most groups of eight pixels contain no bright pixel.
+            if groups[group]:
+                # Each index is stored without a branch, because the processor could not predict a branch.
+                for k in range(8 * group, min(8 * group + 8, size)):
+                    found[count] = begin + k
+                    count += bright[k] > 0
     return found[:count].copy()
+
+
+# Number of pixels that are compared with the threshold in one step, a multiple of eight.
+_AT_ONCE = 1024
+
+
+@loop_helper
+def _mark_bright(
+    bright: npt.NDArray[np.uint8], sums: Float32Array, floor: Float32Array, threshold: float
+) -> None:
+    """Set `bright` (k,) to 1 for pixels whose `sums` exceed `threshold` times their noise, otherwise to 0."""
+    for k in range(len(bright)):
+        own = float(sums[k])
+        bright[k] = (own > 0.0) & (own * own > threshold * threshold * floor[k])
 
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.

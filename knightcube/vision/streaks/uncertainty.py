@@ -407,7 +407,8 @@ class RotationUncertainty:
             unspecified, the uncertainty of the line time is included only in `covariance`.
         common_motion: deviation from the smooth motion that is common to all streaks, such as vibration; 0 if
             `covariance` includes an unresolved vibration.
-        aside: displacement of streaks across their paths that would explain the residuals, px.
+        aside: displacement of streaks across their paths that would explain the residuals, px, or 0 if the
+            misfit is acceptable.
     """
 
     rotation: FloatArray
@@ -455,7 +456,8 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
     covariance = covariance + spread * vibration
-    sides = side_displacement(residuals, whole.scene)
+    fits = result.misfit < settings.worst_misfit
+    sides = None if fits else side_displacement(residuals, whole.scene)
     model_error, aside = float(np.sqrt(unmodelled / (rotation @ rotation))), sides.shown if sides else 0.0
     return RotationUncertainty(rotation, covariance, model_error, common_motion, aside)
 

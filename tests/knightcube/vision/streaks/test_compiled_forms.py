@@ -44,6 +44,7 @@ _FUNCTIONS = (
     (faint_stars, "_high_places", 1e-9),
     (faint_stars, "_summits", 1e-9),
     (faint_stars, "_add_responses", 1e-9),
+    (faint_stars, "_solved", 1e-4),
     (normal_equations, "_sum_products", 2e-5),
     (normal_equations, "_eliminated", 1e-6),
     (streak_model, "_mixtures", 1e-9),
