@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -92,8 +93,9 @@ class Bench:
         self.facts = Facts(log)
         update = self.facts.update
 
-        def noted(fact: Any, holds: bool | None, now_ns: int, text: str) -> None:
-            self.said.setdefault(fact.name, []).append((bool(holds), text))
+        def noted(fact: Any, holds: bool | None, now_ns: int, text: str | Callable[[], str]) -> None:
+            said = text if isinstance(text, str) else text()
+            self.said.setdefault(fact.name, []).append((bool(holds), said))
             update(fact, holds, now_ns, text)
 
         self.facts.update = noted  # type: ignore[method-assign]
