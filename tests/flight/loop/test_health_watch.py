@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -54,8 +55,8 @@ class Bench:
         self.facts.enter(Mode.SAFE)
         update = self.facts.update
 
-        def noted(fact: Any, holds: bool | None, now_ns: int, text: str) -> None:
-            self.said[fact.name] = holds, text
+        def noted(fact: Any, holds: bool | None, now_ns: int, text: str | Callable[[], str]) -> None:
+            self.said[fact.name] = holds, text if isinstance(text, str) else text()
             update(fact, holds, now_ns, text)
 
         self.facts.update = noted  # type: ignore[method-assign]
