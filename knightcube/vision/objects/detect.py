@@ -586,13 +586,15 @@ class Judge:
             return None
         only_uniform = rough.chi_square - light.expected > _HOPELESS * gained
         located = self._located(ends, light, stars, improvement)
+        if only_uniform and (located is None or located[0].misfit > _UNIFORM):
+            return None
         if not stars and (located is None or located[2].misfit > _GOOD_FIT):
             own = np.flatnonzero(self.segmented.regions.label == region_along(self.segmented, ends))
             stars = fit_stars(self._patch(int(own[0])), self.rotation, self.pinhole)[0] if len(own) else []
             again = self._located(ends, self._light(ends, stars), stars, improvement) if stars else located
             if again is None or located is None or again[2].misfit < located[2].misfit:
                 located = again
-        if located is None or (only_uniform and located[0].misfit > _UNIFORM):
+        if located is None:
             return None
         found_ends, light, found = located
         ends, sigma = found_ends.ends, found_ends.sigma

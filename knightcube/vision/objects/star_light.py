@@ -188,7 +188,9 @@ class StarLight:
         """Return which pixels (p, 2) belong to bright regions other than those with the given `labels`."""
         regions = self._segmented.regions
         found = regions.labels[pixels[:, 1], pixels[:, 0]]
-        others = np.zeros(regions.labels.max(initial=0) + 1, dtype=np.bool_)
+        # The largest label of these pixels is used, because that of the whole frame takes longer to find.
+        largest = max(int(each.max(initial=0)) for each in (found, labels, regions.label))
+        others = np.zeros(largest + 1, dtype=np.bool_)
         others[regions.label] = True
         others[labels] = False
         return np.asarray(others[found])
