@@ -143,8 +143,8 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
     total = windows.total(images, spots, scene.light, scene.sky)
     chosen = np.flatnonzero(scene.trusted[of_block])
     star, gain = of_block[chosen], float(view.gain)
-    own, weight, residual = _chosen_residuals(images, scene.light[star], chosen, total, pixels, gain)
-    return StreakResiduals(star, windows.strips.time[chosen], own, weight, residual)
+    weight, residual = _chosen_residuals(images, scene.light[star], chosen, total, pixels, gain)
+    return StreakResiduals(star, windows.strips.time[chosen], images[chosen], weight, residual)
 
 
 def _chosen_residuals_numpy(
@@ -154,22 +154,23 @@ def _chosen_residuals_numpy(
     total: Float32Array,
     pixels: Pixels,
     gain: float,
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Return images, weights and residuals of the blocks `chosen` (c,), see `StreakResiduals`.
+) -> tuple[Float32Array, Float32Array]:
+    """Return weights and residuals of the blocks `chosen` (c,), see `StreakResiduals`.
 
     The array `light` (c,) is the flux of the star of each chosen block. The modelled counts `total` of all
     fitted pixels, the attributes `pixels` of all blocks, and the `gain` are those of
     `normal_equations.residuals`. Pixels that contain flux of another star get the weight 0.
     """
-    slot, inside, signal, floor, ceiling = (values[chosen] for values in pixels)
-    weight, residual = residuals(total, (slot, inside, signal, floor, ceiling), (gain, 0.0))
+    slot, inside, signal, floor, ceiling = pixels
+    own = slot[chosen], inside[chosen], signal[chosen], floor[chosen], ceiling[chosen]
+    weight, residual = residuals(total, own, (gain, 0.0))
     peak = (images[chosen, 0] * light[:, None, None].astype(np.float32)).max(
         axis=2, keepdims=True, initial=0.0
     )
     with np.errstate(divide="ignore"):
         foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
     weight[foreign] = 0.0
-    return images[chosen], weight, residual
+    return weight, residual
 
 
 @compiled_form_of(_chosen_residuals_numpy)
@@ -180,16 +181,14 @@ def _chosen_residuals(
     total: Float32Array,
     pixels: Pixels,
     gain: float,
-) -> tuple[Float32Array, Float32Array, Float32Array]:
+) -> tuple[Float32Array, Float32Array]:
     slot, inside, signal, floor, ceiling = pixels
     (_, lines, size), count = slot.shape, len(chosen)
-    own = np.empty((count, images.shape[1], lines, size), np.float32)
     weight, residual = np.empty((count, lines, size), np.float32), np.empty((count, lines, size), np.float32)
     per_count, margin, least = np.float32(1.0 / gain), np.float32(_MARGIN), np.float32(0.0)
     sigmas, share = np.float32(_FOREIGN_SIGMAS), np.float32(_FOREIGN_SHARE)
     for c in range(count):
         b, flux = chosen[c], np.float32(light[c])
-        own[c] = images[b]
         for i in range(lines):
             peak = least
             for k in range(size):
@@ -202,7 +201,7 @@ def _chosen_residuals(
                 residual[c, i, k] = off if good else least
                 known = good and abs(off) <= sigmas * deviation + share * peak
                 weight[c, i, k] = np.float32(1.0) / variance if known else least
-    return own, weight, residual
+    return weight, residual
 
 
 # Number of time bins over the exposure for the estimate of the motion common to all streaks.
