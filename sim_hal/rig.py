@@ -33,6 +33,7 @@ from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import CoilReach
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
+from knightcube import compiled
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
@@ -104,6 +105,7 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     if not request.realtime:
         if request.devices is not None:
             raise UsageError("--devices: the devices of a server run in real time: give --realtime too")
+        compiled.load()  # otherwise, the first control cycle would load numba
         hardware = stack.enter_context(opened_lockstep(config, section, request.out))
         latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
         return with_host_faults(hardware.rig(section.seed, latency), section)

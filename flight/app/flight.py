@@ -155,7 +155,6 @@ def open_flight(
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))
     if not rig.realtime:
-        compiled.load()  # otherwise, the first control cycle would load numba
         _collect_rarely(stack)
     return loop, flight_log
 

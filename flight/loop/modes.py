@@ -475,12 +475,8 @@ class ModeControl:
         blind = (now_ns - self._measured_ns) * 1e-9
         missing = "estimate" if estimate is None else "estimate accurate enough for control"
         missing = "body rate" if self._acquires and rate is None else missing
-        self._facts.update(
-            facts.BLIND,
-            blind > self._settings.blind_limit,
-            now_ns,
-            lambda: f"no {missing} for {blind:.0f} s",
-        )
+        late = blind > self._settings.blind_limit
+        self._facts.update(facts.BLIND, late, now_ns, lambda: f"no {missing} for {blind:.0f} s")
         if self.mode is Mode.DETUMBLE and rate is not None:
             self._brake(estimate, rate, now_ns)
         elif self.mode in ORBITAL and rate is not None:

@@ -450,8 +450,7 @@ class ReadingConverter:
         if not has_rate:
             self.rejection = self._fault(q, rate, mag, accel)
             finite = math.isfinite(sum(rate))
-            self.out_of_range += finite
-            self.not_finite += not finite
+            self.out_of_range, self.not_finite = self.out_of_range + finite, self.not_finite + (not finite)
             rate = _ZERO_RATE
         values = self._map.dot(np.array((*q, *rate, *mag, *accel)))
         if not has_rate:
