@@ -255,8 +255,7 @@ def _look_up(
                 left, short, medium, slack, lowest, highest, below, layout, runs[count:], windows[count:]
             )
             runs[count:after, 2] = queries
-            count = after
-            queries += 1
+            count, queries = after, queries + 1
     entry, query, total = _matching_entries(runs[:count], windows, entries, most)
     return *_matches(entry, query, entries, longest, corners, star_of), total
 
