@@ -8,7 +8,8 @@ certainty. Fits of models to pixels exclude all suspected hot pixels. A fit is h
 star is excluded by mistake.
 
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
-8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits.
+8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits. Colour
+images are converted to grey values.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -414,6 +417,40 @@ as many pixels have the highest count as have slightly smaller counts. A count i
 differs from the highest count by at most `_PLATEAU_REACH` times the difference between the highest count and
 the median.
 """
+
+
+LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in the luminance (ITU-R BT.601)."""
+
+
+def grey_image(pixels: npt.ArrayLike) -> Image:
+    """Return an image (rows, columns) of grey values from an array of grey or colour pixels.
+
+    A grey image (rows, columns) is returned unchanged. Colours (rows, columns, 3) in the order red, green and
+    blue, with or without a fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the
+    same type; transparency is ignored. A third axis of length 1, or of 2 for grey and transparency, is
+    removed. Raises ValueError for an array of any other shape.
+    """
+    if isinstance(pixels, (str, Path)):
+        raise ValueError(f"{pixels}: give an array of pixels, such as read_image({str(pixels)!r})")
+    image = np.asarray(pixels)
+    if image.ndim == 2:
+        return image
+    if image.ndim == 3 and image.shape[2] in (1, 2):
+        return image[..., 0]
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        return grey_of_planes(np.moveaxis(image[..., :3], -1, 0))
+    raise ValueError(
+        f"an image of shape {image.shape}: give (rows, columns), or (rows, columns, 3) for colours"
+    )
+
+
+def grey_of_planes(planes: Image) -> Image:
+    """Return the luminance (rows, columns) of colour planes (3, rows, columns), in the planes' data type."""
+    grey = np.zeros(planes.shape[1:])
+    for weight, plane in zip(LUMINANCE, planes, strict=True):
+        grey += weight * plane
+    return np.asarray((np.rint(grey) if planes.dtype.kind in "iu" else grey).astype(planes.dtype))
 
 
 class FrameState(Enum):

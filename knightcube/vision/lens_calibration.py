@@ -26,8 +26,8 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.errors import UsageError
-from knightcube.vision.camera.images import grey_image
 from knightcube.vision.camera.lens import SHAPE_TERMS, CameraModel, Lens, LensError
+from knightcube.vision.frame import grey_image
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.lens_knowledge import (
     NONE,

@@ -18,8 +18,8 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
 from knightcube.errors import InputError
-from knightcube.vision.camera.images import grey_image
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
+from knightcube.vision.frame import grey_image
 from knightcube.vision.frame_job import found_in_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index import SkyIndex, load_once

@@ -37,6 +37,7 @@ import numpy.typing as npt
 
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
+from knightcube.vision.frame import LUMINANCE, grey_of_planes
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
@@ -76,7 +77,7 @@ def fits_image(content: bytes, name: str) -> Image:
     if not np.all(np.isfinite(planes)):
         scaled = f" with BZERO = {zero:g} and BSCALE = {scale:g}" if (zero, scale) != (0.0, 1.0) else ""
         raise UsageError(f"{name}: has pixels that are not finite{scaled}: fill them first")
-    image = planes[0] if len(planes) == 1 else _grey_of_planes(planes)
+    image = planes[0] if len(planes) == 1 else grey_of_planes(planes)
     return image[::-1].copy() if _bottom_up(header, name) else image
 
 
@@ -115,36 +116,6 @@ def _axes(header: dict[str, str], name: str) -> list[int]:
         if size < 0:
             raise UsageError(f"{name}: NAXIS{number} = {size} is negative")
     return axes
-
-
-def grey_image(pixels: npt.ArrayLike) -> Image:
-    """Return an image (rows, columns) of grey values from an array of grey or colour pixels.
-
-    A grey image (rows, columns) is returned unchanged. Colours (rows, columns, 3) in the order red, green and
-    blue, with or without a fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the
-    same type; transparency is ignored. A third axis of length 1, or of 2 for grey and transparency, is
-    removed. Raises ValueError for an array of any other shape.
-    """
-    if isinstance(pixels, (str, Path)):
-        raise ValueError(f"{pixels}: give an array of pixels, such as read_image({str(pixels)!r})")
-    image = np.asarray(pixels)
-    if image.ndim == 2:
-        return image
-    if image.ndim == 3 and image.shape[2] in (1, 2):
-        return image[..., 0]
-    if image.ndim == 3 and image.shape[2] in (3, 4):
-        return _grey_of_planes(np.moveaxis(image[..., :3], -1, 0))
-    raise ValueError(
-        f"an image of shape {image.shape}: give (rows, columns), or (rows, columns, 3) for colours"
-    )
-
-
-def _grey_of_planes(planes: Image) -> Image:
-    """Return the luminance (rows, columns) of colour planes (3, rows, columns), in the planes' data type."""
-    grey = np.zeros(planes.shape[1:])
-    for weight, plane in zip(_LUMINANCE, planes, strict=True):
-        grey += weight * plane
-    return np.asarray((np.rint(grey) if planes.dtype.kind in "iu" else grey).astype(planes.dtype))
 
 
 def _bottom_up(header: dict[str, str], name: str) -> bool:
@@ -238,8 +209,6 @@ GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint1
 """NumPy types of grey images by the name of their Pillow mode."""
 COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
 
-_LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in the luminance (ITU-R BT.601)."""
 _NATIVE_SWAPPED = "B" if sys.byteorder == "little" else "L"
 # Pillow keeps only the high byte of 16-bit colour values, or the low byte if the byte order is swapped.
 _OTHER_BYTES = {
@@ -326,7 +295,7 @@ def _through_pillow(path: Path) -> Image:
                 high = _colours(picture)
                 with pillow.open(path, formats=FORMATS) as again:
                     again.tile = [tile._replace(args=_low_bytes(tile.args)) for tile in again.tile]
-                    luminance = np.rint((256.0 * high + _colours(again)) @ _LUMINANCE)
+                    luminance = np.rint((256.0 * high + _colours(again)) @ LUMINANCE)
                     return _upright(luminance.astype(np.uint16), picture)
             picture.load()
             return _upright(_grey(path, picture), picture)

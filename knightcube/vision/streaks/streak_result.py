@@ -182,7 +182,7 @@ class FrameMotion:
     exposure: float
     length: float = float("nan")
     endpoints: FloatArray = field(default_factory=no_rows(2, 2))
-    used: BoolArray = field(default_factory=partial(np.empty, 0, dtype=np.bool_))
+    used: BoolArray = field(default_factory=partial(np.full, 0, np.False_))
     rate: FloatArray | None = None
     covariance: FloatArray | None = None
     residual: float = float("nan")

@@ -20,12 +20,12 @@ from knightcube.vision.camera.images import (
     KeptFrames,
     facts_of,
     fits_image,
-    grey_image,
     grey_stretch,
     keep_frame,
     read_image,
     write_picture,
 )
+from knightcube.vision.frame import grey_image
 from tests.support.fits_files import fits_file
 
 pillow = pytest.importorskip("PIL.Image", reason="Pillow, the extra `images`, is not installed")
