@@ -43,7 +43,7 @@ MOST_LINES = {"file": 900, "class": 350, "function": 50}
 ...")."""
 MOST_LONG_FUNCTIONS = 20
 _REASON = re.compile(r"\blines\b", re.IGNORECASE)
-LIMITS = {"control cycle": 30, "opening of a flight": 45, "star fix": 22}
+LIMITS = {"control cycle": 30, "opening of a flight": 45, "star fix": 20}
 """Largest number of files whose functions each activity may call."""
 _FIRST, _LAST = 400, 440
 """First and last control cycle of the measurement: one second of steady flight, after the first plan."""
