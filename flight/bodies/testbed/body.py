@@ -50,7 +50,6 @@ from flight.schema.bodies import TestbedConfig, as_testbed
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube import compiled
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from knightcube.gnc.control.detumble import (
@@ -245,8 +244,6 @@ class TestbedEstimation(BodyEstimation):
         noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
         self._density = noise**2 / CONTROL_RATE_HZ * np.eye(3)
         filter_, self.learned_problems = attitude_filter(config, plant, learned, cage)
-        if compiled.in_use():  # otherwise, the first control cycles would load the compiled functions
-            filter_.rehearse()
         self.filter = filter_
         self.feed = UnitFeed(filter_, config, self._field_at)
         self.coil_monitor = coil_monitor(config, plant)

@@ -429,18 +429,6 @@ class AttitudeFilter:
         self._refused_in_a_row = {}
         self._accepted = {}
 
-    def rehearse(self) -> None:
-        """Apply two samples to a second filter, which loads the compiled functions of this filter."""
-        spare = AttitudeFilter(self._model.body, self._settings)
-        for time_ns in (0, 1_000_000):
-            attitude = AttitudeMeasurement(time_ns, np.array([0.0, 0.0, 0.0, 1.0]), np.eye(3), 0.0)
-            rate = RateMeasurement(time_ns, np.zeros(3), np.eye(3), 0.0)
-            if spare.started:
-                spare.measure(attitude)
-                spare.measure(rate)
-            else:
-                spare.start(attitude, rate)
-
     @property
     def started(self) -> bool:
         """Whether an estimate exists."""

@@ -379,15 +379,3 @@ def test_a_learned_plant_that_the_motion_contradicts_is_replaced_by_the_configur
     sigma = np.sqrt(estimate.covariance[PARAMETERS, PARAMETERS].diagonal())
     assert found.restarts == 1
     assert (np.abs(np.subtract(estimate.parameters, flight.parameters)) < 4.0 * sigma).all()
-
-
-@BOTH
-def test_a_rehearsal_leaves_the_filter_as_it_is(suspended: bool) -> None:
-    flight = fly(25, 8, suspended)
-    filters = [AttitudeFilter(SUSPENDED if suspended else FREE, SETTINGS) for _ in range(2)]
-    filters[1].rehearse()
-    assert not filters[1].started
-    for filter_ in filters:
-        filter_.start(*flight.samples[0])
-        follow(filter_, flight)
-    assert_same(*(filter_.at(8 * CYCLE_NS) for filter_ in filters))
