@@ -266,7 +266,6 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
 
     A convincing fit is accepted without comparison with other fits. Returns None if the fit does not succeed.
     """
-    count = len(guess.light)
     motion = guess.motion if camera.course is None else camera.course.scaled_to(guess.motion.rotation)
     motion = motion if camera.sense is None else motion.directed(camera.sense)
     stars = mid_exposure_positions(camera.pinhole, motion, camera.shutter, guess.stars)
@@ -275,14 +274,23 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # The variable `ends` is the smaller of the fractions of confirmed streak ends and of unbroken streaks.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
     if ends > _IN_PLACE and misfit(done.evaluation) > _SHAKEN:
         done = _vibrating(camera, done) or done
-    if ends > _IN_PLACE and misfit(done.evaluation) > _WORST_FIRST:
-        done = fit_profile(camera, done) or done
+    found = _judged(done, guess, ends)
+    if not found[1] and ends > _IN_PLACE and misfit(done.evaluation) > _WORST_FIRST:
+        learned = fit_profile(camera, done)
+        found = found if learned is None else _judged(learned, guess, ends)
+    return found
+
+
+def _judged(done: StreakFit, guess: MotionGuess, ends: float) -> tuple[float, bool, StreakFit]:
+    """Return the explained chi-square of a fit, whether the fit is convincing, and the fit.
+
+    The argument `ends` is the smaller of the fractions of confirmed streak ends and of unbroken streaks.
+    """
     # With a wrong rotation angle, the model has large residuals at one end of each streak.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
@@ -290,8 +298,8 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     calm = 1.0 if done.last_step < _CALM else 0.3
     evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
     explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _ENDS_BY_CHANCE, 0.02)
-    convincing = explained > _EVIDENT and share > _EXPLAINED and ends > _IN_PLACE and count >= _MANY
-    return explained, convincing, done
+    convincing = explained > _EVIDENT and share > _EXPLAINED and ends > _IN_PLACE
+    return explained, convincing and len(guess.light) >= _MANY, done
 
 
 def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:

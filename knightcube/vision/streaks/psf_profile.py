@@ -26,6 +26,8 @@ from knightcube.vision.streaks.scene_images import gaussian_lights
 # Standard deviations of the Gaussians of a profile, as fractions of the width of the scene.
 _WIDTHS = (0.5, 0.7, 1.0, 1.3)
 _FIRST = PsfProfile(_WIDTHS, (0.0, 0.0, 1.0, 0.0))
+# Minimum ratio of fitted to configured width for which a profile is learned.
+_LEAST_WIDER = 1.05
 # Number of fits of the motion, each with a better profile.
 _ROUNDS = 3
 # Number of solutions for the shares, each with the pixel noise that follows from the previous solution.
@@ -46,8 +48,11 @@ def fit_profile(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
     """Return a fit of the motion and the stars of `fit` with a PSF profile learned from their pixels.
 
     The work of this fit is not added to that of the `camera`, because few frames need it. Returns None if the
-    pixels do not determine the profile, or if the fit does not succeed.
+    PSF is not wider than configured, unlike that of a defocused camera, if the pixels do not determine the
+    profile, or if the fit does not succeed.
     """
+    if fit.scene.sigma < _LEAST_WIDER * camera.settings.psf_sigma:
+        return None
     camera, scene = replace(camera, work=WorkBudget()), _without_doubles(fit.scene)
     if scene.profile == GAUSSIAN:
         scene = replace(scene, profile=_FIRST)

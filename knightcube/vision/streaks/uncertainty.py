@@ -380,6 +380,8 @@ _END_SHARE = 1.0
 _END_FLOOR = 0.12
 # Minimum uncertainty (px) of streak ends if the profile of the PSF was learned from the frame.
 _LEARNED_FLOOR = 0.04
+# Fraction of the rate's uncertainty that counts as model error if the profile of the PSF was learned.
+_LEARNED_SHARE = 0.5
 # Ratio of the uncertainty of the streak ends to the significant displacement that explains their residuals.
 _END_SHOWN = 1.5
 # Ratio of the uncertainty of the streak ends to the upper limit of their displacement.
@@ -456,6 +458,8 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
     covariance = covariance + spread * vibration
+    if scene.profile != GAUSSIAN:
+        unmodelled = max(unmodelled, _LEARNED_SHARE**2 * float(np.trace(covariance)))
     fits = result.misfit < settings.worst_misfit
     sides = None if fits else side_displacement(residuals, whole.scene)
     model_error, aside = float(np.sqrt(unmodelled / (rotation @ rotation))), sides.shown if sides else 0.0
