@@ -16,9 +16,10 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -395,7 +396,7 @@ def _unresolved_amplitude(sums: _RotationSums, known: Vibration, length: float) 
     constant, square = (0.5 * sums.information[:, i, :, i].sum(axis=0) for i in (0, 1))
     information = constant + angular[..., None] ** 2 * square
     information = information + (sums.focal_length / _USUAL) ** 2 * np.eye(3)
-    amplitude = np.linalg.solve(information, score[..., None])[..., 0]
+    amplitude = _solved(information, score[..., None])[..., 0]
     gain = np.sum((score.conj() * amplitude).real, axis=1)
     best = int(np.argmax(gain))
     if gain[best] <= _LEAST_GAIN:
@@ -554,13 +555,21 @@ def _strongest_frequency(sums: _RotationSums, known: Vibration, highest: float) 
     prior = np.diag(_precisions(sums.focal_length, len(known.frequency) + 1))
     n = 3 * len(base)
     information, score = sums.normal_equations(base)
-    before = score @ np.linalg.solve(information + prior[:n, :n], score)
+    before = score @ _solved(information + prior[:n, :n], score)
     gain = np.empty(len(grid))
     for index in range(len(grid)):
         information, score = sums.normal_equations(np.concatenate([base, waves[:, index]]))
-        gain[index] = score @ np.linalg.solve(information + prior, score) - before
+        gain[index] = score @ _solved(information + prior, score) - before
     best = int(np.argmax(gain))
     return float(grid[best]) if gain[best] > _LEAST_GAIN else None
+
+
+def _solved(matrix: FloatArray, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the solution of a linear system, or that of smallest norm if the `matrix` is singular."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(matrix) @ right)
 
 
 def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, FloatArray]:
@@ -583,14 +592,14 @@ def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, Flo
     prior = np.append(_precisions(sums.focal_length, k), np.full(k, _MOST_DETUNED**-2))
     mean = np.concatenate([np.zeros(9), amplitudes.reshape(-1), np.zeros(k)])
     matrix = chosen.T @ information @ chosen + np.diag(prior)
-    step = np.linalg.solve(matrix, chosen.T @ score - prior * mean)
+    step = _solved(matrix, chosen.T @ score - prior * mean)
     sine, cosine = amplitudes + step[9:n].reshape(2, k, 3)
     detuned = np.clip(step[n:], -_MOST_DETUNED, _MOST_DETUNED)
     # The derivative of the rotation over the exposure with respect to each parameter.
     over = np.concatenate(functions)[:, 0, 2:] @ np.array([-1.0, 1.0])
     rotation = np.kron(over, np.eye(3)) @ chosen
-    total = rotation @ np.linalg.solve(matrix, rotation.T)
-    without = np.linalg.inv(matrix[:9, :9])[3:6, 3:6]
+    total = rotation @ _solved(matrix, rotation.T)
+    without = _solved(matrix[:9, :9], np.eye(9))[3:6, 3:6]
     size, axes = np.linalg.eigh(total - without)
     added = axes * np.maximum(size, 0.0) @ axes.T
     frequency = np.maximum(vibration.frequency + detuned, _LOWEST)

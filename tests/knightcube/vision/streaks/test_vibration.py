@@ -445,3 +445,9 @@ def test_the_spectrum_shows_the_true_amplitude_of_an_unresolved_vibration(cycles
     weak = vibration._RotationSums(time, information, 1e-3 * score, focal)
     assert vibration._unresolved_amplitude(weak, Vibration(), length) == 0.0
     assert vibration._unresolved_amplitude(sums, Vibration(), 2.0) == 0.0
+
+
+def test_a_singular_system_has_the_solution_of_smallest_norm() -> None:
+    matrix = np.array([[2.0, 2.0], [2.0, 2.0]])
+    assert vibration._solved(matrix, np.array([4.0, 4.0])) == pytest.approx([1.0, 1.0])
+    assert vibration._solved(np.diag([2.0, 4.0]), np.array([2.0, 2.0])) == pytest.approx([1.0, 0.5])
