@@ -460,7 +460,7 @@ class ReadingConverter:
             time_ns=item.arrival_ns - round(length * self._byte_ns),
             arrival_ns=item.arrival_ns,
             device_time_ns=device_ns,
-            # Of the two equivalent quaternions q and -q, the one with a positive scalar part is returned.
+            # The quaternions q and -q are equivalent; the one with a positive scalar part is returned.
             quaternion=values[:4] / math.copysign(norm, values[3]),
             rate=values[4:7],
             field=values[7:10] - self._field_offset,

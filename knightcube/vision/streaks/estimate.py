@@ -823,8 +823,6 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     If the joint fit does not succeed, the motion is marked as REJECTED. A rejected motion is fitted again
     with a vibration if its residuals show one, and then with a point-spread profile learned from the frame.
     """
-    if first.scene.profile != GAUSSIAN:
-        camera = replace(camera, work=WorkBudget())
     last, found = _candidate(camera, seen, first)
     if found.possible or first.scene.motion.vibration.exists or first.scene.profile != GAUSSIAN:
         return found
@@ -834,13 +832,10 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
         scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
         start = replace(last, scene=scene, windows=camera.windows(scene), hidden=None)
     camera = replace(camera, growing=bool(start.free[3]))
-    for fit_again in (_vibrating, fit_profile):
-        # No profile of the PSF explains streaks whose ends contradict the motion.
-        if fit_again is fit_profile and found.result.reason == _WRONG_ENDS:
-            break
+    # No profile of the PSF explains streaks whose ends contradict the motion.
+    wrong = found.result.reason == _WRONG_ENDS
+    for fit_again in (_vibrating,) if wrong else (_vibrating, fit_profile):
         again = fit_again(camera, start)
-        if again is not None and again.scene.profile != GAUSSIAN:
-            camera = replace(camera, work=WorkBudget())
         other = None if again is None else _candidate(camera, seen, again)[1]
         if other is not None and other.possible:
             return other
@@ -850,7 +845,13 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
 def _candidate(
     camera: FitProblem, seen: MotionResult, first: StreakFit
 ) -> tuple[StreakFit | None, _Candidate]:
-    """Return the joint fit that starts from the fit `first`, or None if it fails, and its motion."""
+    """Return the joint fit that starts from the fit `first`, or None if it fails, and its motion.
+
+    With a learned profile of the PSF, each evaluation of the model is several times as much work, so that the
+    work of the fit is limited separately.
+    """
+    if first.scene.profile != GAUSSIAN:
+        camera = replace(camera, work=WorkBudget())
     last, faint = final_fit(camera, first)
     if last is not None and last.scene.motion.vibration.exists:
         done = last

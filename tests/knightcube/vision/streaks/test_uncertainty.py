@@ -257,6 +257,19 @@ def test_residuals_are_measured_as_a_displacement(shift: str, measured: object) 
     assert 0.0 < by_chance.chance < 0.15
 
 
+def test_a_learned_profile_that_is_wrong_everywhere_does_not_displace_the_ends() -> None:
+    """With a learned profile, only the part of residuals that exceeds those elsewhere is a displacement."""
+    learned = PsfProfile((0.5, 1.0), (-0.5, 1.5))
+    for displaced, expected in ((0.0, 0.0), (0.5, 0.5)):
+        left, scene = _left(displaced, 1.5, "ends")
+        found = end_displacement(left, replace(scene, profile=learned))
+        usual = end_displacement(left, scene)
+        assert found is not None
+        assert usual is not None
+        assert found.shown == pytest.approx(expected, rel=0.1, abs=1e-9)
+        assert usual.shown > found.shown + 0.02
+
+
 def test_streaks_without_ends_in_the_frame_have_no_displacement_of_ends() -> None:
     left, scene = _left(0.5, 1.0, "sides")
     left.images[:, 3] = 0.0
