@@ -144,8 +144,9 @@ def light(
     `length` (px) limits the length of paths. `delay` is the time between rows (rolling shutter) in units of
     the exposure.
     """
-    layers = len(optics.spreads)
-    grid: Cells = np.zeros((layers, CELLS * pinhole.rows, CELLS * pinhole.columns), dtype=np.float32)
+    layers, edge = len(optics.spreads), _reach(optics.radius)
+    size = CELLS * pinhole.rows + 2 * edge, CELLS * pinhole.columns + 2 * edge
+    grid: Cells = np.zeros((layers, *size), dtype=np.float32)
     room = 0.5 + 0.5 * abs(delay) * pinhole.rows
     count = int(np.ceil(2.0 * room * length / _APART)) + 16
     times = (np.arange(count) + 0.5) / count * 2.0 * room - room
@@ -168,8 +169,8 @@ def light(
             weight *= np.array([np.interp(share, np.arange(24.0), knot) for knot in knots])
         seen = (weight > 0.0) & pinhole.contains(place, optics.radius)
         laid.append((place[seen], weight[seen]))
-    _lay(grid, pinhole, np.concatenate([p for p, _ in laid]), np.concatenate([w for _, w in laid]))
-    cells = np.zeros(grid.shape[1:])
+    _lay(grid, pinhole, edge, np.concatenate([p for p, _ in laid]), np.concatenate([w for _, w in laid]))
+    cells = np.zeros((CELLS * pinhole.rows, CELLS * pinhole.columns))
     for layer, spread in zip(grid, optics.spreads, strict=True):
         cells += _spread(layer, spread, optics.radius)
     shape = pinhole.rows, CELLS, pinhole.columns, CELLS
@@ -186,12 +187,17 @@ def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> Float
     return np.asarray(place + np.array(pinhole.centre) + np.array(optics.offset))
 
 
-def _lay(grid: Cells, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -> None:
-    """Add points of light.
+def _reach(radius: float) -> int:
+    """Return the number of cells that a point spread of `radius` px extends from its centre."""
+    return int(np.ceil(radius * CELLS))
+
+
+def _lay(grid: Cells, pinhole: Pinhole, edge: int, place: FloatArray, weight: FloatArray) -> None:
+    """Add points of light to a grid that extends `edge` cells beyond the detector.
 
     Each point is shared by the four nearest cells, and by the two layers nearest in radius.
     """
-    cell = CELLS * (place + 0.5) - 0.5
+    cell = CELLS * (place + 0.5) - 0.5 + edge
     corner = np.floor(cell).astype(np.int64)
     inside = ((corner >= 0) & (corner < np.array(grid.shape[:0:-1]) - 1)).all(axis=1)
     place, weight, cell, corner = place[inside], weight[inside], cell[inside], corner[inside]
@@ -208,12 +214,16 @@ def _lay(grid: Cells, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -
 
 
 def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
-    """Return a layer (rows, columns) of cells convolved with a point spread."""
-    half = int(np.ceil(radius * CELLS))
+    """Return the cells (rows, columns) of the detector in a layer convolved with a point spread.
+
+    The layer extends beyond the detector by the `radius` (px) of the point spread, so that the periodic
+    convolution reaches no cell of the detector from the opposite side.
+    """
+    half = _reach(radius)
     fine = (np.arange((2 * half + 1) * _FINER) + 0.5) / (_FINER * CELLS) - (half + 0.5) / CELLS
     density = spread(fine[None, :], fine[:, None])
     kernel = density.reshape(2 * half + 1, _FINER, 2 * half + 1, _FINER).sum(axis=(1, 3))
-    shape = [fft.next_fast_len(size + 2 * half, real=True) for size in layer.shape]
+    shape = [fft.next_fast_len(size, real=True) for size in layer.shape]
     product = fft.rfft2(layer, shape) * fft.rfft2((kernel / kernel.sum()).astype(np.float32), shape)
     whole = fft.irfft2(product, shape)
-    return np.asarray(whole[half : half + layer.shape[0], half : half + layer.shape[1]])
+    return np.asarray(whole[2 * half : layer.shape[0], 2 * half : layer.shape[1]])

@@ -52,6 +52,13 @@ def test_every_point_spread_keeps_the_light(spread: object) -> None:
     assert image.sum() == pytest.approx(1000.0, rel=1e-3)
 
 
+def test_a_star_beyond_the_edge_lights_the_pixels_within_reach_of_its_point_spread() -> None:
+    beyond, inside = _PINHOLE.unit_vectors(np.array([[-1.3, 44.6], [38.7, 44.6]]))
+    at_edge, whole = _rendered(Optics(), beyond), _rendered(Optics(), inside)
+    assert at_edge.sum() > 100.0
+    assert at_edge[:, :12] == pytest.approx(whole[:, 40:52], abs=0.01)
+
+
 def test_distortion_moves_the_corner_by_its_share_and_the_axis_moves_all() -> None:
     corner = _PINHOLE.unit_vectors(np.array([[-0.5, -0.5]]))
     ideal = through_lens(_PINHOLE, Optics(), corner)[0]
