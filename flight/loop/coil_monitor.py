@@ -61,6 +61,7 @@ from flight.loop.coil_currents import (
     Bounds,
     BrakeProof,
     CoilFault,
+    Commands,
     Sampling,
     StuckLeg,
     fits,
@@ -621,13 +622,14 @@ class CoilMonitor:
             self._give(found, CoilFault.HIGH, reading.time_ns, text)
             self.interrupted(reading.time_ns)
 
-    def _windows(self, reading: PowerReading) -> list[tuple[float, FloatArray, Bounds, Sampling, bool]]:
+    def _windows(self, reading: PowerReading) -> list[tuple[float, Commands, Bounds, Sampling, bool]]:
         """Return the newest ADC sample, and the window's mean unless the circuit changed in the window.
 
         Each tuple contains the arguments of `predict`.
         """
         commands, bounds, clipped = self._commands, self._bounds, reading.clipped
         newest = commands.window(reading.newest_since_ns, reading.time_ns)
+        windows: list[tuple[float, Commands, Bounds, Sampling, bool]]
         windows = [(reading.newest, newest, bounds, NEWEST, clipped)]
         begin_ns = reading.time_ns - _WINDOW_NS
         if begin_ns >= self._unmixed_ns:
@@ -638,7 +640,7 @@ class CoilMonitor:
 
     def _check_healthy(self, reading: PowerReading) -> None:
         windows, known = self._windows(reading), self._known
-        asked = float(np.abs(windows[0][1]).sum()) / len(windows[0][1])
+        asked = sum([sum(map(abs, currents)) for currents in windows[0][1]]) / len(windows[0][1])
         if known:
             healthy = all(fits([predict(*window)], self._bounds, known) for window in windows)
         else:

@@ -45,7 +45,8 @@ import numpy as np
 
 from flight.loop.coil_currents import ELECTRICAL, NEWEST, Bounds, CoilFault, Predicted, Supplied, fits
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
@@ -92,7 +93,7 @@ class CoilCommands:
         """Return whether all commands since `time_ns` are recorded and the braking has not changed since."""
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
-    def window(self, begin_ns: int, end_ns: int) -> FloatArray:
+    def window(self, begin_ns: int, end_ns: int) -> list[tuple[float, ...]]:
         """Return the commands (k, n), A, that may be in force between two times, sampled in equal steps."""
         earlier = reversed(self._commands)
         since_ns, currents = next(earlier)
@@ -101,22 +102,24 @@ class CoilCommands:
             while since_ns > time_ns:
                 since_ns, currents = next(earlier, (time_ns, currents))
             sampled.append(currents)
-        return np.array(sampled[::-1])
+        return sampled[::-1]
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
         """Return the newest ADC sample with the bounds for healthy coils besides `known` faults."""
-        sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
+        window = self.window(reading.newest_since_ns, reading.time_ns)
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
         unsure = [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]
-        driven: list[bool] = [any(column) for column in sizes.T.tolist()]
-        total = sizes.sum(axis=1)
-        sure = np.delete(sizes, unsure, axis=1).sum(axis=1) if unsure else total
+        driven = [any(column) for column in zip(*window, strict=True)]
+        totals = [sum(map(abs, currents)) for currents in window]
+        lowest, highest = min(totals), max(totals)
+        sure = lowest
+        if unsure:
+            sure = float(np.abs(np.delete(window, unsure, axis=1)).sum(axis=1).min())
         slack = sum(driven) * bounds.uncertainty + bounds.noise
         error = bounds.gain + NEWEST.scatter
-        lowest, highest = float(total.min()), float(total.max())
         return Supplied(
             reading.newest,
-            least=float(sure.min()) * (1.0 - error) - slack,
+            least=sure * (1.0 - error) - slack,
             most=highest * (1.0 + error) + slack + sum(bounds.full_current[axis] for axis in free),
             at_rest=[axis for axis in range(len(driven)) if not driven[axis] and axis not in known],
             driven=any(driven),
@@ -233,7 +236,6 @@ class CoilResponse:
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)
         count = len(self._free)
-        self._places = np.arange(count)
         # Coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of its changes by k inertia errors.
         self._gyroscopic: FloatArray = np.zeros((3, 6))
         if count == 3:
@@ -271,10 +273,10 @@ class CoilResponse:
         # Samples: time since the previous sample (s), rate (3,), field (3,) and currents (n,).
         self._samples: list[tuple[float, ...]] = []
         self._times: list[int] = []  # times (ns) of the samples
-        # Integrals of the n coil accelerations (3 n,), rad/s, and of the six rate products, rad^2/s.
-        self._integrals: FloatArray = np.zeros(3 * coils + 6)
-        self._previous: tuple[float, FloatArray, FloatArray] | None = None
-        self._turned: FloatArray = np.zeros(3)
+        # Time (s), sums and motion of the last bin, as `_bin_equations` needs them for the next bin.
+        self._middle: float | None = None
+        self._sums: FloatArray = np.zeros((2, 3 * coils + 6))
+        self._motion: FloatArray = np.zeros((2, 3))
         self._quiet_field: tuple[float, ...] | None = None
         # Equations (f, p + 1) of each bin for f free axes: coefficients of p parameters, and acceleration.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
@@ -282,8 +284,8 @@ class CoilResponse:
         self.fastest = self._walk = 0.0
         # The newest fit determines the weights of the inertia error modes.
         self._weights: FloatArray = np.zeros(len(self._gyroscopic) // 3 - 1)
-        # The tuple of a bin: time (ns), equations (3, p + 1), and accelerations per ampere (3, n).
-        self._remainders: deque[tuple[int, FloatArray, FloatArray]] = deque()
+        # The tuple of a bin: time (ns), equations (3, p + 1), and field (3,), T, of the last sample.
+        self._remainders: deque[tuple[int, FloatArray, tuple[float, ...]]] = deque()
         self._in_a_row = {finding: [0] * coils for finding in Finding}
         self.sigma = np.full(coils, np.inf)
 
@@ -356,11 +358,11 @@ class CoilResponse:
         to be observed, and NaN if there are too few residuals.
         """
         before = [rows for time_ns, rows, _ in self._remainders if time_ns < since_ns]
-        after = [(rows, gains) for time_ns, rows, gains in self._remainders if time_ns >= settled_ns]
+        after = [(rows, field) for time_ns, rows, field in self._remainders if time_ns >= settled_ns]
         if len(before) < 3 or len(after) < 3:
             return math.nan
-        column = self._others + axis
-        expected = np.mean([constant * gains[:, axis] - rows[:, column] for rows, gains in after], axis=0)
+        column, per_field = self._others + axis, constant * self._per_field[:, 3 * axis : 3 * axis + 3]
+        expected = np.mean([np.array(field) @ per_field - rows[:, column] for rows, field in after], axis=0)
         expected = self._mask * expected
         size = float(expected @ expected)
         if size < _LEAST_CHANGE**2:
@@ -387,38 +389,20 @@ class CoilResponse:
         return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its expected torque"
 
     def _close_bin(self) -> bool:
-        samples, count, coils = np.array(self._samples), len(self._samples), self._count_of_coils
-        middle = sum(self._times) / count * 1e-9
+        samples, field = np.array(self._samples), self._samples[-1][4:7]
+        middle = sum(self._times) / len(samples) * 1e-9
         self._samples.clear()
         self._times.clear()
-        spans, rates, fields, currents = samples[:, :1], samples[:, 1:4], samples[:, 4:7], samples[:, 7:]
-        per_ampere = fields @ self._per_field
-        products = rate_products(rates)
-        commanded = (currents[:, :, None] * per_ampere.reshape(count, coils, 3)).reshape(count, 3 * coils)
-        # The sum of all steps, and the mean of the sums after each sample.
-        steps = spans * np.concatenate([commanded, products], axis=1)
-        total, mean = _sums_and_means(count) @ steps
-        mean += self._integrals
-        self._integrals = self._integrals + total
-        rate = rates.sum(axis=0) / count
-        before, self._previous = self._previous, (middle, rate, mean)
+        before, self._middle = self._middle, middle
+        span = 0.0 if before is None else middle - before
+        self._sums, self._motion, rows, fastest = _bin_equations(
+            samples, self._per_field, self._gyroscopic, self._free, self._sums, self._motion, span
+        )
         if before is None:
             return False
-        span = middle - before[0]
-        mean_rate = 0.5 * (rate + before[1])
-        self._turned = self._turned + mean_rate * span
-        change = (mean - before[2]) / span
-        gyroscopic = (self._gyroscopic @ change[3 * coils :]).reshape(-1, 3)
-        free, others, number = self._free, self._others, len(self._free)
-        rows = np.zeros((3, others + coils + 1))
-        rows[free, self._places] = -self._turned[free]
-        rows[free, self._places + number] = -mean_rate[free]
-        rows[:, 2 * number : others] = gyroscopic[1:].T
-        rows[:, others:-1] = change[: 3 * coils].reshape(coils, 3).T
-        rows[:, -1] = (rate - before[1]) / span - gyroscopic[0]
-        self._rows.append(rows[free])
-        self._speeds.append(math.sqrt(float(products[:, :3].sum(axis=1).max())))
-        self._remainders.append((self._last_ns, rows, per_ampere[-1].reshape(coils, 3).T))
+        self._rows.append(rows[self._free])
+        self._speeds.append(fastest)
+        self._remainders.append((self._last_ns, rows, field))
         while self._remainders[0][0] < self._last_ns - _MEMORY_NS:
             self._remainders.popleft()
         if len(self._rows) < self._settings.least_bins:
@@ -431,7 +415,8 @@ class CoilResponse:
 
         Bins from before a fault would hide the fault from a fit over all bins.
         """
-        rows, self._walk = np.array(self._rows), self._disturbance_walk()
+        rows = np.concatenate(self._rows).reshape(len(self._rows), len(self._free), -1)
+        self._walk = self._disturbance_walk()
         counts = [len(rows)]
         while counts[-1] // 2 >= self._settings.least_bins:
             counts.append(counts[-1] // 2)
@@ -469,8 +454,10 @@ class CoilResponse:
             spread = max(1.0, cost[0] / max(free * (count - 1) - coils, 1))
             # If a gain is impossible even within its uncertainty, the model is wrong.
             possible = all(
-                abs(value) - 3.0 * math.sqrt(spread * square) < limit
-                for value, square, limit in zip(gain[0], variance[0], largest, strict=True)
+                [
+                    abs(value) - 3.0 * math.sqrt(spread * square) < limit
+                    for value, square, limit in zip(gain[0], variance[0], largest, strict=True)
+                ]
             )
             single = [gain[axis + 1][axis] for axis in range(coils)]
             sigma = [math.sqrt(spread * variance[axis + 1][axis]) for axis in range(coils)]
@@ -497,16 +484,15 @@ class CoilResponse:
         # The dipole of a coil that was corrected before may be several times the dipole assumed at present.
         corrected = float(self.largest[axis]) > LARGEST_GAIN
         wrong = is_reversed or (corrected and exact and gain + 3.0 * sigma < -LEAST_GAIN)
-        findings = {
-            Finding.REVERSED: wrong,
-            Finding.FEEBLE: wrong or (sure and weak),
-            Finding.SOUND: sure and gain > _LOWEST_SOUND,
-            Finding.WEAK: exact and gain + 3.0 * sigma < _USED_WEAK_GAIN and gain - 3.0 * sigma > LEAST_GAIN,
-            Finding.STRONG: exact and gain - 3.0 * sigma > _STRONG_GAIN,
-        }
-        for finding, holds in findings.items():
-            counts = self._in_a_row[finding]
-            counts[axis] = counts[axis] + 1 if holds else 0
+        holds = (  # in the order of `Finding`
+            wrong,
+            wrong or (sure and weak),
+            sure and gain > _LOWEST_SOUND,
+            exact and gain + 3.0 * sigma < _USED_WEAK_GAIN and gain - 3.0 * sigma > LEAST_GAIN,
+            exact and gain - 3.0 * sigma > _STRONG_GAIN,
+        )
+        for counts, held in zip(self._in_a_row.values(), holds, strict=True):
+            counts[axis] = counts[axis] + 1 if held else 0
 
     def _whitened(self, rows: FloatArray, counts: tuple[int, ...], span: float) -> FloatArray:
         """Return the equations (w, m f, p + 1) of w fits, whitened and without the effect of a constant.
@@ -543,6 +529,108 @@ class CoilResponse:
 def _sums_and_means(count: int) -> FloatArray:
     """Return the matrix (2, m) that yields the sum of m steps, and the mean of their m cumulative sums."""
     return np.stack([np.ones(count), np.arange(count, 0, -1) / count])
+
+
+def _bin_equations_numpy(
+    samples: FloatArray,
+    per_field: FloatArray,
+    gyroscopic: FloatArray,
+    free: IntArray,
+    sums: FloatArray,
+    motion: FloatArray,
+    span: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the equations of the angular acceleration between two neighbouring bins of samples.
+
+    The integrals (3 n + 6,) are those of the accelerations (rad/s) by n coils, coil by coil, and of the six
+    rate products (rad^2/s).
+
+    Args:
+        samples: samples (m, 7 + n) of the second bin: time (s) since the previous sample, rate, field (T) and
+            currents (A).
+        per_field: accelerations per ampere (3, 3 n) by the coils in a unit field along each body axis.
+        gyroscopic: coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of k error modes.
+        free: indices (f,) of the axes about which the body can rotate.
+        sums: integrals (2, 3 n + 6) until the end of the first bin, and their means in the first bin.
+        motion: rotation vector (rad) until the first bin, and mean rate in the first bin, (2, 3).
+        span: time (s) between the bins, or 0.0 without a first bin.
+
+    Returns:
+        The sums and the motion of the second bin, the equations (3, 2 f + k + n + 1), and the largest body
+        rate in the second bin. The columns of the equations are the coefficients of torsions, dampings, error
+        modes and coil gains, and the acceleration. Without a first bin, the equations are zero.
+    """
+    count, coils, rates = len(samples), samples.shape[1] - 7, samples[:, 1:4]
+    products = rate_products(rates)
+    commanded = np.repeat(samples[:, 7:], 3, axis=1) * (samples[:, 4:7] @ per_field)
+    steps = np.concatenate([commanded, products], axis=1)
+    after = sums[0] + (_sums_and_means(count) * samples[:, 0]) @ steps
+    rate = rates.sum(axis=0) / count
+    mean_rate = 0.5 * (motion[1] + rate)
+    moved = np.stack([motion[0] + span * mean_rate, rate])
+    fastest = math.sqrt(float(products[:, :3].sum(axis=1).max()))
+    number, modes = len(free), len(gyroscopic) // 3 - 1
+    rows = np.zeros((3, 2 * number + modes + coils + 1))
+    if span:
+        change = (after[1] - sums[1]) / span
+        turning = (gyroscopic @ change[3 * coils :]).reshape(-1, 3)
+        for place, axis in enumerate(free.tolist()):
+            rows[axis, place], rows[axis, number + place] = -moved[0, axis], -mean_rate[axis]
+        rows[:, 2 * number : 2 * number + modes] = turning[1:].T
+        rows[:, 2 * number + modes : -1] = change[: 3 * coils].reshape(coils, 3).T
+        rows[:, -1] = (rate - motion[1]) / span - turning[0]
+    return after, moved, rows, fastest
+
+
+@compiled_form_of(_bin_equations_numpy)
+def _bin_equations(
+    samples: FloatArray,
+    per_field: FloatArray,
+    gyroscopic: FloatArray,
+    free: IntArray,
+    sums: FloatArray,
+    motion: FloatArray,
+    span: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """See `_bin_equations_numpy`."""
+    (count, columns), number, modes = samples.shape, len(free), len(gyroscopic) // 3 - 1
+    coils, last = columns - 7, 2 * number + modes + columns - 7
+    after, moved, rows = np.empty_like(sums), np.zeros((2, 3)), np.zeros((3, last + 1))
+    after[:] = sums[0]
+    fastest = 0.0
+    for place in range(count):
+        weight, (x, y, z) = samples[place, 0], (samples[place, 1], samples[place, 2], samples[place, 3])
+        products = (x * x, y * y, z * z, y * z, z * x, x * y)
+        fastest = max(fastest, x * x + y * y + z * z)
+        for column in range(3 * coils + 6):
+            step = weight * products[max(column - 3 * coils, 0)]
+            if column < 3 * coils:
+                acceleration = 0.0
+                for axis in range(3):
+                    acceleration += samples[place, 4 + axis] * per_field[axis, column]
+                step = weight * samples[place, 7 + column // 3] * acceleration
+            after[0, column] += step
+            after[1, column] += (count - place) / count * step
+        for axis in range(3):
+            moved[1, axis] += samples[place, 1 + axis] / count
+    for axis in range(3):
+        moved[0, axis] = motion[0, axis] + 0.5 * span * (motion[1, axis] + moved[1, axis])
+    if span == 0.0:
+        return after, moved, rows, math.sqrt(fastest)
+    change = (after[1] - sums[1]) / span
+    for place in range(number):
+        axis = free[place]
+        rows[axis, place] = -moved[0, axis]
+        rows[axis, number + place] = -0.5 * (motion[1, axis] + moved[1, axis])
+    for axis in range(3):
+        rows[axis, last] = (moved[1, axis] - motion[1, axis]) / span
+        for k in range(6):
+            rows[axis, last] -= gyroscopic[axis, k] * change[3 * coils + k]
+            for mode in range(modes):
+                rows[axis, 2 * number + mode] += gyroscopic[3 + 3 * mode + axis, k] * change[3 * coils + k]
+        for coil in range(coils):
+            rows[axis, 2 * number + modes + coil] = change[3 * coil + axis]
+    return after, moved, rows, math.sqrt(fastest)
 
 
 class Finding(Enum):
@@ -585,10 +673,11 @@ def _judged(costs: list[float]) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
     coils = len(costs) // 2 - 1
     free, sound = costs[0], costs[coils + 1]
     alone, is_reversed = [], []
-    for axis, (single, turned) in enumerate(zip(costs[1 : coils + 1], costs[coils + 2 :], strict=True)):
+    singles = costs[1 : coils + 1]
+    least, second = sorted(singles)[:2]
+    for single, turned in zip(singles, costs[coils + 2 :], strict=True):
         # The hypothesis that only this axis is broken is accepted if its cost is below this limit.
-        limit = min(costs[other] for other in range(1, coils + 1) if other != axis + 1) - _CLEARLY
-        limit = min(limit, free + _WORSE)
+        limit = min((second if single == least else least) - _CLEARLY, free + _WORSE)
         alone.append(single < limit)
         is_reversed.append(turned < min(limit, sound - _CERTAINLY))
     return tuple(alone), tuple(is_reversed)

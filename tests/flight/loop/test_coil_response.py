@@ -19,8 +19,10 @@ from flight.loop.coil_response import (
     MotionFit,
     MotionWitness,
     ResponseSettings,
+    _bin_equations,
 )
 from knightcube.astro.arrays import FloatArray
+from tests.support.compiled_forms import assert_forms_agree
 
 FIELD = np.array([0.0, 0.0, 60e-6])
 INERTIA, DIPOLE = 0.02, 60.0
@@ -422,6 +424,19 @@ def test_samples_that_are_200_ms_apart_begin_a_new_fit(since_ns: int, kept: bool
     assert len(response._samples) == 2
     response.observe_motion(2 + since_ns, np.zeros(3), FIELD)
     assert bool(response._samples) is kept
+
+
+@pytest.mark.parametrize(("coils", "free", "modes"), [(3, [1], 0), (4, [0, 1, 2], 6)])
+def test_the_loop_form_of_the_equations_of_a_bin_equals_the_numpy_form(
+    coils: int, free: list[int], modes: int
+) -> None:
+    rng = np.random.default_rng(coils)
+    samples = rng.standard_normal((8, 7 + coils))
+    per_field, gyroscopic = rng.standard_normal((3, 3 * coils)), rng.standard_normal((3 + 3 * modes, 6))
+    sums, motion = rng.standard_normal((2, 3 * coils + 6)), rng.standard_normal((2, 3))
+    for span in (0.2, 0.0):
+        args = samples, per_field, gyroscopic, np.array(free), sums, motion, span
+        assert_forms_agree(_bin_equations, *args)
 
 
 def test_before_the_first_fit_no_gain_is_claimed() -> None:
