@@ -334,8 +334,9 @@ class Navigation:
             self._bytes_since_ns = now_ns
         without_ns = now_ns - max(self._received_ns, self._bytes_since_ns)
         unusable = without_ns > limit_ns
-        text = f"bytes but no valid reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
-        text = text if unusable else "readings arrive again"
+        text = "readings arrive again"
+        if unusable:
+            text = f"bytes but no valid reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
         self._facts.update(facts.IMU_UNUSABLE, unusable, now_ns, text)
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes

@@ -540,10 +540,15 @@ class CommandHistory:
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
         """Yield each coil command between two times, and the command's duration (ns), in order of time."""
+        if to_ns <= from_ns:
+            return
+        if not self._times or self._times[-1] <= from_ns:  # no search is needed
+            yield self._torquings[-1] if self._torquings else self.idle, to_ns - from_ns
+            return
         time_ns = from_ns
         index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
         while time_ns < to_ns:
-            torquing = self._torquings[index] if self._torquings else self.idle
+            torquing = self._torquings[index]
             more = index + 1 < len(self._torquings)
             until_ns = min(to_ns, self._times[index + 1]) if more else to_ns
             if until_ns > time_ns:
@@ -754,7 +759,10 @@ class CheckpointHistory:
     @property
     def newest_used(self) -> Checkpoint:
         """The newest checkpoint whose measurement passed the gate; if none passed, the newest checkpoint."""
-        return next((c for c in reversed(self._checkpoints) if c.used), self._checkpoints[-1])
+        newest = self._checkpoints[-1]
+        if newest.used:  # nearly always
+            return newest
+        return next((c for c in reversed(self._checkpoints) if c.used), newest)
 
     def at(self, time_ns: int) -> Checkpoint | None:
         """Return the last checkpoint up to a time, or None for a time before the first checkpoint."""
