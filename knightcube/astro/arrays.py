@@ -42,7 +42,7 @@ def _names(kind: type[Any]) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind))
 
 
-def median(values: FloatArray) -> float:
+def median(values: npt.NDArray[np.floating[Any]]) -> float:
     """Return the median of finite `values` (n,), several times as fast as numpy.median for small n."""
     ordered, middle = np.sort(values, axis=None), values.size // 2
     if values.size % 2:

@@ -27,7 +27,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.frame import saturation_count
-from knightcube.vision.streaks.faint_stars import FaintStars, find_faint, polar_grid
+from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
 from knightcube.vision.streaks.first_guess import (
     SCANNED_STARS,
     Circles,
@@ -70,6 +70,7 @@ from knightcube.vision.streaks.joint_fit import (
     true_ends,
     unbroken,
 )
+from knightcube.vision.streaks.polar_grid import polar_grid
 from knightcube.vision.streaks.psf_profile import fit_profile
 from knightcube.vision.streaks.streak_result import (
     REASONS,

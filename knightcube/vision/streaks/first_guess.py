@@ -35,9 +35,9 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.faint_stars import SAMPLE_NOISE, cumulative_sums, polar_grid
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_lengths, positions
+from knightcube.vision.streaks.polar_grid import SAMPLE_NOISE, cumulative_sums, polar_grid
 
 SCANNED_STARS = 14
 """Number of the brightest regions that are used in the scan for the rotation angle."""
@@ -185,7 +185,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
     middle = np.clip(np.rint((circles.azimuth + wide) / step).astype(np.int64), 0, count - 1)
     about = np.clip(middle[:, None] + np.arange(-4, 5), 0, count - 1)
     own = np.median(np.take_along_axis(light, about, axis=1), axis=1)
-    noise = 9.0 * float(np.median(frame.floor[::97]))
+    noise = 9.0 * frame.usual_noise**2
     own = np.maximum(own, np.sqrt(noise))
     light = np.minimum(light, _CAP * own[:, None])
     start = np.zeros((len(middle), 1))
@@ -584,7 +584,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
     held = cumulative_sums(frame.sums, pinhole, grid)
-    held *= np.float32(1.0 / (SAMPLE_NOISE * np.sqrt(np.median(frame.floor[::97]))))
+    held *= np.float32(1.0 / (SAMPLE_NOISE * frame.usual_noise))
     longest = min(len(grid.azimuth) // 2, int(np.pi / step))
     if longest < 2 * _FRAME_SHORTEST:
         return []

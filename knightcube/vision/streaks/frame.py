@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import estimate_background
 from knightcube.vision.camera.lens import Pinhole
@@ -29,6 +29,9 @@ from knightcube.vision.frame import (
 )
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
+
+# Distance (px) between the pixels whose median is the usual noise.
+_SPARSE = 97
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +59,11 @@ class ReducedFrame:
     bad: BoolArray
     gain: float
     hot_pixels: int
+
+    @property
+    def usual_noise(self) -> float:
+        """Standard deviation (counts) of the noise of a typical pixel without a star."""
+        return float(np.sqrt(median(self.floor[::_SPARSE])))
 
 
 def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> ReducedFrame:

@@ -1,4 +1,4 @@
-"""Tests of running sums on circles about the rotation axis, and of stars found in the sums."""
+"""Tests of stars found in the running sums on circles about the rotation axis."""
 
 from __future__ import annotations
 
@@ -12,85 +12,18 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import box_sum
 from knightcube.vision.streaks import faint_stars
 from knightcube.vision.streaks.faint_stars import (
-    ACROSS,
-    PolarGrid,
-    RunningSums,
-    cumulative_sums,
     find_faint,
     less_boxes,
     overlap_of,
-    polar_grid,
     profile,
-    running_sums,
     sharp_peaks,
     standing_peaks,
 )
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import CameraMotion, paths
-from tests.knightcube.vision.streaks.scenes import CAMERA, turn_of
+from knightcube.vision.streaks.polar_grid import ACROSS, PolarGrid, RunningSums
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree
-
-_CASES = [(90.0, 100.0), (30.0, 60.0), (12.0, 60.0), (6.0, 150.0), (0.0, 40.0)]
-
-
-@pytest.mark.parametrize(("theta", "length"), _CASES)
-def test_running_sums_are_those_of_every_sample_of_every_circle(theta: float, length: float) -> None:
-    pinhole = CAMERA.pinhole
-    grid = polar_grid(pinhole, CameraMotion.steady(turn_of(np.radians(theta), length, 0.7)), 3)
-    rows, columns = np.indices((len(grid.polar), len(grid.azimuth)))
-    row, column = (each.reshape(-1).astype(float) for each in (rows, columns))
-    place = np.rint(grid.pixels(pinhole, row, column)).reshape(*rows.shape, 2)
-    last = np.array([pinhole.columns - 1, pinhole.rows - 1])
-    exist = np.asarray(((place > 0) & (place < last)).all(axis=2))
-    light = np.zeros((pinhole.rows, pinhole.columns), dtype=np.float32)
-    light[1:-1, 1:-1] = np.random.default_rng(5).integers(0, 50, (pinhole.rows - 2, pinhole.columns - 2))
-    x, y = np.where(exist, np.nan_to_num(place).transpose(2, 0, 1), 0.0).astype(int)
-    samples = np.where(exist, light[y, x], 0.0)
-    width = round(grid.length)
-    reach = np.arange(width) - width // 2
-    there = columns[0, :, None] + reach
-    on_grid = np.logical_or((there >= 0) & (there < columns.shape[1]), grid.full)
-    wrapped = there % columns.shape[1]
-    held = running_sums(light.reshape(-1), pinhole, grid, 1.0)
-    count = (exist[:, wrapped] & on_grid).sum(axis=2)
-    # Samples at the border between two pixels may be rounded differently in single precision.
-    assert np.mean(held.count != count) < 2e-3
-    assert np.max(np.abs(held.count - count)) <= 2
-    expected = (samples[:, wrapped] * on_grid).sum(axis=2)
-    assert np.corrcoef(held.light.reshape(-1), expected.reshape(-1))[0, 1] > 0.9999
-    whole = cumulative_sums(light.reshape(-1), pinhole, grid)[:, -1]
-    np.testing.assert_allclose(whole, samples.sum(axis=1), rtol=0.02, atol=100.0)
-
-
-def test_a_polar_grid_consists_of_circles_about_the_rotation_axis() -> None:
-    pinhole = CAMERA.pinhole
-    rotation = turn_of(np.radians(40.0), 90.0, 0.7)
-    angle, every = float(np.linalg.norm(rotation)), 2
-    axis = rotation / angle
-    for sign in (1.0, -1.0):
-        grid = polar_grid(pinhole, CameraMotion.steady(sign * rotation), every)
-        assert grid.frame @ grid.frame.T == pytest.approx(np.eye(3), abs=1e-12)
-        assert np.linalg.det(grid.frame) == pytest.approx(1.0)
-        assert grid.frame[2] == pytest.approx(axis)  # in the direction of the image
-        assert grid.angle == pytest.approx(angle)
-        assert grid.length * (grid.azimuth[1] - grid.azimuth[0]) == pytest.approx(angle)
-        assert (grid.polar[1] - grid.polar[0]) * pinhole.focal_length == pytest.approx(every * ACROSS)
-        row, column = np.array([3.0, 40.5, 100.0]), np.array([20.0, 33.25, 60.0])
-        seen = pinhole.unit_vectors(grid.pixels(pinhole, row, column))
-        polar = np.arccos(seen @ axis)
-        assert polar == pytest.approx(np.interp(row, np.arange(len(grid.polar)), grid.polar))
-        assert grid.speed == pytest.approx(np.sin(grid.polar) * pinhole.focal_length)
-        # One sample further along its circle, a star has rotated by the angle between two samples.
-        turned = pinhole.unit_vectors(grid.pixels(pinhole, row, column + 1.0))
-        step = grid.azimuth[1] - grid.azimuth[0]
-        normal = seen - (seen @ axis)[:, None] * axis
-        expected = seen + np.sin(step) * np.cross(axis, seen) - (1.0 - np.cos(step)) * normal
-        assert turned == pytest.approx(expected, abs=1e-9)
-        assert not grid.full
-    centre = polar_grid(pinhole, CameraMotion.steady(np.array([0.0, 0.0, 0.3])))
-    assert centre.full
-    assert centre.frame[2] == pytest.approx([0.0, 0.0, 1.0])
 
 
 def _grid(length: float) -> PolarGrid:
@@ -137,12 +70,16 @@ def test_peaks_are_refined_by_a_parabola() -> None:
     row, column = np.indices((9, 12))
     values = (50.0 - 2.0 * (row - 4.3) ** 2 - 0.5 * (column - 6.8) ** 2).astype(np.float32)
     at = np.array([4]), np.array([7])
-    assert faint_stars._refined(values, *at, 0) == pytest.approx([4.3], abs=1e-4)
-    assert faint_stars._refined(values, *at, 1) == pytest.approx([6.8], abs=1e-4)
+    found = faint_stars._refined(values, *at)
+    assert found[0] == pytest.approx([4.3], abs=1e-4)
+    assert found[1] == pytest.approx([6.8], abs=1e-4)
     # A maximum at the edge of the grid stays there.
     edge = np.array([0]), np.array([11])
-    assert faint_stars._refined(values, *edge, 0) == pytest.approx([0.0])
-    assert faint_stars._refined(values, *edge, 1)[0] <= 11.0
+    found = faint_stars._refined(values, *edge)
+    assert found[0] == pytest.approx([0.0])
+    assert found[1][0] <= 11.0
+    assert_forms_agree(faint_stars._refined, values, *at, relative=1e-6, compiled=False)
+    assert_forms_agree(faint_stars._refined, values, *edge, relative=1e-6, compiled=False)
 
 
 def test_counts_are_subtracted_from_the_sums_of_pixels() -> None:
@@ -181,15 +118,31 @@ _STARS = [(5.2, 60.0, 900.0), (6.0, 71.5, 500.0), (4.4, 8.0, 300.0), (5.0, 120.0
 
 
 def test_responses_are_truncated_triangles_with_the_profile_across() -> None:
+    """The responses of stars, divided by the noise, are subtracted where the noise is given."""
     grid = _grid(20.0)
     expected = _responses(grid, _SPAN, _STARS)
-    place = np.flatnonzero(np.random.default_rng(1).uniform(size=expected.size) > 0.4)
-    out = np.ones(len(place))
-    arguments = place, _SPAN, expected.shape, grid.length, tuple(np.array(_STARS).T)
-    faint_stars._add_responses(out, *arguments)
-    assert out - 1.0 == pytest.approx(expected.reshape(-1)[place], abs=0.015 * 900.0)
-    assert np.all((out > 1.0) == (expected.reshape(-1)[place] > 0.0))
-    assert_forms_agree(faint_stars._add_responses, out, *arguments, compiled=False)
+    scale = np.random.default_rng(1).choice([0.0, 0.02], expected.shape, p=[0.4, 0.6]).astype(np.float32)
+    out = np.zeros_like(scale)
+    arguments = scale, _SPAN, grid.length, tuple(np.array(_STARS).T)
+    faint_stars._subtract_responses(out, *arguments)
+    assert -out == pytest.approx(scale * expected, abs=0.015 * 900.0 * 0.02)
+    assert np.all((out < 0.0) == ((expected > 0.0) & (scale > 0.0)))
+    assert_forms_agree(
+        faint_stars._subtract_responses, np.ones_like(scale), *arguments, relative=1e-5, compiled=False
+    )
+
+
+def test_significant_sums_have_the_reciprocal_of_their_noise() -> None:
+    rng = np.random.default_rng(4)
+    light = rng.normal(0.0, 40.0, (12, 70)).astype(np.float32)
+    count, excess = rng.integers(0, 21, (12, 70)).astype(np.int32), np.linspace(1.0, 2.0, 12)
+    noise = np.append(np.full(7, np.inf), np.sqrt(np.arange(7.0, 21.0)))
+    deviation = noise[count] * excess[:, None]
+    expected = np.where(light > 5.0 * deviation, 1.0 / deviation, 0.0)
+    arguments = light, count, noise, excess, 5.0
+    assert 50 < np.count_nonzero(expected) < 700
+    assert faint_stars._scales(*arguments) == pytest.approx(expected, rel=1e-6)
+    assert_forms_agree(faint_stars._scales, *arguments, relative=1e-6, compiled=False)
 
 
 def test_heights_of_overlapping_stars_are_separated() -> None:
@@ -209,6 +162,23 @@ def test_heights_of_overlapping_stars_are_separated() -> None:
     first = np.interp(9.0, np.arange(12.0), _SPAN[:, 0])
     expected = [80.0 / (20.0 * 2.0), 40.0 * (18.0 - first) / 20.0 / 20.0]
     assert faint_stars._significance(held, noise, grid, peaks) == pytest.approx(expected)
+
+
+def test_pairs_of_overlapping_stars_are_listed_with_their_overlaps() -> None:
+    length, row, column = 20.0, np.array([1.0, 1.5, 4.0, 6.2, 12.0]), np.array([30.0, 38.0, 55.0, 36.0, 30.0])
+    spans = np.tile([-0.5, 200.5], (5, 1))
+    spans[1, 1] = 40.5
+    one, other, overlap = faint_stars._overlaps(row, column, spans, length)
+    pairs = [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3), (3, 1), (3, 2), (3, 3)]
+    assert sorted(zip(one.tolist(), other.tolist(), strict=True)) == [*pairs, (4, 4)]
+    matrix = np.zeros((5, 5))
+    matrix[one, other] = overlap
+    assert matrix == pytest.approx(matrix.T)
+    assert matrix[0, 0] == matrix[4, 4] == pytest.approx(1.01, abs=1e-5)
+    assert matrix[1, 1] == pytest.approx(1.01 * 12.5 / 20.0, abs=1e-5)
+    # The common part of both streaks is from 28 to the edge at 40, and the circles are 0.9 px apart.
+    assert matrix[0, 1] == pytest.approx(12.0 / 20.0 * profile(np.array([0.9]))[0])
+    assert_forms_agree(faint_stars._overlaps, row, column, spans, length, compiled=False)
 
 
 def test_sparse_equations_are_solved() -> None:
@@ -249,16 +219,18 @@ def test_peaks_of_two_stars_on_one_circle_are_separated() -> None:
     span = np.tile([-0.5, 159.5], (12, 1))
     light = _responses(grid, span, [(5.0, 60.0, 900.0), (5.0, 84.0, 800.0)]).astype(np.float32)
     held = RunningSums(light, np.full(light.shape, 50, np.int32), span, np.ones(12))
-    place = np.flatnonzero(light > 30.0)
-    row, column = sharp_peaks(held, place, np.full(len(place), 1.0), grid)
+    scale = np.where(light > 30.0, np.float32(1.0), np.float32(0.0))
+    row, column = sharp_peaks(held, scale, grid)
     assert row == pytest.approx([5.0, 5.0], abs=0.1)
     assert column == pytest.approx([60.0, 84.0], abs=0.1)
-    short, noisy = _grid(30.0), np.full(len(place), 1e3)
-    assert len(sharp_peaks(held, place, noisy, grid)[0]) == 0
-    assert len(sharp_peaks(held, place, np.full(len(place), 1.0), short)[0]) == 0
+    assert len(sharp_peaks(held, np.float32(1e-3) * scale, grid)[0]) == 0
+    assert len(sharp_peaks(held, scale, _grid(30.0))[0]) == 0
+    arguments = light.reshape(-1), held.count.reshape(-1), scale.reshape(-1), 50.0
+    assert_forms_agree(faint_stars._second_differences, *arguments, relative=1e-6, compiled=False)
     # Without the second difference, only the stronger of the two peaks is found in the first pass.
-    row, column = standing_peaks(light, span, place, _grid(50.0), 5.0)
+    row, column = standing_peaks(light, span, 50.0, 30.0)
     assert column[0] == pytest.approx(60.0, abs=1.0)
+    assert len(column) < 3
 
 
 _SMALL = Pinhole(150, 110, 700.0)
