@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from flight.link.events import Mode
 from flight.loop.coil_monitor import CoilMonitor
@@ -75,8 +75,7 @@ class Target:
     law: TargetLaw
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoilCommand:
+class CoilCommand(NamedTuple):
     """A tracker's command: the dipole (3,), A m^2, and the currents (3,), A, that produce it."""
 
     dipole: FloatArray
@@ -93,8 +92,7 @@ class SteeringState(IntEnum):
     BRAKING = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Steered:
+class Steered(NamedTuple):
     """Result of steering in one control cycle.
 
     Attributes:
@@ -111,8 +109,7 @@ class Steered:
     saturated: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ControlOutput:
+class ControlOutput(NamedTuple):
     """Results of one control cycle.
 
     Attributes:
@@ -133,8 +130,7 @@ PLANNER = "planner"
 """Name of the planner worker."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReadingAgreement:
+class ReadingAgreement(NamedTuple):
     """Agreement of an inertial unit's reading with the estimate.
 
     Attributes:

@@ -41,7 +41,7 @@ from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from flight.loop.worker import LONGEST_BYTES, SLAB_BYTES, message_length, pack_trusted, unpack_values
 from hal.interfaces.wires import SECOND_NS, Clock
@@ -169,8 +169,7 @@ class LockStepRunner:
         self._pending.clear()
 
 
-@dataclass(frozen=True, slots=True)
-class Cycle:
+class Cycle(NamedTuple):
     """A cycle of a rate group: slot number, time (ns) at which it was due, and start time (ns)."""
 
     slot: int

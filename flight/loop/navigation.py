@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,8 +78,7 @@ STOOD_NS = 200_000_000
 """Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
 
 
-@dataclass(frozen=True, slots=True)
-class CurrentValidity:
+class CurrentValidity(NamedTuple):
     """Validity of the recorded coil currents.
 
     Attributes:

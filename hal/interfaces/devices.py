@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,8 +23,7 @@ Axes = frozenset[int]
 NO_AXES: Axes = frozenset()
 
 
-@dataclass(frozen=True, slots=True)
-class ImuReading:
+class ImuReading(NamedTuple):
     """One sample of the inertial unit, in the body frame and the mission's reference frame.
 
     Attributes:
@@ -52,8 +51,7 @@ class ImuReading:
         return math.isfinite(self.rate[0])
 
 
-@dataclass(frozen=True, slots=True)
-class ImuLink:
+class ImuLink(NamedTuple):
     """Counters of the inertial unit's serial line since the start of the driver.
 
     The counters never decrease. If the line is silent, `last_byte_ns` does not change. If the line is
@@ -199,8 +197,7 @@ class PowerReading:
     clipped: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class CoilState:
+class CoilState(NamedTuple):
     """State of the coil driver: newest command and last acknowledged output.
 
     Attributes:

@@ -29,6 +29,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,8 +92,7 @@ LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 """Limits of the estimated coil gain; outside these limits the filter has not converged."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ThreadEstimate:
+class ThreadEstimate(NamedTuple):
     """Angle (rad), rate (rad/s) and disturbance (rad/s^2) about the thread.
 
     The estimate `whole`, from which these values follow, contains the covariance and `measured_ns`, the time

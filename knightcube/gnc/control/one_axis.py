@@ -36,14 +36,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant, angle_of
 
 
-@dataclass(frozen=True, slots=True)
-class CurrentCommand:
+class CurrentCommand(NamedTuple):
     """Coil current that a controller commands in one cycle.
 
     Attributes:

@@ -28,7 +28,7 @@ import functools
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -531,7 +531,7 @@ class CommandHistory:
         if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
             self._torquings.insert(first, self.at(since_ns))
             self._times.insert(first, since_ns)
-        self._torquings[first:] = [replace(torquing, known=False) for torquing in self._torquings[first:]]
+        self._torquings[first:] = [torquing._replace(known=False) for torquing in self._torquings[first:]]
 
     def at(self, time_ns: int) -> Torquing:
         """Return the coils' dipole and field at a time, as `Torquing`."""

@@ -57,8 +57,7 @@ from knightcube.gnc.estimation.estimate import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Torquing:
+class Torquing(NamedTuple):
     """The coils' dipole moment (A m^2, body axes) and the magnetic field (T, reference axes).
 
     The vector `driven` is 1 for each driven coil and 0 for other coils. The flag `known` is false while any

@@ -29,6 +29,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
@@ -302,8 +303,7 @@ FARTHEST = angle_of(Q2_LIMIT)
 """Largest angle (rad) up to which the commanded motion continues at the end rate after the end of a path."""
 
 
-@dataclass(frozen=True, slots=True)
-class PathSample:
+class PathSample(NamedTuple):
     """The commanded angle (rad), rate (rad/s) and acceleration (rad/s^2) at one time."""
 
     angle: float

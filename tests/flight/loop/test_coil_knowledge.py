@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from flight.loop.navigation import STOOD_NS, CoilKnowledge, CurrentValidity
@@ -12,7 +10,7 @@ from hal.interfaces.devices import CoilState
 
 MS = 1_000_000
 OBEYS = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "")
-REFUSES = replace(OBEYS, error="pca9685 at 0x40: does not keep the values written to its output registers")
+REFUSES = OBEYS._replace(error="pca9685 at 0x40: does not keep the values written to its output registers")
 
 
 def test_what_a_chip_carries_that_obeys_is_known() -> None:

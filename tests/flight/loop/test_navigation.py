@@ -129,7 +129,7 @@ class Bench:
         self.unit.readings = list(readings)
         if readings:
             counters.setdefault("last_byte_ns", now_ns)
-        self.unit.counters = replace(self.unit.counters, **counters)
+        self.unit.counters = self.unit.counters._replace(**counters)
         self.calls.clear()
         return self.task.update(now_ns)
 

@@ -143,7 +143,7 @@ class Flown:
         return float(angle_between(self.filter.at(self.time_ns).quaternion, self.attitude))
 
     def _reading_at(self, time_ns: int) -> ImuReading:
-        return replace(self._reading(), time_ns=time_ns, arrival_ns=time_ns)
+        return self._reading()._replace(time_ns=time_ns, arrival_ns=time_ns)
 
     def _reading(self) -> ImuReading:
         noise = self.generator.standard_normal(6)

@@ -89,7 +89,7 @@ def test_a_step_is_the_product_of_the_whole_matrices() -> None:
     exposure = MeanRateMeasurement(0, 10, np.zeros(3), RATE_COVARIANCE)
     root = rng.normal(0.0, 0.1, (SIZE, SIZE))
     for body, begun in ((FREE, STATE), (SUSPENDED, HUNG)):
-        for torquing in (TORQUING, replace(TORQUING, known=False), body.torquing(np.zeros(3))):
+        for torquing in (TORQUING, TORQUING._replace(known=False), body.torquing(np.zeros(3))):
             state, before = keep_attitude(begun, root @ root.T, exposure)
             _, carried = propagate(body, noise, state, before, torquing, 0.025)
             transition, added = dense_step(body, noise, state, torquing, 0.025)
