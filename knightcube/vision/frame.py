@@ -332,12 +332,9 @@ def _is_hot(signal: Image, row: int, column: int, noise: float, level: float) ->
         for c in range(column - 1, column + 2):
             value = float(signal[r, c]) - level
             brighter += value > own
-            if value > highest:
-                highest, second, third = value, highest, second
-            elif value > second:
-                second, third = value, second
-            elif value > third:
-                third = value
+            third = max(third, min(second, value))
+            second = max(second, min(highest, value))
+            highest = max(highest, value)
     alone = second < min(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
     pair = highest > _PAIR * noise and third < _SHARPNESS * highest + _PAIR_NOISE * noise
     return brighter <= 1 and (alone or pair)

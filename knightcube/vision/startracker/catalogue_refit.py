@@ -255,7 +255,9 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
     polar, azimuth = polar_angles(pinhole, course, motion.stars)
     known_polar, known_azimuth = polar_angles(pinhole, course, known.places)
     beside = np.abs(polar[:, None] - known_polar) * pinhole.focal_length < _BESIDE
-    near |= beside & (azimuth_differences(azimuth, known_azimuth) < float(np.linalg.norm(course.rotation)))
+    near |= beside & (
+        azimuth_differences(azimuth[:, None], known_azimuth) < float(np.linalg.norm(course.rotation))
+    )
     alike = known.light > _ALIKE * motion.flux[:, None]
     return np.flatnonzero(~(near & alike).any(axis=1))
 

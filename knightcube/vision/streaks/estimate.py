@@ -254,12 +254,14 @@ def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> 
             yield known
     growth = 0.0 if camera.settings.rate_model == "constant" else measured_rate_change(guess, regions)
     if growth:
-        yield from motions_by_length(guess, regions, camera.pinhole, _FIRST_STARS, growth)[:_MOST_GROWING]
+        growing = motions_by_length(guess, regions, camera.pinhole, _FIRST_STARS, growth)
+        yield from islice(growing, _MOST_GROWING)
     voted = motions_by_length(guess, regions, camera.pinhole, _FIRST_STARS)
-    if voted and len(voted[0].light) >= _WHOLE and voted[0].contradicted < _CONTRADICTED:
-        yield voted.pop(0)
+    first = list(islice(voted, 1))
+    if first and len(first[0].light) >= _WHOLE and first[0].contradicted < _CONTRADICTED:
+        yield first.pop()
     yield from motions_by_scan(guess, camera.frame, camera.pinhole, _FIRST_STARS, near)
-    yield from voted
+    yield from chain(first, voted)
 
 
 def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakFit] | None:
@@ -399,12 +401,13 @@ def chained_stars(
     Different stars rarely form a chain of equal segments by chance.
     """
     polar, azimuth = polar_angles(pinhole, motion, stars)
-    rotations = azimuth_differences(azimuth[:judged], azimuth)
+    one, other = np.nonzero(np.abs(polar[:judged, None] - polar) < _CHAIN_ASIDE / pinhole.focal_length)
+    rotations = azimuth_differences(azimuth[one], azimuth[other])
     rotations = rotations / max(float(np.linalg.norm(motion.rotation)), 1e-12)
-    aside = np.abs(polar[:judged, None] - polar) * pinhole.focal_length
-    ratio = light[:judged, None] / np.maximum(light, 1e-9)
-    joined = (aside < _CHAIN_ASIDE) & (rotations > _CHAIN_APART[0]) & (rotations < _CHAIN_APART[1])
-    return np.asarray((joined & (ratio < _CHAIN_RATIO) & (ratio > 1.0 / _CHAIN_RATIO)).any(axis=1))
+    ratio = light[one] / np.maximum(light[other], 1e-9)
+    joined = (rotations > _CHAIN_APART[0]) & (rotations < _CHAIN_APART[1])
+    joined &= (ratio < _CHAIN_RATIO) & (ratio > 1.0 / _CHAIN_RATIO)
+    return np.bincount(one[joined], minlength=judged) > 0
 
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, median
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
@@ -280,16 +280,10 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
     # The weight of long and bright regions is large, because blends of stars are rarely long and bright.
     worth = np.sqrt(regions.flux) * np.minimum(regions.length, 100.0)
     leaders = long[np.argsort(-worth[long], kind="stable")[:_PROPOSERS]]
-    i, j = (leaders[index] for index in np.triu_indices(len(leaders), k=1))
-    proposal = np.cross(equation[i], equation[j])
-    size = np.linalg.norm(proposal, axis=-1)
-    usable = size > _PARALLEL * np.linalg.norm(equation[i], axis=-1) * np.linalg.norm(equation[j], axis=-1)
-    if not usable.any():
+    weight = np.log1p(regions.flux[long] / median(regions.flux[long]))
+    axis = _likeliest_axis(equation[leaders], equation[long], flow[long], tolerance[long], weight)
+    if not axis.any():
         return None
-    proposal = proposal[usable] / size[usable, None]
-    weight = np.log1p(regions.flux[long] / np.median(regions.flux[long]))
-    missed = (_misalignment(proposal, equation[long], flow[long]) / tolerance[long]) ** 2
-    axis = proposal[np.argmin((np.minimum(missed, 9.0) * weight).sum(axis=1))]
     for _ in range(3):
         off = np.abs(_misalignment(axis[None], equation, flow)[0]) / tolerance
         agree = (off <= 3.0) & (regions.length >= _LEAST_LENGTH)
@@ -299,6 +293,56 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
         rows = equation[agree] / np.maximum(speed * tolerance[agree], 1e-9)[:, None]
         axis = np.linalg.svd(rows, full_matrices=False)[2][-1]
     return axis, agree
+
+
+def _likeliest_axis_numpy(
+    leaders: FloatArray, equation: FloatArray, flow: FloatArray, tolerance: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """Return the best rotation axis (3,) that two of the equation vectors `leaders` (k, 3) propose, or zeros.
+
+    The equation vectors `equation` (n, 3), image-flow matrices `flow` (n, 2, 3), standard errors `tolerance`
+    (n,), rad, and the `weight` (n,) belong to the regions that vote for the axes.
+    """
+    i, j = np.triu_indices(len(leaders), k=1)
+    proposal, length = np.cross(leaders[i], leaders[j]), np.linalg.norm(leaders, axis=-1)
+    size = np.linalg.norm(proposal, axis=-1)
+    usable = size > _PARALLEL * length[i] * length[j]
+    if not usable.any():
+        return np.zeros(3)
+    proposal = proposal[usable] / size[usable, None]
+    missed = (_misalignment(proposal, equation, flow) / tolerance) ** 2
+    return np.asarray(proposal[np.argmin((np.minimum(missed, 9.0) * weight).sum(axis=1))])
+
+
+@compiled_form_of(_likeliest_axis_numpy)
+def _likeliest_axis(
+    leaders: FloatArray, equation: FloatArray, flow: FloatArray, tolerance: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """See `_likeliest_axis_numpy`."""
+    best, axis, proposal = np.inf, np.zeros(3), np.zeros(3)
+    for i in range(len(leaders)):
+        one = leaders[i]
+        for j in range(i + 1, len(leaders)):
+            other = leaders[j]
+            x = one[1] * other[2] - one[2] * other[1]
+            y = one[2] * other[0] - one[0] * other[2]
+            z = one[0] * other[1] - one[1] * other[0]
+            size = math.sqrt(x * x + y * y + z * z)
+            if size <= _PARALLEL * math.sqrt(np.sum(one * one) * np.sum(other * other)):
+                continue
+            proposal[0], proposal[1], proposal[2] = x / size, y / size, z / size
+            missed = 0.0
+            for n in range(len(equation)):
+                speed, off = np.zeros(2), 0.0
+                for k in range(3):
+                    off += proposal[k] * equation[n, k]
+                    speed += proposal[k] * flow[n, :, k]
+                off /= max(math.hypot(speed[0], speed[1]), 1e-9) * tolerance[n]
+                missed += min(off * off, 9.0) * weight[n]
+            if missed < best:
+                best = missed
+                axis[:] = proposal
+    return axis
 
 
 def _misalignment(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> FloatArray:
@@ -365,20 +409,18 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
 
 def motions_by_length(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, most: int, growth: float = 0.0
-) -> list[MotionGuess]:
-    """Return initial guesses from the lengths of regions, by descending likelihood, with up to `most` stars.
+) -> Iterator[MotionGuess]:
+    """Yield initial guesses from the lengths of regions, by descending likelihood, with up to `most` stars.
 
     The argument `growth` is the relative change of the rate over the exposure, see `measured_rate_change`.
     """
-    guesses = []
     for wide, contradicted in _angles(guess, regions):
         # A changing rate slightly increases the second moment of a streak.
         angle = wide / np.sqrt(1.0 + growth**2 / 60.0)
         stars, light = _stars_of_angle(guess, regions, pinhole, angle, most, growth)
         if len(light):
             turn = guess.frame[2] * angle
-            guesses.append(MotionGuess(CameraMotion(turn, growth * turn), stars, light, contradicted))
-    return guesses
+            yield MotionGuess(CameraMotion(turn, growth * turn), stars, light, contradicted)
 
 
 def motion_by_course(
@@ -471,7 +513,9 @@ def _arcs(
         x = frame[0, 0] * u + frame[0, 1] * v + frame[0, 2]
         y = frame[1, 0] * u + frame[1, 1] * v + frame[1, 2]
         z = (frame[2, 0] * u + frame[2, 1] * v + frame[2, 2]) / math.sqrt(u * u + v * v + 1.0)
-        azimuth = (math.atan2(y, x) - reference[region] + math.pi) % (2.0 * math.pi) - math.pi
+        azimuth = math.atan2(y, x) - reference[region]
+        if abs(azimuth) > math.pi:
+            azimuth -= math.copysign(2.0 * math.pi, azimuth)
         flux[region] += weight
         moments[0, region] += weight * azimuth
         moments[1, region] += weight * azimuth * azimuth

@@ -123,9 +123,7 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     """Return up to `most` of the brightest regions with 3 x 3 sums above `sigmas` standard deviations."""
     pixel = _significant(frame.sums, frame.floor, 3.0 * sigmas)
     number, count = label_pixels(pixel, frame.shape[1])
-    area = np.bincount(number, minlength=count)
-    flux = np.bincount(number, np.maximum(frame.signal[pixel], np.float32(0.0)), count)
-    flux[area < _LEAST_AREA] = 0.0
+    flux = _fluxes(pixel, number, count, frame.signal)
     chosen = np.argsort(-flux, kind="stable")[:most]
     chosen = chosen[flux[chosen] > 0.0]
     rank = np.full(count, -1)
@@ -135,6 +133,30 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     normal = np.stack([-np.sin(found.direction), np.cos(found.direction)], axis=-1)
     shapes, lit = (found.centre, normal, found.length, found.flux), len(pixel) / frame.signal.size
     return BrightRegions(*shapes, cut[: len(chosen)], owner, column, row, light, lit)
+
+
+def _fluxes_numpy(pixel: IntArray, number: IntArray, count: int, signal: Float32Array) -> FloatArray:
+    """Return the counts (count,) of each region, zero for a region that is smaller than `_LEAST_AREA`.
+
+    The other arguments are the flat index and the region of each bright pixel (p,), and the counts of all
+    pixels. Negative counts do not count.
+    """
+    area = np.bincount(number, minlength=count)
+    flux = np.bincount(number, np.maximum(signal[pixel], np.float32(0.0)), count)
+    return np.where(area < _LEAST_AREA, 0.0, flux)
+
+
+@compiled_form_of(_fluxes_numpy)
+def _fluxes(pixel: IntArray, number: IntArray, count: int, signal: Float32Array) -> FloatArray:
+    """See `_fluxes_numpy`."""
+    area, flux = np.zeros(count, np.int64), np.zeros(count)
+    for p in range(len(pixel)):
+        area[number[p]] += 1
+        flux[number[p]] += max(float(signal[pixel[p]]), 0.0)
+    for region in range(count):
+        if area[region] < _LEAST_AREA:
+            flux[region] = 0.0
+    return flux
 
 
 _RegionPixels = tuple[IntArray, IntArray, IntArray, FloatArray, BoolArray]
@@ -213,9 +235,9 @@ def _mark_bright(
     bright: npt.NDArray[np.uint8], sums: Float32Array, floor: Float32Array, threshold: float
 ) -> None:
     """Set `bright` (k,) to 1 for pixels whose `sums` exceed `threshold` times their noise, otherwise to 0."""
+    least = np.float32(threshold * threshold)
     for k in range(len(bright)):
-        own = float(sums[k])
-        bright[k] = (own > 0.0) & (own * own > threshold * threshold * floor[k])
+        bright[k] = (sums[k] > np.float32(0.0)) & (sums[k] * sums[k] > least * floor[k])
 
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
@@ -317,25 +339,54 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions, near: int = 
     whatever the direction and curvature of the streak. The median of the width over the brightest regions is
     insensitive to blended stars and bright limbs.
     """
-    chosen = np.flatnonzero(regions.owner < _MOST_WIDTH_REGIONS)
-    owner, columns = regions.owner[chosen], frame.shape[1]
-    pixel = regions.row[chosen] * columns + regions.column[chosen]
+    pixels = regions.owner, regions.column, regions.row, regions.light
     count = min(len(regions), _MOST_WIDTH_REGIONS)
-    light = regions.light[chosen]
-    fallen = np.zeros(count)
+    correlation = _autocorrelations(pixels, frame.signal, frame.shape[1], near, count)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for step in (1, columns):
-            correlation = []
-            for distance in (near * step, _FARTHER * near * step):
-                beside = frame.signal.take(pixel + distance, mode="clip")
-                beside = beside + frame.signal.take(pixel - distance, mode="clip")
-                correlation.append(np.bincount(owner, light * beside, count))
-            fallen += np.log(correlation[0] / correlation[1])
+        fallen = np.log(correlation[0] / correlation[1]) + np.log(correlation[2] / correlation[3])
         variance = near**2 * (_FARTHER**2 - 1) / (4.0 * fallen)
     known = variance[np.isfinite(variance) & (variance > 0.0)]
     if len(known) < _LEAST_WIDTH_REGIONS:
         return None
     return float(np.sqrt(max(float(np.median(known)) - PIXEL_VARIANCE, 0.0)))
+
+
+_OwnedPixels = tuple[IntArray, IntArray, IntArray, FloatArray]
+"""Attributes `owner`, `column`, `row` and `light` of `BrightRegions`."""
+
+
+def _autocorrelations_numpy(
+    pixels: _OwnedPixels, signal: Float32Array, columns: int, near: int, count: int
+) -> FloatArray:
+    """Return the autocorrelations (4, count) of the first `count` regions of a frame with `columns` columns.
+
+    The displacements are `near` px and `_FARTHER` times `near` px along rows, and then along columns.
+    """
+    chosen = np.flatnonzero(pixels[0] < count)
+    owner, column, row = (values[chosen] for values in pixels[:3])
+    light = pixels[3][chosen]
+    found = np.empty((4, count))
+    for k, distance in enumerate((near, _FARTHER * near, near * columns, _FARTHER * near * columns)):
+        beside = signal.take(row * columns + column + distance, mode="clip")
+        beside = beside + signal.take(row * columns + column - distance, mode="clip")
+        found[k] = np.bincount(owner, light * beside, count)
+    return found
+
+
+@compiled_form_of(_autocorrelations_numpy)
+def _autocorrelations(
+    pixels: _OwnedPixels, signal: Float32Array, columns: int, near: int, count: int
+) -> FloatArray:
+    """See `_autocorrelations_numpy`."""
+    (owner, column, row, light), found, last = pixels, np.zeros((4, count)), len(signal) - 1
+    for p in range(len(owner)):
+        if owner[p] < count:
+            pixel = row[p] * columns + column[p]
+            for k in range(4):
+                distance = near * (_FARTHER if k % 2 else 1) * (columns if k > 1 else 1)
+                beside = signal[min(pixel + distance, last)] + signal[max(pixel - distance, 0)]
+                found[k, owner[p]] += light[p] * beside
+    return found
 
 
 # Minimum standard deviation of the PSF in a binned image, in binned pixels.

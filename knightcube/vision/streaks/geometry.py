@@ -884,8 +884,8 @@ def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> t
 
 
 def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the absolute differences (n, m), at most pi, between azimuths (n,) and (m,), all in rad."""
-    return np.asarray(np.abs(np.remainder(azimuth[:, None] - other + np.pi, 2.0 * np.pi) - np.pi))
+    """Return the absolute differences (n,), at most pi, between azimuths (n,) and others (n,), all in rad."""
+    return np.asarray(np.abs(np.remainder(azimuth - other + np.pi, 2.0 * np.pi) - np.pi))
 
 
 def near_streaks(
@@ -894,7 +894,8 @@ def near_streaks(
     """Return which streaks of `stars` (n, 2), px, pass within `distance` px of any of `others` (m, 2)."""
     polar, azimuth = polar_angles(pinhole, motion, stars)
     other_polar, other_azimuth = polar_angles(pinhole, motion, others)
-    beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance
+    one, other = np.nonzero(np.abs(polar[:, None] - other_polar) < distance / pinhole.focal_length)
     room = distance / (pinhole.focal_length * np.maximum(np.sin(other_polar), 1e-3))
-    angle = float(np.linalg.norm(motion.rotation))
-    return np.asarray((beside & (azimuth_differences(azimuth, other_azimuth) < angle + room)).any(axis=1))
+    reach = float(np.linalg.norm(motion.rotation)) + room
+    near = azimuth_differences(azimuth[one], other_azimuth[other]) < reach[other]
+    return np.bincount(one[near], minlength=len(stars)) > 0

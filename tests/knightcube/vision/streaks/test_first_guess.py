@@ -48,7 +48,7 @@ def test_regions_give_axis_and_angle(theta: float, length: float) -> None:
     assert abs(guess.frame[2] @ rotation) / angle > np.cos(2.0 / length)
     assert guess.frame @ guess.frame.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.count_nonzero(guess.agree) > 0.8 * len(regions)
-    best = motions_by_length(guess, regions, CAMERA.pinhole, 12)[0]
+    best = next(motions_by_length(guess, regions, CAMERA.pinhole, 12))
     assert float(np.linalg.norm(best.motion.rate)) == pytest.approx(angle, rel=0.03)
     assert best.motion.constant
     assert len(best.stars) == len(best.light) <= 12
@@ -89,7 +89,7 @@ def test_the_asymmetry_of_regions_shows_a_change_of_the_rate(growth: float) -> N
     change = measured_rate_change(guess, regions)
     reverse = np.sign(guess.frame[2] @ rotation)
     assert change * reverse == pytest.approx(growth, abs=0.4)
-    best = motions_by_length(guess, regions, CAMERA.pinhole, 12, change)[0]
+    best = next(motions_by_length(guess, regions, CAMERA.pinhole, 12, change))
     assert best.motion.acceleration == pytest.approx(change * best.motion.rate)
 
 
@@ -177,14 +177,14 @@ def test_streaks_are_arcs_about_the_rotation_axis(way: float) -> None:
     # The end in the frame of the truncated streak is not at the border.
     assert guess.cut_first[6] != guess.cut_last[6]
     assert not (guess.cut_first | guess.cut_last)[whole].any()
-    best = motions_by_length(guess, regions, _SMALL, 12)[0]
+    best = next(motions_by_length(guess, regions, _SMALL, 12))
     assert np.linalg.norm(best.motion.rate) == pytest.approx(0.07, rel=0.03)
     assert best.stars[whole] == pytest.approx(_STARS[whole], abs=0.5)
     assert best.stars[6] == pytest.approx(_STARS[6], abs=3.0)
     assert best.light[whole] == pytest.approx(_FLUX[whole], rel=0.05)
     assert best.light[6] == pytest.approx(_FLUX[6], rel=0.25)
     assert best.contradicted == 0.0
-    assert len(motions_by_length(guess, regions, _SMALL, 3)[0].stars) == 3
+    assert len(next(motions_by_length(guess, regions, _SMALL, 3)).stars) == 3
 
 
 def test_a_region_in_another_direction_does_not_change_the_axis() -> None:
@@ -212,7 +212,7 @@ def test_the_centroid_of_a_streak_shows_the_change_of_the_rate(growth: float) ->
     few = replace(regions, cut=np.arange(7) > 1)
     assert measured_rate_change(guess, few) == 0.0
     change = float(measured_rate_change(guess, regions))
-    best = motions_by_length(guess, regions, _SMALL, 12, change)[0]
+    best = next(motions_by_length(guess, regions, _SMALL, 12, change))
     # The centre of a streak is at half the angle between its ends.
     halfway = CameraMotion.steady(motion.halfway)
     centres = paths(_SMALL, halfway, _STARS[:6], np.ones(6)).position

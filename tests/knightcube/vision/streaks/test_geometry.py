@@ -316,7 +316,7 @@ def test_stars_have_polar_coordinates_about_the_rotation_axis() -> None:
 
 
 def test_azimuths_differ_by_at_most_half_a_turn() -> None:
-    found = azimuth_differences(np.array([3.0, -1.0]), np.array([-3.0, 0.5, 3.0]))
+    found = azimuth_differences(np.array([[3.0], [-1.0]]), np.array([-3.0, 0.5, 3.0]))
     expected = np.array([[2.0 * np.pi - 6.0, 2.5, 0.0], [2.0, 1.5, 2.0 * np.pi - 4.0]])
     assert found == pytest.approx(expected)
 
