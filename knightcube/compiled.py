@@ -19,6 +19,7 @@ control loop calls it in a real-time flight, because the first call of a compile
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import logging
@@ -37,6 +38,8 @@ _COMPILING = (
     "numba compiles the functions in use for this machine; this takes about a minute, once "
     f"({_SWITCH}=0 avoids it)"
 )
+_functions: list[HotFunction[Any, Any]] = []
+"""All functions of this process that have a compiled form."""
 _helpers: list[Callable[..., Any]] = []
 """Functions that loop forms call and that are not yet registered for compilation by numba."""
 
@@ -52,6 +55,7 @@ class HotFunction(Generic[Parameters, Result]):
         self.loop_form = loop_form
         self._chosen: Callable[Parameters, Result] | None = None
         self._refusals: tuple[type[Exception], ...] = ()
+        _functions.append(self)
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         """Return the result of the compiled form, or of the numpy form if compiled forms are switched off.
@@ -72,6 +76,15 @@ class HotFunction(Generic[Parameters, Result]):
             unknown = importlib.import_module("numba.core.errors").NumbaError
             self._refusals = (unknown, NotImplementedError, OSError, EOFError, pickle.UnpicklingError)
         return self._chosen
+
+    def load(self) -> None:
+        """Load the machine code that earlier processes stored, which the first call would load otherwise."""
+        form: Any = self._chosen or self._choose()
+        with contextlib.suppress(AttributeError, *self._refusals):  # the first call then loads or compiles
+            cache, codegen = form._cache, form.targetctx.codegen()
+            for key in cache._cache_file._load_index():
+                if key == cache._index_key(key[0], codegen):
+                    form.compile(key[0])
 
     def compiled_form(self) -> Callable[Parameters, Result]:
         """Return the loop form as a function that numba compiles and, if possible, stores in a file.
@@ -116,8 +129,20 @@ def compiled_floats(function: Callable[Parameters, Result]) -> HotFunction[Param
 
 
 @compiled_floats
-def load() -> None:
-    """Load numba if the compiled forms are in use, which takes half a second in the first call."""
+def _nothing() -> None:
+    """Do nothing; the first call loads numba."""
+
+
+def load(*packages: str) -> None:
+    """Load numba, and the stored compiled forms of the functions of `packages`, if compiled forms are in use.
+
+    Otherwise, the first call of a function would load its compiled form, which takes some milliseconds, and
+    the first call of all functions would load numba, which takes half a second.
+    """
+    _nothing()
+    for function in _functions if in_use() else ():
+        if function.__module__.startswith(packages):
+            function.load()
 
 
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

@@ -105,7 +105,8 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     if not request.realtime:
         if request.devices is not None:
             raise UsageError("--devices: the devices of a server run in real time: give --realtime too")
-        compiled.load()  # otherwise, the first control cycle would load numba
+        # Otherwise, the first control cycles would load numba and the machine code of their functions.
+        compiled.load("flight.", "knightcube.gnc.")
         hardware = stack.enter_context(opened_lockstep(config, section, request.out))
         latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
         return with_host_faults(hardware.rig(section.seed, latency), section)

@@ -141,3 +141,26 @@ def test_numba_can_be_loaded_before_the_first_call_of_a_compiled_form(selected: 
     environment = {**os.environ, "KNIGHTCUBE_COMPILED": str(int(selected)), "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=False)
     assert done.returncode == selected
+
+
+def test_stored_machine_code_can_be_loaded_before_the_first_call(tmp_path: Path) -> None:
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    places = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    code = (
+        "import sys\nimport numpy as np\nfrom knightcube import compiled\n"
+        "from tests.support.compiled_forms import sum_of_squares as hot\n"
+        "compiled.load('tests.')\nloaded = len(hot._chosen.overloads)\n"
+        "assert hot(np.arange(5.0)) == 30.0\nsys.exit(loaded)"
+    )
+    found = []
+    for damaged in (False, False, True):
+        for file in tmp_path.rglob("*.nbi") if damaged else ():
+            file.write_bytes(file.read_bytes()[:40])
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "KNIGHTCUBE_COMPILED": "1", **places},
+            timeout=100,
+            check=False,
+        )
+        found.append(done.returncode)
+    assert found == [0, 1, 0]
