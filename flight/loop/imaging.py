@@ -388,8 +388,9 @@ class RepeatedRows:
     def look(self, pixels: Image) -> int:
         """Return how many sampled rows are copies from earlier frames, or 0 if all of them are copies."""
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
-        noisy = [row for row in rows if np.mean(pixels[row][1:] != pixels[row][:-1]) >= _LEAST_CHANGES]
-        here = {row: zlib.crc32(pixels[row].tobytes()) for row in noisy}
+        sampled = np.ascontiguousarray(pixels[rows])
+        noisy = np.mean(sampled[:, 1:] != sampled[:, :-1], axis=1) >= _LEAST_CHANGES
+        here = {rows[place]: zlib.crc32(sampled[place]) for place in np.flatnonzero(noisy).tolist()}
         old = sum(any(before.get(row) == value for before in self._seen) for row, value in here.items())
         self._seen.append(here)
         return old if old < len(here) else 0

@@ -447,7 +447,12 @@ class AttitudeFilter:
                 self._branch.replay.add(measurement)
             else:
                 self.catch_up()
-        if self._is_newest(measurement):
+        is_newest = self._is_newest(measurement)
+        if is_newest and not isinstance(measurement, MeanRateMeasurement):
+            newest = self._model.apply(self._history.newest, measurement)
+            self._history.replace_from(len(self._history), (newest,))
+            used, self.nis = newest.used, newest.nis
+        elif is_newest:
             used = self._apply([measurement], measurement)
         elif (index := self._history.index_before(measurement.begin_ns)) > 0:
             # The first `index` checkpoints remain, and all later measurements are applied again.

@@ -660,6 +660,33 @@ class PropagationModel:
         first, last = self.commands.at(time_ns - half_ns), self.commands.at(time_ns + half_ns)
         return rate_change(self.body, state, covariance, first, last)
 
+    def correct(
+        self, state: FilterState, covariance: FloatArray, measurement: Measurement
+    ) -> tuple[Correction, tuple[float, ...]]:
+        """Return the correction by a measurement at the time of the state, and the innovation."""
+        change, rate_gate = None, math.inf
+        if isinstance(measurement, RateMeasurement):
+            if measurement.latency is not None:
+                change = self.rate_change(state, covariance, measurement.time_ns)
+            if self.noise.unknown_current:
+                rate_gate = _RATE_ONLY[1 if self.body.suspended else 3]
+        if self.body.suspended and isinstance(measurement, AttitudeMeasurement | RateMeasurement):
+            done, value = correct_about_thread(
+                state, covariance, measurement, change, self.gate[1], rate_gate
+            )
+            return done, (value,)
+        found = innovation(state, measurement, self.body.suspended, change)
+        gate, is_aged = self.gate[len(found.value)], change is not None
+        return correct(state, covariance, found, gate, rate_gate, considers_age=is_aged), found.value
+
+    def apply(self, then: Checkpoint, measurement: Measurement) -> Checkpoint:
+        """Return the next checkpoint after `then`, for a later measurement that is not a mean rate."""
+        state, covariance = self.propagate(then.state, then.covariance, then.time_ns, measurement.time_ns)
+        done, value = self.correct(state, covariance, measurement)
+        return Checkpoint(
+            measurement, done.used, done.state, done.covariance, done.square, value, done.spread
+        )
+
 
 _SINCE = attrgetter("since_ns")
 
@@ -693,28 +720,12 @@ class Replay:
             self._ingest(self._pending.popleft())
 
     def _ingest(self, measurement: Measurement) -> None:
-        model = self._model
         while self._exposures and self._exposures[-1].since_ns <= measurement.time_ns:
             exposure = self._exposures.pop()
             self._propagate_to(exposure.since_ns)
             self._state, self._covariance = keep_attitude(self._state, self._covariance, exposure)
         self._propagate_to(measurement.time_ns)
-        state, covariance = self._state, self._covariance
-        change, rate_gate = None, math.inf
-        if isinstance(measurement, RateMeasurement):
-            if measurement.latency is not None:
-                change = model.rate_change(state, covariance, measurement.time_ns)
-            if model.noise.unknown_current:
-                rate_gate = _RATE_ONLY[1 if model.body.suspended else 3]
-        if model.body.suspended and isinstance(measurement, AttitudeMeasurement | RateMeasurement):
-            done, departure = correct_about_thread(
-                state, covariance, measurement, change, model.gate[1], rate_gate
-            )
-            value: tuple[float, ...] = (departure,)
-        else:
-            found = innovation(state, measurement, model.body.suspended, change)
-            gate, is_aged, value = model.gate[len(found.value)], change is not None, found.value
-            done = correct(state, covariance, found, gate, rate_gate, considers_age=is_aged)
+        done, value = self._model.correct(self._state, self._covariance, measurement)
         state, covariance = done.state, done.covariance
         if isinstance(measurement, MeanRateMeasurement):
             state, covariance = release_attitude(state, covariance, measurement)
