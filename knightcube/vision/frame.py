@@ -272,30 +272,25 @@ def repair_hot_pixels(signal: Image, noise: Image) -> int:
 
     Only pixels well above the noise, whose standard deviation is `noise` (rows, columns), are tested.
     """
-    row, column = find_hot_pixels(signal, np.square(noise))
+    row, column = find_hot_pixels(signal, np.square(noise), float(noise.min()) ** 2)
     bright = signal[row, column] > _REPAIR_SIGMAS * noise[row, column]
     row, column = row[bright], column[bright]
     signal[row, column] = np.median([signal[row + dr, column + dc] for dr, dc in _AROUND], axis=0)
     return len(row)
 
 
-def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the hot pixels of `signal` that are well above the noise.
-
-    The array `variance` (rows, columns) is the noise variance of each pixel.
-    """
-    return _hot_places(signal, variance, float(variance.min()))
-
-
-def _hot_places_numpy(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
-    """See `find_hot_pixels`; `least` is the smallest noise variance of all pixels."""
+def _find_hot_pixels_numpy(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
+    """See `find_hot_pixels`."""
     row, column = positions(signal > np.float32(HOT_SIGMAS * np.sqrt(least)))
     return _hot_among_numpy(signal, row, column, np.sqrt(variance[row, column]), np.zeros(len(row)))
 
 
-@compiled_form_of(_hot_places_numpy)
-def _hot_places(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
-    """See `_hot_places_numpy`."""
+@compiled_form_of(_find_hot_pixels_numpy)
+def find_hot_pixels(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the hot pixels of `signal` that are well above the noise.
+
+    The array `variance` (rows, columns) is the noise variance of each pixel, which is at least `least`.
+    """
     rows, columns = signal.shape
     found, count = np.empty((2, rows * columns), dtype=np.int64), 0
     lowest = np.float32(HOT_SIGMAS * math.sqrt(least))

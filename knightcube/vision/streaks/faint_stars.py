@@ -90,7 +90,7 @@ def sharp_peaks(held: RunningSums, scale: Float32Array, grid: PolarGrid) -> tupl
     flat = held.light.reshape(-1), held.count.reshape(-1), scale.reshape(-1)
     sharp, high = _second_differences(*flat, grid.length)
     bend = sharp.reshape(scale.shape)
-    return _refined(bend, *_local_maxima(bend, np.flatnonzero(high)))
+    return _refined(bend, *_local_maxima(bend, high))
 
 
 def _second_differences_numpy(
@@ -136,7 +136,7 @@ def standing_peaks(
     response. The argument `span` (r, 2) is the range of columns on the detector, as in `RunningSums`, and
     `length` is the length of a streak in samples.
     """
-    row, column = _local_maxima(significance, np.flatnonzero(significance.reshape(-1) > sigmas))
+    row, column = _local_maxima(significance, significance > np.float32(sigmas))
     value, spans = significance[row, column].astype(np.float64), span[row]
     kept = _unshaded(row, column, value, spans, length, sigmas)
     return _refined(significance, row[kept], column[kept])
@@ -198,41 +198,57 @@ def _unshaded(
     return kept
 
 
-def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return grid rows and columns of local maxima among the indices `place` (p,), in descending order."""
-    columns = values.shape[1]
-    place = place[_summits(values.reshape(-1), place, columns)]
-    place = place[np.argsort(-values.reshape(-1)[place], kind="stable")[:_MOST_PEAKS]]
+def _local_maxima(values: Float32Array, high: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return grid rows and columns of local maxima, the highest first, where the mask `high` is set."""
+    flat, columns = values.reshape(-1), values.shape[1]
+    place = _summits(flat, high.reshape(-1), columns)
+    place = place[np.argsort(-flat[place], kind="stable")[:_MOST_PEAKS]]
     row, column = np.divmod(place, columns)
     return row, column
 
 
-def _summits_numpy(flat: Float32Array, place: IntArray, columns: int) -> BoolArray:
-    """Return which of the flat indices `place` (p,) are local maxima of a grid with `columns` columns."""
-    kept = np.arange(len(place))
+def _summits_numpy(flat: Float32Array, high: BoolArray, columns: int) -> IntArray:
+    """Return the flat indices (p,) of the local maxima of a grid (m,), where the mask `high` (m,) is set.
+
+    The argument `columns` is the number of columns of the grid.
+    """
+    place = np.flatnonzero(high)
     # If the circles are complete, the first column of a circle is a neighbour of the last column.
     for down, beside in _NEIGHBOURS:
-        at = place[kept]
-        kept = kept[flat.take(at + (down * columns + beside), mode="wrap") <= flat[at]]
-    out = np.zeros(len(place), dtype=np.bool_)
-    out[kept] = True
-    return out
+        place = place[flat.take(place + (down * columns + beside), mode="wrap") <= flat[place]]
+    return place
 
 
 @compiled_form_of(_summits_numpy)
-def _summits(flat: Float32Array, place: IntArray, columns: int) -> BoolArray:
-    out, size = np.empty(len(place), dtype=np.bool_), len(flat)
-    margin = columns + 2
-    for p in range(len(place)):
-        own, highest = place[p], True
-        for down in range(-1, 2):
-            for beside in range(-2, 3):
-                at = own + down * columns + beside
-                if own < margin or own >= size - margin:
-                    at %= size
-                highest &= flat[at] <= flat[own]
-        out[p] = highest
-    return out
+def _summits(flat: Float32Array, high: BoolArray, columns: int) -> IntArray:
+    """See `_summits_numpy`."""
+    place, count, size, margin = np.empty(len(flat), np.int64), 0, len(flat), columns + 2
+    for begin in range(0, size, _AT_ONCE):
+        stop = min(begin + _AT_ONCE, size)
+        if not _any_set(high[begin:stop]):
+            continue
+        for k in range(begin, stop):
+            if not high[k] or flat[k] < flat[k - 1] or flat[k] < flat[(k + 1) % size]:
+                continue
+            highest = True
+            for down in range(-1, 2):
+                for beside in range(-2, 3):
+                    at = k + down * columns + beside
+                    if k < margin or k >= size - margin:
+                        at %= size
+                    highest &= flat[at] <= flat[k]
+            place[count] = k
+            count += highest
+    return place[:count].copy()
+
+
+@loop_helper
+def _any_set(mask: BoolArray) -> bool:
+    """Return whether any element of `mask` (k,) is true; the count permits vector instructions."""
+    number = np.int32(0)
+    for k in range(len(mask)):
+        number += np.int32(mask[k])
+    return bool(number > 0)
 
 
 def _refined_numpy(values: Float32Array, row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, median
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, cross_product, median
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
@@ -319,7 +319,7 @@ def _likeliest_axis(
     leaders: FloatArray, equation: FloatArray, flow: FloatArray, tolerance: FloatArray, weight: FloatArray
 ) -> FloatArray:
     """See `_likeliest_axis_numpy`."""
-    best, axis, proposal = np.inf, np.zeros(3), np.zeros(3)
+    best, axis = np.inf, np.zeros(3)
     for i in range(len(leaders)):
         one = leaders[i]
         for j in range(i + 1, len(leaders)):
@@ -330,18 +330,16 @@ def _likeliest_axis(
             size = math.sqrt(x * x + y * y + z * z)
             if size <= _PARALLEL * math.sqrt(np.sum(one * one) * np.sum(other * other)):
                 continue
-            proposal[0], proposal[1], proposal[2] = x / size, y / size, z / size
-            missed = 0.0
+            x, y, z, missed = x / size, y / size, z / size, 0.0
             for n in range(len(equation)):
-                speed, off = np.zeros(2), 0.0
-                for k in range(3):
-                    off += proposal[k] * equation[n, k]
-                    speed += proposal[k] * flow[n, :, k]
-                off /= max(math.hypot(speed[0], speed[1]), 1e-9) * tolerance[n]
+                across = flow[n, 0, 0] * x + flow[n, 0, 1] * y + flow[n, 0, 2] * z
+                down = flow[n, 1, 0] * x + flow[n, 1, 1] * y + flow[n, 1, 2] * z
+                off = equation[n, 0] * x + equation[n, 1] * y + equation[n, 2] * z
+                off /= max(math.sqrt(across * across + down * down), 1e-9) * tolerance[n]
                 missed += min(off * off, 9.0) * weight[n]
             if missed < best:
                 best = missed
-                axis[:] = proposal
+                axis[0], axis[1], axis[2] = x, y, z
     return axis
 
 
@@ -393,7 +391,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]
         first = first - (first @ axis) * axis
     first = first / np.linalg.norm(first)
-    frame = np.stack([first, np.cross(axis, first), axis])
+    frame = np.stack([first, cross_product(axis, first), axis])
     centre = np.einsum("ij,nj->ni", frame, pinhole.unit_vectors(regions.centre))
     reference = np.arctan2(centre[:, 1], centre[:, 0])
     view = (float(pinhole.focal_length), *pinhole.centre)

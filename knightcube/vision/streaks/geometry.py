@@ -877,9 +877,9 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
 def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the angles (n,), rad, of `stars` (n, 2), px, from the rotation axis, and their azimuths (n,)."""
     axis = motion.rotation / max(float(np.linalg.norm(motion.rotation)), 1e-12)
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first = cross_product(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)
-    local = pinhole.unit_vectors(stars) @ np.stack([first, np.cross(axis, first), axis]).T
+    local = pinhole.unit_vectors(stars) @ np.stack([first, cross_product(axis, first), axis]).T
     return np.arccos(np.clip(local[:, 2], -1.0, 1.0)), np.arctan2(local[:, 1], local[:, 0])
 
 
@@ -896,6 +896,5 @@ def near_streaks(
     other_polar, other_azimuth = polar_angles(pinhole, motion, others)
     one, other = np.nonzero(np.abs(polar[:, None] - other_polar) < distance / pinhole.focal_length)
     room = distance / (pinhole.focal_length * np.maximum(np.sin(other_polar), 1e-3))
-    reach = float(np.linalg.norm(motion.rotation)) + room
-    near = azimuth_differences(azimuth[one], other_azimuth[other]) < reach[other]
-    return np.bincount(one[near], minlength=len(stars)) > 0
+    apart = azimuth_differences(azimuth[one], other_azimuth[other]) - room[other]
+    return np.bincount(one[apart < np.linalg.norm(motion.rotation)], minlength=len(stars)) > 0

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, cross_product
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import CameraMotion
@@ -84,7 +84,7 @@ def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarG
     if np.linalg.norm(first) < 1e-6:
         first = np.array([1.0, 0.0, 0.0])
     first = first / np.linalg.norm(first)
-    frame = np.stack([first, np.cross(axis, first), axis])
+    frame = np.stack([first, cross_product(axis, first), axis])
     half = pinhole.half_diagonal
     spacing = every * ACROSS / pinhole.focal_length
     polar = np.arange(max(inside_field - half, _NEAREST), inside_field + half, spacing)

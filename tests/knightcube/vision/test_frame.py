@@ -182,9 +182,9 @@ def test_hot_pixels_are_found_except_on_the_border() -> None:
     signal = np.zeros((12, 15), dtype=np.float32)
     signal[4, 6] = signal[0, 3] = signal[11, 14] = 100.0
     signal[8:10, 9:11] = 100.0  # four bright pixels in a square are not hot
-    row, column = find_hot_pixels(signal, np.ones_like(signal))
+    row, column = find_hot_pixels(signal, np.ones_like(signal), 1.0)
     assert (row.tolist(), column.tolist()) == ([4], [6])
-    assert not len(find_hot_pixels(signal, np.full_like(signal, 13.0**2))[0])  # below eight sigmas
+    assert not len(find_hot_pixels(signal, np.full_like(signal, 13.0**2), 13.0**2)[0])  # below eight sigmas
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
@@ -198,7 +198,7 @@ def test_the_fast_search_finds_the_same_hot_pixels_as_the_search_with_a_backgrou
     pixels = np.rint(np.clip(frame, 0.0, 255.0)).astype(kind)
     background = estimate_background(pixels, 64, 8)
     noise = background.map(background.noise)
-    expected = find_hot_pixels(pixels - background.map(background.level), noise * noise)
+    expected = find_hot_pixels(pixels - background.map(background.level), noise * noise, 0.0)
     found = hot_pixels_above(pixels, background, 10)
     assert len(expected[0]) > 100
     assert np.array_equal(found, expected)
@@ -251,8 +251,8 @@ def test_the_compiled_search_of_hot_pixels_equals_that_in_numpy(dtype: type[np.g
     pixels.reshape(-1)[draw.integers(0, pixels.size, 60)] = 250
     level, variance = draw.uniform(40.0, 80.0, (3, 4)), draw.uniform(30.0, 50.0, (3, 4))
     signal, floor = Background(level, variance**0.5, (43, 70)).subtracted(pixels)
-    assert len(frame._hot_places_numpy(signal, floor, 30.0)[0]) > 20
-    assert_forms_agree(frame._hot_places, signal, floor, 30.0)
+    assert len(frame._find_hot_pixels_numpy(signal, floor, 30.0)[0]) > 20
+    assert_forms_agree(find_hot_pixels, signal, floor, 30.0)
     assert_forms_agree(frame._box_sum, signal, relative=1e-6)
 
 
@@ -274,7 +274,7 @@ def test_the_compiled_hot_pixels_are_those_of_numpy_among_pairs_and_squares() ->
     signal = draw.normal(0.0, 1.0, (60, 50)).astype(np.float32)
     signal[draw.random(signal.shape) < 0.05] += 60.0
     signal[draw.random(signal.shape) < 0.05] += 25.0
-    assert_forms_agree(frame._hot_places, signal, np.ones_like(signal), 1.0)
+    assert_forms_agree(find_hot_pixels, signal, np.ones_like(signal), 1.0)
     row, column = np.divmod(np.flatnonzero(signal > 5.0), 50)
     noise, level = draw.uniform(0.5, 1.5, len(row)), draw.normal(0.0, 1.0, len(row))
     assert_forms_agree(

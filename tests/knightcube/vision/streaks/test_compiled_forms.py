@@ -39,6 +39,7 @@ _FUNCTIONS = (
     (streak_frame, "_region_pixels", 1e-9),
     (streak_frame, "_fluxes", 1e-9),
     (streak_frame, "_autocorrelations", 1e-6),
+    (streak_frame, "_filter_sums", 1e-9),
     (first_guess, "_likeliest_axis", 1e-9),
     (first_guess, "_arcs", 1e-7),
     (first_guess, "_best_boxes", 1e-9),

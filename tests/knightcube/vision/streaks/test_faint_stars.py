@@ -56,14 +56,14 @@ def test_the_response_across_a_streak_is_that_of_three_pixels() -> None:
 def test_local_maxima_are_the_highest_of_their_neighbours(seed: int) -> None:
     """A local maximum is not lower than its neighbours on three circles, at most two columns away."""
     values = np.random.default_rng(seed).integers(0, 30, (7, 13)).astype(np.float32)
-    place = np.arange(0, values.size, 1 + seed)
+    high = np.arange(values.size) % (1 + seed) == 0
     ring = values.reshape(-1)
     expected = []
-    for p in place:
+    for p in np.flatnonzero(high):
         around = [ring[(p + 13 * down + beside) % 91] for down in (-1, 0, 1) for beside in range(-2, 3)]
-        expected.append(ring[p] == max(around))
-    assert faint_stars._summits(values.reshape(-1), place, 13).tolist() == expected
-    assert_forms_agree(faint_stars._summits, values.reshape(-1), place, 13, compiled=False)
+        expected += [p] if ring[p] == max(around) else []
+    assert faint_stars._summits(ring, high, 13).tolist() == expected
+    assert_forms_agree(faint_stars._summits, ring, high, 13, compiled=False)
 
 
 def test_peaks_are_refined_by_a_parabola() -> None:
