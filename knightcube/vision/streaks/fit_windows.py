@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
@@ -102,22 +102,12 @@ def cut_strips(
     sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _CROSSING_SAMPLES)
     place = positions(pinhole, motion, np.repeat(chosen, _CROSSING_SAMPLES, axis=0), sampled.reshape(-1))
     place = place.reshape(-1, _CROSSING_SAMPLES, 2)
-    span = np.abs(place[:, -1] - place[:, 0])
-    along_rows = span[:, 0] >= span[:, 1]
-    major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])
-    size = np.where(along_rows, pinhole.columns, pinhole.rows)
-    first = np.maximum(np.ceil(major.min(axis=1)), 0).astype(np.int64)
-    last = np.minimum(np.floor(major.max(axis=1)), size - 1).astype(np.int64)
-    count = np.maximum(last - first + 1, 0)
-    blocks = -(-count // LINES)
-    owner = np.repeat(np.arange(len(part)), blocks)
-    number = np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
-    line = first[owner, None] + number[:, None] * LINES + np.arange(LINES)
-    real = line <= last[owner, None]
-    time = _crossings(major, sampled, line, owner)
+    owner, line, time, real, along_rows = _block_lines(place, sampled, (pinhole.columns, pinhole.rows))
     path = paths(pinhole, motion, np.repeat(stars[part[owner]], LINES, axis=0), time.reshape(-1))
-    lines = _Lines(part[owner], owner, line, time, real, along_rows[owner])
-    return _pixels(pinhole, lines, path, width, (low, high, outer))
+    lines = _Lines(part[owner], owner, line, time, real, along_rows)
+    field = pinhole.columns, pinhole.rows, float(width)
+    bounds = np.ascontiguousarray(low), np.ascontiguousarray(high), outer
+    return Strips(*_strip_pixels(path.at_lines(line.shape), lines, bounds, field))
 
 
 class _Lines(NamedTuple):
@@ -179,6 +169,30 @@ def _diagonals(
     return which, begin + (end - begin) * first / (first - last)
 
 
+_BlockLines = tuple[IntArray, IntArray, FloatArray, BoolArray, BoolArray]
+"""Attributes `part`, `line`, `time`, `real` and `along_rows` of `_Lines`."""
+
+
+def _block_lines_numpy(place: FloatArray, sampled: FloatArray, field: tuple[int, int]) -> _BlockLines:
+    """Return the lines of pixels that cross n parts of paths, given positions (n, s, 2) at s instants (n, s).
+
+    The pair `field` contains the numbers of columns and rows of the frame.
+    """
+    span = np.abs(place[:, -1] - place[:, 0])
+    along_rows = span[:, 0] >= span[:, 1]
+    major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])
+    size = np.where(along_rows, *field)
+    first = np.maximum(np.ceil(major.min(axis=1)), 0).astype(np.int64)
+    last = np.minimum(np.floor(major.max(axis=1)), size - 1).astype(np.int64)
+    count = np.maximum(last - first + 1, 0)
+    blocks = -(-count // LINES)
+    owner = np.repeat(np.arange(len(place)), blocks)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+    line = first[owner, None] + number[:, None] * LINES + np.arange(LINES)
+    real = line <= last[owner, None]
+    return owner, line, _crossings(major, sampled, line, owner), real, along_rows[owner]
+
+
 def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
     """Return approximate times at which paths cross lines of pixels (`line`, (b, LINES))."""
     falling = major[:, -1] < major[:, 0]
@@ -192,87 +206,77 @@ def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: In
     return np.asarray(times.reshape(line.shape))
 
 
+@compiled_form_of(_block_lines_numpy)
+def _block_lines(place: FloatArray, sampled: FloatArray, field: tuple[int, int]) -> _BlockLines:
+    parts, count = sampled.shape
+    first, last, blocks = np.empty(parts, np.int64), np.empty(parts, np.int64), 0
+    axes = np.empty(parts, np.int64)
+    for n in range(parts):
+        across, down = abs(place[n, -1, 0] - place[n, 0, 0]), abs(place[n, -1, 1] - place[n, 0, 1])
+        axes[n] = 0 if across >= down else 1
+        major = place[n, :, axes[n]]
+        first[n], last[n] = max(math.ceil(major.min()), 0), min(math.floor(major.max()), field[axes[n]] - 1)
+        blocks += max(last[n] - first[n] + LINES, 0) // LINES
+    owner, along_rows = np.empty(blocks, np.int64), np.empty(blocks, np.bool_)
+    line, real = np.empty((blocks, LINES), np.int64), np.empty((blocks, LINES), np.bool_)
+    time, b = np.empty((blocks, LINES)), 0
+    for n in range(parts):
+        major = place[n, :, axes[n]]
+        low, high = min(major[0], major[-1]), max(major[0], major[-1])
+        step = 1 if major[-1] >= major[0] else -1
+        # The path is between the samples `at` and `at + step` if it crosses the line.
+        at = 0 if step > 0 else count - 1
+        for begin in range(first[n], last[n] + 1, LINES):
+            owner[b], along_rows[b] = n, axes[n] == 0
+            for i in range(LINES):
+                line[b, i], real[b, i] = begin + i, begin + i <= last[n]
+                within = min(max(float(begin + i), low), high)
+                while 0 <= at + 2 * step < count and major[at + step] <= within:
+                    at += step
+                slope = (sampled[n, at + step] - sampled[n, at]) / (major[at + step] - major[at])
+                time[b, i] = slope * (within - major[at]) + sampled[n, at]
+            b += 1
+    return owner, line, time, real, along_rows
+
+
 _Bounds = tuple[FloatArray, FloatArray, BoolArray]
 """Start time and end time of each part of a path, and a mask (.., 2) of times that are streak ends."""
 _Field = tuple[int, int, float]
 """Numbers of columns and rows of the frame, and largest distance (px) of a pixel from the path."""
 
 
-def _pixels(pinhole: Pinhole, lines: _Lines, path: StarPaths, width: float, parts: _Bounds) -> Strips:
-    """Return the pixel strips formed by `lines`, which cross the paths at the points `path` (b * LINES)."""
-    line, along = lines.line, lines.along_rows[:, None]
-    position, velocity, _ = points = path.at_lines(line.shape)
+_StripArrays = tuple[IntArray, FloatArray, IntArray, IntArray, IntArray, BoolArray]
+"""Attributes of `Strips`."""
+
+
+def _strip_pixels_numpy(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field) -> _StripArrays:
+    """Return the attributes of the strips formed by `lines`, which cross the paths at the `points`.
+
+    The strips contain only blocks with usable pixels, without margins that are unusable on all lines.
+    """
+    (position, velocity, _), along, (columns, _, width) = points, lines.along_rows[:, None], field
     tangent = np.where(along, *velocity) / np.maximum(np.hypot(*velocity), SLOWEST)
     steep = np.maximum(np.abs(tangent), _MOST_BENT)
     half = math.ceil(float(np.max(np.where(lines.real, width / steep, 0.0), initial=0.0)))
     minor = np.rint(np.where(along, position[1], position[0])).astype(np.int64) - half
-    corner = np.stack([np.where(along, line, minor), np.where(along, minor, line)], axis=-1)
-    bounds = (np.ascontiguousarray(parts[0]), np.ascontiguousarray(parts[1]), parts[2])
-    within = np.empty((*line.shape, 2 * half + 1), dtype=np.bool_)
-    _select_pixels(within, corner, points, lines, bounds, (pinhole.columns, pinhole.rows, float(width)))
-    step = np.where(along, [[0, 1]], [[1, 0]])
-    used, begin, index, inside = _kept_pixels(within, corner, step, pinhole.columns)
-    step = step[used]
-    return Strips(
-        lines.star[used], lines.time[used], corner[used] + begin * step[:, None], step, index, inside
-    )
-
-
-def _kept_pixels_numpy(
-    within: BoolArray, corner: IntArray, step: IntArray, columns: int
-) -> tuple[IntArray, int, IntArray, BoolArray]:
-    """Return the blocks (u,) with usable pixels, and their pixels without unusable margins of the lines.
-
-    The arguments are the mask of the usable pixels `within` (b, LINES, k), the first pixel and the step of
-    each line, see `Strips`, and the number of columns of the frame. The last three returned values are the
-    number of pixels omitted at the start of each line, and `index` and `inside` of `Strips`.
-    """
+    corner = np.stack([np.where(along, lines.line, minor), np.where(along, minor, lines.line)], axis=-1)
+    within = _selected_pixels(corner, points, lines, bounds, field, 2 * half + 1)
     crossed = np.flatnonzero(within.any(axis=(0, 1)))
     used = np.flatnonzero(within.any(axis=(1, 2)))
     begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
     inside = np.ascontiguousarray(within[used, :, begin:end])
-    first = corner[used, :, 1] * columns + corner[used, :, 0]
-    next_pixel = (step[used, 1] * columns + step[used, 0])[:, None, None]
-    index = first[..., None] + np.arange(begin, end) * next_pixel
+    step = np.where(along, [[0, 1]], [[1, 0]])[used]
+    corner = corner[used] + begin * step[:, None]
+    first, next_pixel = corner[..., 1] * columns + corner[..., 0], step[:, 1] * columns + step[:, 0]
+    index = first[..., None] + np.arange(end - begin) * next_pixel[:, None, None]
     index *= inside
-    return used, begin, index, inside
+    return lines.star[used], lines.time[used], corner, step, index, inside
 
 
-@compiled_form_of(_kept_pixels_numpy)
-def _kept_pixels(
-    within: BoolArray, corner: IntArray, step: IntArray, columns: int
-) -> tuple[IntArray, int, IntArray, BoolArray]:
-    blocks, lines, count = within.shape
-    crossed, used, found = np.zeros(count, np.bool_), np.empty(blocks, np.int64), 0
-    for b in range(blocks):
-        any_pixel = False
-        for i in range(lines):
-            for k in range(count):
-                crossed[k] |= within[b, i, k]
-                any_pixel |= within[b, i, k]
-        used[found] = b
-        found += any_pixel
-    begin, end = 0, 0
-    for k in range(count):
-        if crossed[k]:
-            begin, end = (k if end == 0 else begin), k + 1
-    index = np.zeros((found, lines, end - begin), np.int64)
-    inside = np.zeros((found, lines, end - begin), np.bool_)
-    for u in range(found):
-        b = used[u]
-        next_pixel = step[b, 1] * columns + step[b, 0]
-        for i in range(lines):
-            first = corner[b, i, 1] * columns + corner[b, i, 0]
-            for k in range(begin, end):
-                if within[b, i, k]:
-                    index[u, i, k - begin], inside[u, i, k - begin] = first + k * next_pixel, True
-    return used[:found].copy(), begin, index, inside
-
-
-def _select_pixels_numpy(
-    within: BoolArray, corner: IntArray, points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field
-) -> None:
-    """Compute the mask `within` (b, LINES, k) of pixels that are nearest to the path part of their block."""
+def _selected_pixels(
+    corner: IntArray, points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field, count: int
+) -> BoolArray:
+    """Return the mask (b, LINES, count) of pixels that are nearest to the path part of their block."""
     part, time, real, along_rows = lines.part, lines.time, lines.real, lines.along_rows
     along, (low, high, outer), (columns, rows, width) = along_rows[:, None], bounds, field
     position, velocity, bent = points
@@ -280,7 +284,6 @@ def _select_pixels_numpy(
     tangent = velocity / speed
     bend = (bent[1] * tangent[0] - bent[0] * tangent[1]) / speed**2
     step = np.where(along, [[0, 1]], [[1, 0]])
-    count = within.shape[2]
     there, way = position.transpose(1, 2, 0), tangent.transpose(1, 2, 0)
     aside, ahead = path_distances(corner, step, there, way, count)
     # An accuracy of 0.01 px suffices for the selection of pixels, so that float32 is used.
@@ -300,40 +303,96 @@ def _select_pixels_numpy(
     chosen &= foot < stop.astype(np.float32)
     chosen &= offset >= np.where(real, -minor, count)
     chosen &= offset < limit - minor
-    within[:] = chosen.transpose(1, 2, 0)
+    return chosen.transpose(1, 2, 0)
 
 
-@compiled_form_of(_select_pixels_numpy)
-def _select_pixels(
-    within: BoolArray, corner: IntArray, points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field
-) -> None:
+@compiled_form_of(_strip_pixels_numpy)
+def _strip_pixels(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field) -> _StripArrays:
     position, velocity, bent = points
-    part, time, real, along_rows = lines.part, lines.time, lines.real, lines.along_rows
     (low, high, outer), (columns, rows, width) = bounds, field
-    blocks, each, count = within.shape
+    (blocks, each), steepest = lines.line.shape, 1.0
     for b in range(blocks):
-        along, p = along_rows[b], part[b]
+        for i in range(each):
+            speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), SLOWEST)
+            major = velocity[0, b, i] if lines.along_rows[b] else velocity[1, b, i]
+            steep = max(abs(major) / speed, _MOST_BENT) if lines.real[b, i] else 1.0
+            steepest = min(steepest, steep)
+    half = math.ceil(width / steepest) if lines.real.any() else 0
+    count = 2 * half + 1
+    within, minor = np.zeros((blocks, each, count), np.bool_), np.empty((blocks, each), np.int64)
+    crossed, used, found = np.zeros(count, np.bool_), np.empty(blocks, np.int64), 0
+    near = np.empty(-(-count // _VECTOR) * _VECTOR, np.bool_)
+    for b in range(blocks):
+        along, p, any_pixel = lines.along_rows[b], lines.part[b], False
         limit = rows if along else columns
         for i in range(each):
             speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), SLOWEST)
             tx, ty = velocity[0, b, i] / speed, velocity[1, b, i] / speed
             bend = (bent[1, b, i] * tx - bent[0, b, i] * ty) / speed**2
-            dx, dy = corner[b, i, 0] - position[0, b, i], corner[b, i, 1] - position[1, b, i]
-            across, ahead = dy * tx - dx * ty, dx * tx + dy * ty
-            by_across, by_ahead = (tx, ty) if along else (-ty, tx)
-            seam, room = (_SEAM + _ARC * width**3 * bend * bend) / speed, width / speed
-            start = low[p] + (-room if outer[p, 0] else seam) - time[b, i]
-            stop = high[p] - (-room if outer[p, 1] else seam) - time[b, i]
-            minor = corner[b, i, 1] if along else corner[b, i, 0]
-            begin, end = max(0, -minor), min(count, limit - minor)
-            if not real[b, i]:
-                end = 0
-            for k in range(count):
-                aside, s = across + k * by_across, ahead + k * by_ahead
-                s /= max(1.0 - bend * aside, 0.5)
-                aside -= 0.5 * bend * s * s
-                near = abs(aside) <= width and start <= s / speed < stop
-                within[b, i, k] = near and begin <= k < end
+            minor[b, i] = round(position[1, b, i] if along else position[0, b, i]) - half
+            column, row = (lines.line[b, i], minor[b, i]) if along else (minor[b, i], lines.line[b, i])
+            dx, dy = column - position[0, b, i], row - position[1, b, i]
+            seam, room = _SEAM + _ARC * width**3 * bend * bend, -width
+            start = (low[p] - lines.time[b, i]) * speed + (room if outer[p, 0] else seam)
+            stop = (high[p] - lines.time[b, i]) * speed - (room if outer[p, 1] else seam)
+            first, slope = (dy * tx - dx * ty, dx * tx + dy * ty), (tx, ty) if along else (-ty, tx)
+            _select_near(near, first, slope, bend, (start, stop, width))
+            begin, end = max(0, -minor[b, i]), min(count, limit - minor[b, i])
+            for k in range(begin, end if lines.real[b, i] else begin):
+                within[b, i, k] = near[k]
+                crossed[k] |= near[k]
+                any_pixel |= near[k]
+        used[found] = b
+        found += any_pixel
+    begin, end = 0, 0
+    for k in range(count):
+        if crossed[k]:
+            begin, end = (k if end == 0 else begin), k + 1
+    star, time, size = np.empty(found, np.int64), np.empty((found, each)), end - begin
+    corner, step = np.empty((found, each, 2), np.int64), np.empty((found, 2), np.int64)
+    index, inside = np.zeros((found, each, size), np.int64), np.empty((found, each, size), np.bool_)
+    for u in range(found):
+        b = used[u]
+        along = lines.along_rows[b]
+        star[u], time[u], inside[u] = lines.star[b], lines.time[b], within[b, :, begin:end]
+        step[u, 0], step[u, 1] = (0, 1) if along else (1, 0)
+        for i in range(each):
+            column, row = (lines.line[b, i], minor[b, i]) if along else (minor[b, i], lines.line[b, i])
+            corner[u, i, 0], corner[u, i, 1] = column + begin * step[u, 0], row + begin * step[u, 1]
+            first_pixel = corner[u, i, 1] * columns + corner[u, i, 0]
+            for k in range(size):
+                place = first_pixel + k * (columns if along else 1)
+                index[u, i, k] = place if inside[u, i, k] else 0
+    return star, time, corner, step, index, inside
+
+
+# Number of pixels that the processor handles at once.
+_VECTOR = 8
+
+
+@loop_helper
+def _select_near(
+    near: BoolArray,
+    first: tuple[float, float],
+    slope: tuple[float, float],
+    bend: float,
+    limits: tuple[float, float, float],
+) -> None:
+    """Compute whether each pixel of a line is `near` the path, within `limits` along and across the path.
+
+    The distances across and along the tangent of the path are `first` (px) for the first pixel, and change by
+    `slope` from pixel to pixel. The limits (px) are those of the part of the path, and the largest distance.
+    """
+    across, ahead = np.float32(first[0]), np.float32(first[1])
+    by_across, by_ahead = np.float32(slope[0]), np.float32(slope[1])
+    start, stop, width = np.float32(limits[0]), np.float32(limits[1]), np.float32(limits[2])
+    curved, one, half = np.float32(bend), np.float32(1.0), np.float32(0.5)
+    for k in range(len(near)):
+        offset = np.float32(np.int32(k))
+        aside, s = across + offset * by_across, ahead + offset * by_ahead
+        s /= max(one - curved * aside, half)
+        aside -= half * curved * s * s
+        near[k] = (abs(aside) <= width) & (s >= start) & (s < stop)
 
 
 def path_distances(
@@ -585,15 +644,15 @@ def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
     values if windows overlap. For m distinct pixels, the returned index is m for a pixel that is not
     `inside`.
     """
-    named = index[inside]
-    # If a pixel occurs in several windows, `number` keeps the index of the last occurrence.
-    order = np.arange(len(named), dtype=np.int32)
+    named = index[inside][::-1]
+    # If a pixel occurs in several windows, `number` keeps the index of the first occurrence.
+    order = np.arange(len(named), dtype=np.int32)[::-1]
     number = np.empty(size, dtype=np.int32)
     number[named] = order
-    last = number.take(named)
-    own = last == order
-    pixels = named[own]
-    place = (np.cumsum(own) - 1).take(last)
+    first = number.take(named[::-1])
+    own = first == order[::-1]
+    pixels = named[::-1][own]
+    place = (np.cumsum(own) - 1).take(first)
     slot = np.full(len(index), len(pixels))
     slot[inside] = place
     several = np.bincount(place, minlength=len(pixels)) > 1
@@ -604,30 +663,32 @@ def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
 
 @compiled_form_of(_numbered_numpy)
 def _numbered(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
-    number = np.empty(size, dtype=np.int32)
+    # The bytes of `windows` are the number of windows of each pixel, at most 2, or 3 for a numbered pixel.
+    windows, number = np.zeros(size, dtype=np.uint8), np.empty(size, dtype=np.int32)
     for p in range(len(index)):
-        if inside[p]:
-            number[index[p]] = p
-    pixels, count = np.empty(len(index), dtype=np.int64), 0
-    for p in range(len(index)):
-        if inside[p] and number[index[p]] == p:
-            pixels[count] = index[p]
-            count += 1
-            number[index[p]] = -count
-    slot, times = np.full(len(index), count), np.zeros(count + 1, dtype=np.int64)
-    for p in range(len(index)):
-        if inside[p]:
-            slot[p] = -number[index[p]] - 1
-            times[slot[p]] += 1
-    names, shared = np.empty(count + 1, dtype=np.int64), 0
-    for pixel in range(count):
-        names[pixel] = shared
-        shared += times[pixel] > 1
+        windows[index[p]] += inside[p] and windows[index[p]] < 2
+    pixels, slot, count = np.empty_like(index), np.empty_like(index), 0
     crowded, common, found = np.empty_like(index), np.empty_like(index), 0
+    slot_of, shared = np.empty_like(index), 0
     for p in range(len(index)):
-        if times[slot[p]] > 1:
-            crowded[found], common[found] = p, names[slot[p]]
-            found += 1
+        at = index[p]
+        if not inside[p]:
+            slot[p] = -1
+            continue
+        if windows[at] == 1:
+            pixels[count], slot[p] = at, count
+            count += 1
+            continue
+        if windows[at] == 2:
+            windows[at], number[at] = 3, shared
+            pixels[count], slot_of[shared] = at, count
+            count, shared = count + 1, shared + 1
+        slot[p] = slot_of[number[at]]
+        crowded[found], common[found] = p, number[at]
+        found += 1
+    for p in range(len(index)):
+        if slot[p] < 0:
+            slot[p] = count
     return pixels[:count].copy(), slot, crowded[:found].copy(), common[:found].copy(), shared
 
 

@@ -31,8 +31,8 @@ from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, taken, tu
 from tests.support.compiled_forms import assert_forms_agree
 
 _FUNCTIONS = (
-    (fit_windows, "_select_pixels", 1e-9),
-    (fit_windows, "_kept_pixels", 1e-9),
+    (fit_windows, "_block_lines", 1e-9),
+    (fit_windows, "_strip_pixels", 1e-9),
     (fit_windows, "_numbered", 1e-9),
     (fit_windows, "_frame_values", 1e-6),
     (streak_frame, "_significant", 1e-9),
