@@ -30,8 +30,10 @@ from knightcube.vision.streaks.geometry import (
     positions,
 )
 
-LINES = 10
-"""Number of lines of pixels in one block. Each line crosses the path of the star."""
+LINES = 16
+"""Number of lines of pixels in one block, a multiple of the length of the processor's vectors.
+
+Each line crosses the path of the star."""
 
 STEEPEST = 0.68
 """Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
@@ -484,8 +486,8 @@ class BlockPixels:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FitWindows:
-    """The fitted pixels: strips of pixels along long streaks, and square patches of pixels around spots.
+class StarPixels:
+    """Strips of pixels along long streaks, and square patches of pixels around spots.
 
     Attributes:
         long: indices in the scene of the a stars of `strips` (a,). A star that moves slowly on part of its
@@ -493,16 +495,25 @@ class FitWindows:
         spot: indices in the scene of the b stars of `patches` (b,).
         strips: pixels of the strips along long streaks.
         patches: pixels of the square patches around spots.
-        pixels: flat indices in the frame of all m fitted pixels (m,), each given once.
-        slot: index in the list `pixels` of each pixel of all strips and patches, as a flat array.
-        on_strips, on_patches: values of the frame on the strips and on the patches.
-        shared: number of pixels that belong to more than one star.
     """
 
     long: IntArray
     spot: IntArray
     strips: Strips
     patches: Patches
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitWindows(StarPixels):
+    """The fitted pixels of all stars, with the values of the frame.
+
+    Attributes:
+        pixels: flat indices in the frame of all m fitted pixels (m,), each given once.
+        slot: index in the list `pixels` of each pixel of all strips and patches, as a flat array.
+        on_strips, on_patches: values of the frame on the strips and on the patches.
+        shared: number of pixels that belong to more than one star.
+    """
+
     pixels: IntArray
     slot: IntArray
     on_strips: BlockPixels
@@ -614,9 +625,12 @@ def cut_windows(
     frame: ReducedFrame, pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float
 ) -> FitWindows:
     """Return fit windows with all pixels of `frame` within `reach` point-spread widths of the paths."""
-    long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
-    index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
-    inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
+    stars = star_pixels(pinhole, shutter, scene, reach)
+    strips, patches = stars.strips, stars.patches
+    index, inside = strips.index.reshape(-1), strips.inside.reshape(-1)
+    if len(patches.index):
+        index = np.concatenate([index, patches.index.reshape(-1)])
+        inside = np.concatenate([inside, patches.inside.reshape(-1)])
     pixels, slot, crowded, common, shared = _numbered(index, inside, frame.signal.size)
     of_frame = frame.signal, frame.floor, frame.counts, frame.bad
     good, signal, floor, ceiling = _frame_values(index, inside, of_frame, float(frame.top))
@@ -630,7 +644,8 @@ def cut_windows(
 
     on_strips = view(strips.index.shape, 0, slice(0, first))
     on_patches = view(patches.index.shape, cut, slice(first, len(crowded)))
-    return FitWindows(long, spot, strips, patches, pixels, slot, on_strips, on_patches, shared)
+    of_stars = stars.long, stars.spot, strips, patches
+    return FitWindows(*of_stars, pixels, slot, on_strips, on_patches, shared)
 
 
 _Numbered = tuple[IntArray, IntArray, IntArray, IntArray, int]
@@ -722,13 +737,9 @@ def _frame_values(
     return good, light, variance, ceiling
 
 
-def _strips_and_patches(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, room: float
-) -> tuple[IntArray, IntArray, Strips, Patches]:
-    """Return the indices of stars with long streaks (a,) and of spots (b,), and the pixel strips and patches.
-
-    The pixel strips and patches contain the pixels within `room` px of the paths.
-    """
+def star_pixels(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float) -> StarPixels:
+    """Return all pixels within `reach` point-spread widths of the paths of the stars of `scene`."""
+    room = reach * scene.width
     times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
     fast, slow = _divided(pinhole, scene, times)
     whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
@@ -736,7 +747,7 @@ def _strips_and_patches(
     spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
     if not len(spot):
-        return long, spot, strips, cut_patches(pinhole, np.empty((0, 2)), int(np.ceil(room)))
+        return StarPixels(long, spot, strips, cut_patches(pinhole, np.empty((0, 2)), int(np.ceil(room))))
     # A square patch of pixels covers the slow part of a streak, or the complete path of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
     sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
@@ -746,7 +757,7 @@ def _strips_and_patches(
     half = int(np.ceil(room + 0.5 * float(np.max(high - low))))
     patches = cut_patches(pinhole, 0.5 * (low + high), half)
     strips = _without_patches(strips, long, patches, spot)
-    return long, spot, strips, patches
+    return StarPixels(long, spot, strips, patches)
 
 
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,7 @@ from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArra
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
-from knightcube.vision.streaks.fit_windows import FitWindows, cut_windows, window_areas
+from knightcube.vision.streaks.fit_windows import FitWindows, cut_windows, star_pixels, window_areas
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
@@ -48,7 +48,7 @@ from knightcube.vision.streaks.normal_equations import (
     solve,
     star_equations,
 )
-from knightcube.vision.streaks.scene_images import light_of
+from knightcube.vision.streaks.scene_images import light_images, light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 # Number of processed pixels per frame after which no further motion is fitted.
@@ -635,7 +635,7 @@ _LEAST_BRIGHTEST = 10
 # Minimum significance (standard deviations) of a faint star that could shift the ends of bright streaks.
 _HIDDEN_SIGMAS = 4.5
 # Number of stars subtracted from the frame in one batch, which limits the memory.
-_AT_ONCE = 16
+_AT_ONCE = 64
 
 
 def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
@@ -834,8 +834,49 @@ def _subtracted(camera: FitProblem, others: StreakScene) -> FitProblem:
     count = len(others.light)
     for some in np.split(np.arange(count), range(_AT_ONCE, count, _AT_ONCE)):
         scene = others.select(some)
-        windows = camera.windows(scene)
-        pixels, light = windows.pixels, light_of(camera.pinhole, camera.shutter, scene, windows)
-        signal[pixels] -= light
-        floor[pixels] += np.square(np.float32(_SUBTRACTION_ERROR) * light)
+        pixels = star_pixels(camera.pinhole, camera.shutter, scene, camera.settings.reach)
+        streaks, spots = light_images(camera.pinhole, camera.shutter, scene, pixels)
+        strips, patches = pixels.strips, pixels.patches
+        light = scene.light[pixels.long[strips.star]]
+        _subtract(signal, floor, (strips.index, strips.inside), streaks[:, 0], light)
+        _subtract(
+            signal, floor, (patches.index, patches.inside), spots.astype(np.float32), scene.light[pixels.spot]
+        )
     return replace(camera, frame=replace(camera.frame, signal=signal, floor=floor))
+
+
+def _subtract_numpy(
+    signal: Float32Array,
+    floor: Float32Array,
+    pixels: tuple[IntArray, BoolArray],
+    images: Float32Array,
+    light: FloatArray,
+) -> None:
+    """Subtract stars from the frame's `signal`, and add the squared errors of their model to its `floor`.
+
+    The `images` (b, l, k) of stars of unit flux, multiplied by the flux `light` (b,) of the star of each
+    block, are the modelled counts on the `pixels`, which are the attributes `index` and `inside` of `Strips`.
+    """
+    index, inside = pixels
+    counts, at = (images * light.astype(np.float32)[:, None, None])[inside], index[inside]
+    np.subtract.at(signal, at, counts)
+    np.add.at(floor, at, np.square(np.float32(_SUBTRACTION_ERROR) * counts))
+
+
+@compiled_form_of(_subtract_numpy)
+def _subtract(
+    signal: Float32Array,
+    floor: Float32Array,
+    pixels: tuple[IntArray, BoolArray],
+    images: Float32Array,
+    light: FloatArray,
+) -> None:
+    (index, inside), error = pixels, np.float32(_SUBTRACTION_ERROR)
+    for b in range(len(images)):
+        flux = np.float32(light[b])
+        for i in range(images.shape[1]):
+            for k in range(images.shape[2]):
+                if inside[b, i, k]:
+                    counts = images[b, i, k] * flux
+                    signal[index[b, i, k]] -= counts
+                    floor[index[b, i, k]] += (error * counts) ** 2

@@ -245,7 +245,8 @@ def _sum_products_numpy(
     The weights (b, p), and the residuals in the last of the `images` (b, i + 1, p), are computed from the
     modelled counts `total` of all fitted pixels. Products of the residual with the other images give the
     gradient, and the squared residual gives chi-square. The pair `of_blocks` contains the star of each block
-    (b,), and coefficients (b, i, SHARED + ALONE) that combine the images into derivatives.
+    (b,), and coefficients (b, i, SHARED + ALONE) that combine the images into derivatives. The coefficients
+    of images that are zero on a block of pixels are set to zero.
     """
     star, matrix = of_blocks
     weight[:], images[:, -1] = residuals(total, of_pixels, limits)
@@ -254,6 +255,7 @@ def _sum_products_numpy(
     for begin in range(0, blocks, _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
         gram[part] = (images[part] * weight[part, None]) @ images[part].swapaxes(1, 2)
+    matrix *= np.diagonal(gram, axis1=1, axis2=2)[:, :-1, None] > 0.0
     transposed = matrix.swapaxes(1, 2)
     first = np.flatnonzero(np.diff(star, prepend=-1))
     owner = star[first]
@@ -329,7 +331,6 @@ def _multiply_images(
             weighted[p] = weights[p] * images[i, p]
             square += weights[p] * images[i, p] * images[i, p]
         gram[i, i] = square
-        # In most blocks, the images of the streak ends are zero.
         for k in range(i):
             product = np.float32(0.0)
             for p in range(size if square > 0.0 and gram[k, k] > 0.0 else 0):
@@ -340,20 +341,26 @@ def _multiply_images(
 
 @loop_helper
 def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
-    """Add the products `gram` of images to the gradient and the information matrix of one star."""
+    """Add the products `gram` of images to the gradient and the information matrix of one star.
+
+    The coefficients `matrix` (i, SHARED + ALONE) of images that are zero are set to zero.
+    """
     images = len(matrix)
     row = np.empty(_PARAMETERS)
     for i in range(images):
+        # In most blocks, the images of the streak ends are zero.
+        if not gram[i, i] > 0.0:
+            matrix[i] = 0.0
+            continue
         row[:] = 0.0
         for k in range(images):
-            for r in range(_PARAMETERS):
-                row[r] += gram[i, k] * matrix[k, r]
+            if gram[k, k] > 0.0:
+                _add_scaled(row, gram[i, k], matrix[k])
         for q in range(_PARAMETERS):
             share = matrix[i, q]
             if share != 0.0:
                 gradient[q] += share * gram[i, images]
-                for r in range(_PARAMETERS):
-                    information[q, r] += share * row[r]
+                _add_scaled(information[q], share, row)
 
 
 def _spot_images(
@@ -773,7 +780,8 @@ def _add_changes(crowd: SharedPixels, vector: FloatArray, light: Float32Array, c
         stop = first[b + 1] if b + 1 < len(first) else len(slot)
         for i in range(len(images)):
             share = np.float32(_scalar_product(matrix[b, i], vector[star[b]]))
-            _add_scaled(light[first[b] : stop], share, images[i, first[b] : stop])
+            if share != 0.0:
+                _add_scaled(light[first[b] : stop], share, images[i, first[b] : stop])
     for e in range(len(slot)):
         change[slot[e]] += light[e]
 
@@ -787,8 +795,9 @@ def _add_coupling(crowd: SharedPixels, change: FloatArray, light: Float32Array, 
     for b in range(len(first)):
         stop = first[b + 1] if b + 1 < len(first) else len(slot)
         for i in range(len(images)):
-            slope = float(_scalar_product(light[first[b] : stop], images[i, first[b] : stop]))
-            _add_scaled(out[star[b]], slope, matrix[b, i])
+            if matrix[b, i].any():
+                slope = float(_scalar_product(light[first[b] : stop], images[i, first[b] : stop]))
+                _add_scaled(out[star[b]], slope, matrix[b, i])
 
 
 @loop_helper

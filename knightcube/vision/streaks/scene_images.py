@@ -6,7 +6,6 @@ derivatives are linear in the PSF, so that those of another profile are sums ove
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from knightcube.astro.arrays import Float32Array, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.fit_windows import FitWindows
+from knightcube.vision.streaks.fit_windows import FitWindows, StarPixels
 from knightcube.vision.streaks.geometry import GAUSSIAN, Shutter, StreakScene
 
 ModelImages = tuple[Float32Array, FloatArray, FloatArray]
@@ -28,30 +27,45 @@ _SPOT_BY_WIDTH = 8
 
 def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
     """Return the modelled counts (m,) of all stars of `scene` on the m fitted pixels, without sky level."""
-    return _light(scene, windows, model_images(pinhole, shutter, scene, windows))
+    return _light(scene, windows, light_images(pinhole, shutter, scene, windows))
 
 
 def gaussian_lights(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> Float32Array:
     """Return the counts (k, m) of all stars on the m fitted pixels if the PSF were one of its k Gaussians."""
-    parts = _images_of_gaussians(pinhole, shutter, scene, windows)
-    return np.stack([_light(part, windows, images) for part, images in parts])
+    parts = _gaussian_scenes(scene)
+    return np.stack([_light(part, windows, light_images(pinhole, shutter, part, windows)) for part in parts])
 
 
-def _light(scene: StreakScene, windows: FitWindows, images: ModelImages) -> Float32Array:
-    """Return the counts (m,) of all stars on the m fitted pixels, given the result of `model_images`."""
-    return windows.total(images[0], images[1], scene.light, np.zeros_like(scene.sky))[:-1]
+def _light(scene: StreakScene, windows: FitWindows, images: tuple[Float32Array, FloatArray]) -> Float32Array:
+    """Return the counts (m,) of all stars on the m fitted pixels, given the result of `light_images`."""
+    return windows.total(*images, scene.light, np.zeros_like(scene.sky))[:-1]
 
 
-def model_images(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> ModelImages:
+def light_images(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, pixels: StarPixels
+) -> tuple[Float32Array, FloatArray]:
+    """Return images of long streaks (b, 1, LINES, k) and of spots (n, p, p), for stars of unit flux."""
+    camera, long, spot = (pinhole, scene.motion, shutter), pixels.long, pixels.spot
+    streaks, spots = [], []
+    for part in _gaussian_scenes(scene):
+        streaks.append(streak_model.images(*camera, scene.stars[long], part.width, pixels.strips, 1))
+        spots.append(streak_model.spot_derivatives(*camera, scene.stars[spot], part.sigma, pixels.patches)[0])
+    if scene.profile == GAUSSIAN:
+        return streaks[0], spots[0]
+    shares = np.array(scene.profile.shares)
+    return np.tensordot(shares.astype(np.float32), streaks, 1), np.tensordot(shares, spots, 1)
+
+
+def model_images(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: StarPixels) -> ModelImages:
     """Return the images that are combined to model long streaks, and the images and derivatives of spots.
 
     The last image of each long streak is an uninitialised buffer for the residuals.
     """
     if scene.profile == GAUSSIAN:
         return _gaussian_images(pinhole, shutter, scene, windows)
-    parts = _images_of_gaussians(pinhole, shutter, scene, windows)
+    parts = [(part, _gaussian_images(pinhole, shutter, part, windows)) for part in _gaussian_scenes(scene)]
     scaled = [_share(scene, *each, share) for each, share in zip(parts, scene.profile.shares, strict=True)]
     images, spots, change = scaled[0]
     for other in scaled[1:]:
@@ -74,7 +88,7 @@ def _share(scene: StreakScene, part: StreakScene, images: ModelImages, share: fl
 
 
 def _gaussian_images(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: StarPixels
 ) -> ModelImages:
     """Return the result of `model_images` for a Gaussian PSF of the width of the `scene`."""
     camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
@@ -83,10 +97,7 @@ def _gaussian_images(
     return images, *spots
 
 
-def _images_of_gaussians(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
-) -> Iterator[tuple[StreakScene, ModelImages]]:
-    """Yield a scene with each Gaussian of the PSF of `scene`, and its model images."""
-    for width in scene.profile.widths:
-        part = replace(scene, width=width * scene.width, profile=GAUSSIAN)
-        yield part, _gaussian_images(pinhole, shutter, part, windows)
+def _gaussian_scenes(scene: StreakScene) -> list[StreakScene]:
+    """Return the `scene` with each Gaussian of its PSF instead of the PSF."""
+    widths = scene.profile.widths
+    return [replace(scene, width=width * scene.width, profile=GAUSSIAN) for width in widths]

@@ -1,8 +1,8 @@
 """Model of the counts of streaks and spots on the pixels, with derivatives with respect to all parameters.
 
 A long streak is fitted on strips of pixels that consist of parallel lines of pixels across the star's path.
-Ten neighbouring lines of pixels form a block, within which the derivatives with respect to the motion are
-linear along the path. The pixels near the paths are selected once (`path_pixels`), and during the fit only
+Sixteen neighbouring lines of pixels form a block, within which the derivatives with respect to the motion are
+linear along the path. The pixels near the paths are selected once (`cut_strips`), and during the fit only
 their distances from the path are updated.
 
 Near a pixel, the path is approximated by an arc on which the star has the speed v, and s and n are
@@ -176,16 +176,22 @@ _KURTOSIS = -1.0 / 120.0
 
 
 def images(
-    pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, stars: FloatArray, width: float, strips: Strips
+    pinhole: Pinhole,
+    motion: CameraMotion,
+    shutter: Shutter,
+    stars: FloatArray,
+    width: float,
+    strips: Strips,
+    count: int = IMAGES + 1,
 ) -> Float32Array:
-    """Return images (b, IMAGES + 1, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
+    """Return images (b, count, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The argument `width` is the width w of the PSF, px. The last image of each block is not initialised; the
-    calling function sets it.
+    The argument `width` is the width w of the PSF, px. The last of IMAGES + 1 images of each block is not
+    initialised; the calling function sets it. If `count` is 1, only the counts of the stars are computed.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
-    out = np.empty((len(strips.star), IMAGES + 1, *strips.index.shape[1:]), dtype=np.float32)
+    out = np.empty((len(strips.star), count, *strips.index.shape[1:]), dtype=np.float32)
     delay = float(shutter.delay_per_row), float(shutter.middle)
     _draw(out, (strips.corner, strips.step, strips.time), path.at_lines(shape), width, delay)
     return out
@@ -214,7 +220,9 @@ def _draw_numpy(
     crossings = _Crossings(corner, step, there, way, time, centre, speed, gained, bend)
     for first in range(0, len(out), _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
-        _draw_part(out[part], _Crossings._make(each[part] for each in crossings), width, Shutter(*delay))
+        drawn = np.empty((len(out[part]), IMAGES + 1, *out.shape[2:]), dtype=np.float32)
+        _draw_part(drawn, _Crossings._make(each[part] for each in crossings), width, Shutter(*delay))
+        out[part, :IMAGES] = drawn[:, : min(IMAGES, out.shape[1])]
 
 
 class _Crossings(NamedTuple):
@@ -337,15 +345,17 @@ def _draw(
     out: Float32Array, lines: _BlockLines, points: PointsAtLines, width: float, delay: tuple[float, float]
 ) -> None:
     (corner, step, time), (position, velocity, acceleration) = lines, points
-    blocks, _, line_count, count = out.shape
-    size = line_count * count
+    blocks, images_count, line_count, count = out.shape
+    size, light_only = line_count * count, images_count == 1
+    drawn = np.empty((IMAGES, size), dtype=np.float32)
     values = np.zeros((_VALUES, line_count, count), dtype=np.float32)
     pixels = values.reshape(_VALUES, size)
     power = np.zeros(pixels.shape[1], dtype=np.int32)
     exponential, of_lines = power.view(np.float32), np.empty((line_count, 5))
     narrow = 1.0 / width**2
     for b in range(blocks):
-        drawn = out[b].reshape(out.shape[1], size)
+        if not light_only:
+            drawn = out[b].reshape(images_count, size)
         centre = 0.5 * (time[b, line_count // 2 - 1] + time[b, line_count // 2])
         by_x, by_y = step[b, 0], step[b, 1]
         for i in range(line_count):
@@ -371,7 +381,10 @@ def _draw(
                 _from_end(values, of_lines, width, sign, by_y * delay[0])
                 _exponential(pixels[_EXPONENT], power, exponential)
                 _draw_end(drawn, pixels, exponential, width, sign)
-        _draw_moments(drawn, pixels, width)
+        if light_only:
+            out[b, 0] = drawn[0].reshape(line_count, count)
+        else:
+            _draw_moments(drawn, pixels, width)
 
 
 # Rows of the values of each pixel in `_draw`: distances (px) across the path and ahead of the crossing, the

@@ -145,7 +145,8 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
     chosen = np.flatnonzero(scene.trusted[of_block])
     star, gain = of_block[chosen], float(view.gain)
     weight, residual = _chosen_residuals(images, scene.light[star], chosen, total, pixels, gain)
-    return StreakResiduals(star, windows.strips.time[chosen], images[chosen], weight, residual)
+    images = images if len(chosen) == len(images) else images[chosen]
+    return StreakResiduals(star, windows.strips.time[chosen], images, weight, residual)
 
 
 def _chosen_residuals_numpy(

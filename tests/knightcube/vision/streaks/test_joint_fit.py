@@ -363,6 +363,19 @@ def test_subtracted_stars_leave_noise_and_their_model_errors() -> None:
     assert joint_fit._subtracted(lit, nobody) is lit
 
 
+def test_stars_are_subtracted_from_pixels_inside_the_frame() -> None:
+    """Pixels of two stars lose the counts of both, and the squares of their model errors are added."""
+    signal, floor = np.full(4, 100.0, np.float32), np.full(4, 9.0, np.float32)
+    index, inside = np.array([[[1, 2]], [[2, 0]]]), np.array([[[True, True]], [[True, False]]])
+    images, light = np.array([[[0.1, 0.2]], [[0.3, 0.4]]], np.float32), np.array([10.0, 100.0])
+    arguments = signal, floor, (index, inside), images, light
+    assert_forms_agree(joint_fit._subtract, *arguments, relative=1e-6, compiled=False)
+    joint_fit._subtract(*arguments)
+    assert signal == pytest.approx(np.array([100.0, 99.0, 68.0, 100.0]))
+    error = joint_fit._SUBTRACTION_ERROR**2
+    assert floor == pytest.approx(9.0 + error * np.array([0.0, 1.0, 904.0, 0.0]))
+
+
 def test_the_brightest_stars_are_affordable_after_those_of_the_motion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

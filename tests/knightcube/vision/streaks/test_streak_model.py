@@ -96,9 +96,9 @@ def test_the_light_of_a_changing_rate_is_that_of_brute_force(growth: float, leng
 
 @pytest.mark.parametrize(("turn", "star"), _CASES)
 def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[float]) -> None:
-    """The derivatives agree with a sum over instants to 2 %.
+    """The derivatives agree with a sum over instants to 4 %.
 
-    An accuracy of 2 % is sufficient, because derivatives do not change the solution of the fit.
+    An accuracy of 4 % is sufficient, because derivatives do not change the solution of the fit.
     """
     motion, place = CameraMotion.steady(np.array(turn)), np.array(star)
     covered, _, changes = _modelled(motion, place, 1.0)
@@ -109,7 +109,7 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
         down = _brute(CameraMotion.steady(motion.rate - step[:3]), place - step[3:], 1.0)
         truth = ((up - down) / (2.0 * step[k]))[covered]
         found = changes[k if k < 3 else k + 3][covered]
-        assert np.linalg.norm(found - truth) < 0.02 * np.linalg.norm(truth)
+        assert np.linalg.norm(found - truth) < 0.04 * np.linalg.norm(truth)
 
 
 def test_strips_extend_beyond_both_ends_for_any_times() -> None:

@@ -301,7 +301,7 @@ def test_the_normal_equations_of_a_rotation_are_sums_over_the_lines_of_each_bin(
     scene = StreakScene(motion, 1.1, stars, light, np.zeros(2), np.ones(2, dtype=np.bool_))
     star = np.array([0, 1, 1])
     time = np.stack(
-        [np.linspace(-0.4, -0.1, LINES), np.linspace(-0.2, 0.1, LINES), np.linspace(0.1, 0.5, LINES)]
+        [np.linspace(-0.401, -0.1, LINES), np.linspace(-0.2, 0.11, LINES), np.linspace(0.101, 0.5, LINES)]
     )
     images = rng.normal(size=(3, 7, LINES, 4)).astype(np.float32) * np.float32(0.01)
     weight = rng.uniform(0.5, 2.0, (3, LINES, 4)).astype(np.float32)
