@@ -369,16 +369,16 @@ def _ideal_positions_numpy(view: _View, terms: _Terms, stars: FloatArray, time: 
 
 @compiled_form_of(_ideal_positions_numpy)
 def _ideal_positions(view: _View, terms: _Terms, stars: FloatArray, time: FloatArray) -> FloatArray:
-    out, (rate, acceleration, higher) = np.empty((2, len(time))), terms
+    out, (rate, acceleration, higher), places = np.empty((2, len(time))), terms, stars.T.copy()
     if len(higher) == 0 and _is_small(rate, acceleration, time):
         for m in range(len(time)):
             turn, w, change = _motion_at(rate, acceleration, time[m])
-            turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, stars, m))
+            turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, places, m))
             out[0, m], out[1, m], _, _, _, _ = _projected(view, turned, w, change)
     else:
         for m in range(len(time)):
             turn, w, change = _any_motion_at(rate, acceleration, higher, time[m])
-            turned = _turned(turn, _any_turn(_inner(turn, turn)), _direction(view, stars, m))
+            turned = _turned(turn, _any_turn(_inner(turn, turn)), _direction(view, places, m))
             out[0, m], out[1, m], _, _, _, _ = _projected(view, turned, w, change)
     return out.T
 
@@ -410,18 +410,18 @@ def _ideal_paths_numpy(
 def _ideal_paths(
     view: _View, terms: _Terms, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    out, (rate, acceleration, higher) = np.empty((6, len(time))), terms
+    out, (rate, acceleration, higher), places = np.empty((6, len(time))), terms, stars.T.copy()
     if len(higher) == 0 and _is_small(rate, acceleration, time):
         # The compiled form of the branch for small rotations uses the processor's vector instructions.
         for m in range(len(time)):
             turn, w, change = _motion_at(rate, acceleration, time[m])
-            turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, stars, m))
+            turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, places, m))
             point = _projected(view, turned, w, change)
             out[0, m], out[1, m], out[2, m], out[3, m], out[4, m], out[5, m] = point
     else:
         for m in range(len(time)):
             turn, w, change = _any_motion_at(rate, acceleration, higher, time[m])
-            turned = _turned(turn, _any_turn(_inner(turn, turn)), _direction(view, stars, m))
+            turned = _turned(turn, _any_turn(_inner(turn, turn)), _direction(view, places, m))
             point = _projected(view, turned, w, change)
             out[0, m], out[1, m], out[2, m], out[3, m], out[4, m], out[5, m] = point
     return out[0:2].T, out[2:4].T, out[4:6].T
@@ -469,13 +469,13 @@ def _ideal_sensitivities_numpy(
 def _ideal_sensitivities(
     view: _View, terms: _Terms, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray]:
-    focal, (rate, acceleration, higher) = view[0], terms
+    focal, (rate, acceleration, higher), places = view[0], terms, stars.T.copy()
     out, velocity = np.zeros((len(time), 2, 8)), np.empty((len(time), 2))
     for m in range(len(time)):
         t = time[m]
         turn, w, _ = _any_motion_at(rate, acceleration, higher, t)
         trig = _any_turn(_inner(turn, turn))
-        v = _turned(turn, trig, _direction(view, stars, m))
+        v = _turned(turn, trig, _direction(view, places, m))
         x, y = v[0] / v[2], v[1] / v[2]
         flow = (x * y, -1.0 - x * x, y), (1.0 + y * y, -x * y, -x)
         mean = _mean_rate(rate, acceleration, higher, t)
@@ -517,9 +517,9 @@ def _inner(a: _Vector, b: _Vector) -> float:
 
 
 @loop_helper
-def _direction(view: _View, stars: FloatArray, m: int) -> _Vector:
-    """Return the direction of the star with the index `m`, scaled to z = 1."""
-    return (stars[m, 0] - view[1]) * (1.0 / view[0]), (stars[m, 1] - view[2]) * (1.0 / view[0]), 1.0
+def _direction(view: _View, places: FloatArray, m: int) -> _Vector:
+    """Return the direction of the star at `places[:, m]`, scaled to z = 1."""
+    return (places[0, m] - view[1]) * (1.0 / view[0]), (places[1, m] - view[2]) * (1.0 / view[0]), 1.0
 
 
 @loop_helper
