@@ -171,30 +171,33 @@ def test_a_mistake_is_reported_with_exit_status_2(words: list[str], complaint: s
     assert "Traceback" not in done.stderr
 
 
-def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
-    """If the field of view is 5 % wrong, the nadir error stays within three standard deviations."""
-    facts = {}
-    for field, error in ((67.0, None), (67.0, 3.3), (70.3, 3.3)):
-        words = [] if error is None else ["--fov-error", str(error)]
-        done = command(
-            "horizon",
-            folder / "limb.png",
-            "--fov",
-            str(field),
-            *words,
-            *_response(),
-            "--altitude",
-            "600",
-            "--json",
+def test_an_uncertain_field_of_view_is_in_the_uncertainty(tmp_path: Path) -> None:
+    """A field of view that is 5 % wrong does no harm if its error is given, in frames of several seeds.
+
+    The nadir error then stays within three standard deviations, and is less than half the error without
+    `--fov-error`. The smaller standard deviation of the nadir grows with the additional unknown. The larger
+    one depends more on the residuals of the frame than on the number of unknowns.
+    """
+    errors, variances = [], []
+    for seed in (1, 2, 3):
+        pillow.fromarray(render(MODEL, SCENE, np.random.default_rng(seed))).save(tmp_path / "limb.png")
+        found = []
+        for field in (("67",), ("70.3",), ("70.3", "--fov-error", "3.3")):
+            words = ("--fov", *field, *_response(), "--altitude", "600", "--json")
+            done = command("horizon", tmp_path / "limb.png", *words)
+            assert done.returncode == 0, done.stderr
+            found.append(json.loads(done.stdout))
+        off = [np.subtract(each["nadir_camera"], nadir(SCENE)) for each in found]
+        spread, axes = zip(
+            *(np.linalg.eigh(np.array(each["covariance_rad2"])) for each in found), strict=True
         )
-        assert done.returncode == 0, done.stderr
-        facts[field, error] = json.loads(done.stdout)
+        assert np.all(np.abs(off[2] @ axes[2][:, 1:]) < 3.0 * np.sqrt(spread[2][1:]))
+        errors.append(np.linalg.norm(off[1:], axis=1))
+        variances.append(spread[2][1] / spread[0][1])
+    wrong, described = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert described < 0.5 * wrong
     # At a known altitude, the curvature of the limb determines the focal length well.
-    assert facts[67.0, 3.3]["sigma_deg"] > 1.1 * facts[67.0, None]["sigma_deg"]
-    for uncertain in (facts[67.0, 3.3], facts[70.3, 3.3]):
-        off = np.subtract(uncertain["nadir_camera"], facts[67.0, None]["nadir_camera"])
-        spread, axes = np.linalg.eigh(np.array(uncertain["covariance_rad2"]))
-        assert np.all(np.abs(off @ axes[:, 1:]) < 3.0 * np.sqrt(spread[1:]))
+    assert np.mean(variances) > 1.1
 
 
 @pytest.mark.parametrize(

@@ -66,16 +66,19 @@ def test_without_a_learned_profile_rings_give_no_rate(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("cycles", [40.0, 90.0])
 def test_a_fast_vibration_is_not_treated_as_a_ring(cycles: float) -> None:
-    """A vibration along a line widens streaks like a ring, but not at their ends: no rate, or a true one."""
+    """A vibration along a line widens streaks like a ring, but not at their ends: the frame gives no rate.
+
+    The residuals at the ends make the rate uncertain. A ring of this width gives a rate, as the test of a
+    defocused camera shows.
+    """
 
     def shake(times: FloatArray) -> FloatArray:
         return np.outer(3.0 * np.sin(2.0 * np.pi * cycles * times + 1.0), [0.6, 0.8])
 
     found = _found(None, 1, shake)
-    if found.rate is not None:
-        assert found.covariance is not None
-        error = found.rate - _RATE
-        assert error @ np.linalg.solve(found.covariance, error) < 4.0**2
+    assert found.rate is None
+    assert found.reason.startswith("the rate is uncertain by")
+    assert "or the point spread is" in found.reason
 
 
 def _scene(width: float = 1.4) -> StreakScene:
