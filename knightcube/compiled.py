@@ -34,6 +34,8 @@ Result = TypeVar("Result")
 _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 """LLVM options for functions that loop forms call: any order of sums, which permits vector instructions."""
+_UNWRAPPED = {"error_model": "numpy", "no_cfunc_wrapper": True}
+"""Options without a C wrapper, because only Python and other compiled forms call compiled forms."""
 _COMPILING = (
     "numba compiles the functions in use for this machine; this takes about a minute, once "
     f"({_SWITCH}=0 avoids it)"
@@ -95,13 +97,13 @@ class HotFunction(Generic[Parameters, Result]):
         _announce_compilation()
         # Without inlining, a process that compiles a helper would call another compiled form of it than the
         # processes that load the cache file, with sums in another order.
-        options = {"error_model": "numpy", "fastmath": _ANY_ORDER, "forceinline": True}
+        options = {**_UNWRAPPED, "no_cpython_wrapper": True, "fastmath": _ANY_ORDER, "forceinline": True}
         while _helpers:
             numba.extending.register_jitable(**options)(_helpers.pop())
         try:
-            return _typed(numba.njit(cache=True, error_model="numpy")(self.loop_form))
+            return _typed(numba.njit(cache=True, **_UNWRAPPED)(self.loop_form))
         except RuntimeError:  # no cache folder is writable
-            return _typed(numba.njit(error_model="numpy")(self.loop_form))
+            return _typed(numba.njit(**_UNWRAPPED)(self.loop_form))
 
 
 def compiled_form_of(

@@ -158,7 +158,9 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
     from tests.support.yamcs_operator import Operator  # noqa: PLC0415 - imports the client for a second
 
     (udp,), http = free_ports([socket.SOCK_DGRAM]), free_port()
-    config = write_linked_config(tmp_path, udp=f"127.0.0.1:{udp}", rate=1_000_000)
+    flown = tmp_path / "without_camera.yaml"
+    flown.write_text("extends: step_demo\ncamera: none\n", encoding="utf-8")
+    config = write_linked_config(tmp_path, base=flown, udp=f"127.0.0.1:{udp}", rate=1_000_000)
     out = tmp_path / "out"
     elements = tmp_path / "elements.txt"
     elements.write_text("\n".join(POLAR_ORBIT) + "\n", encoding="utf-8")
