@@ -17,6 +17,7 @@ slew is planned again on the fine grid.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -293,10 +294,12 @@ def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPla
     )
 
 
+@functools.lru_cache(maxsize=1)
 def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
     """Return the angles (cones, n), rad, from each cone to the camera axis at n closely spaced times.
 
-    The times cover the path. An angle is negative if the camera axis lies inside the cone.
+    The times cover the path. An angle is negative if the camera axis lies inside the cone. The newest result
+    is kept, because a plan and its check need the same angles.
     """
     dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
     shown = path.references(dense).quaternion
