@@ -131,8 +131,8 @@ def compiled_floats(function: Callable[Parameters, Result]) -> HotFunction[Param
 
 
 @compiled_floats
-def _nothing() -> None:
-    """Do nothing; the first call loads numba."""
+def _nothing(_: Any) -> None:
+    """Do nothing; the first call loads numba, and the modules that numba needs for arrays."""
 
 
 def load(*packages: str) -> None:
@@ -141,7 +141,7 @@ def load(*packages: str) -> None:
     Otherwise, the first call of a function would load its compiled form, which takes some milliseconds, and
     the first call of all functions would load numba, which takes half a second.
     """
-    _nothing()
+    _nothing(importlib.import_module("numpy").zeros(1))
     for function in _functions if in_use() else ():
         if function.__module__.startswith(packages):
             function.load()

@@ -105,11 +105,15 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     if not request.realtime:
         if request.devices is not None:
             raise UsageError("--devices: the devices of a server run in real time: give --realtime too")
-        # Otherwise, the first control cycles would load numba and the machine code of their functions.
-        compiled.load("flight.", "knightcube.gnc.")
         hardware = stack.enter_context(opened_lockstep(config, section, request.out))
         latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
-        return with_host_faults(hardware.rig(section.seed, latency), section)
+
+        def begin(epoch_ns: int) -> None:
+            # Otherwise, the first control cycles would load numba and the machine code of their functions.
+            compiled.load("flight.", "knightcube.gnc.")
+            hardware.release(epoch_ns)
+
+        return with_host_faults(replace(hardware.rig(section.seed, latency), release=begin), section)
     if request.devices is not None:
         served = stack.enter_context(running_server(request.devices))
     else:
