@@ -460,9 +460,11 @@ def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> 
     """
     if np.count_nonzero(at_least(pixels, saturation)) >= saturated_fraction * pixels.size:
         return FrameState.SATURATED
+    some, most = pixels[::8, ::8], _DEAD_FRACTION * pixels.size
     # A comparison in the integer type of the frame is four times as fast as in floating point.
-    usual = np.median(pixels[::8, ::8]).astype(pixels.dtype)
-    if np.count_nonzero(pixels != usual) <= _DEAD_FRACTION * pixels.size:
+    usual = np.median(some).astype(pixels.dtype)
+    # Most frames have more different pixels in the sample than a dead frame has in total.
+    if np.count_nonzero(some != usual) <= most and np.count_nonzero(pixels != usual) <= most:
         return FrameState.BLACK
     return FrameState.USABLE
 

@@ -350,17 +350,13 @@ def find_faint(
 
 def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
     """Return the 3 x 3 sums (rows * columns,) of the frame without modelled stars and bad pixels."""
-    pixels, light = modelled
+    pixels, light = (values[~frame.bad[modelled[0]]] for values in modelled)
     signal, floor = frame.signal[pixels], frame.floor[pixels]
     # Pixels with subtracted stars get a smaller weight, because their residuals are mostly photon noise.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
-    left = (signal - light) * share
-    left[frame.bad[pixels]] = 0.0
-    lost = frame.bad.copy()
-    lost[pixels] = False
-    unmodelled = np.flatnonzero(lost)
-    taken = np.concatenate([signal - left, frame.signal[unmodelled]])
-    return less_boxes(frame.sums, frame.shape, np.concatenate([pixels, unmodelled]), taken)
+    bad = np.flatnonzero(frame.bad)
+    taken = np.concatenate([signal - (signal - light) * share, frame.signal[bad]])
+    return less_boxes(frame.sums, frame.shape, np.concatenate([pixels, bad]), taken)
 
 
 def _less_boxes_numpy(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:

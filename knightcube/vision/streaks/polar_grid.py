@@ -6,6 +6,7 @@ straight and equally long. The matched filter of a streak is a running sum over 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -147,6 +148,16 @@ def _samples(
     return np.rint(samples, out=samples), inside
 
 
+@functools.lru_cache(maxsize=4)
+def _border(pinhole: Pinhole) -> FloatArray:
+    """Return unit vectors (n, 3) from the camera to points on the border of the detector."""
+    x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
+    sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
+    along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
+    down = np.concatenate([np.zeros_like(sides[0]), sides[1], np.full_like(sides[0], y), y - sides[1]])
+    return pinhole.unit_vectors(np.stack([along, down], axis=-1))
+
+
 def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> IntArray:
     """Return groups of circles with the range of azimuths in which they cross the detector.
 
@@ -154,11 +165,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> IntArray:
     last, the first azimuth, and the azimuth after the last. If the circles are complete, a margin of `room`
     samples is included on both sides of the detector.
     """
-    x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
-    sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
-    along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
-    down = np.concatenate([np.zeros_like(sides[0]), sides[1], np.full_like(sides[0], y), y - sides[1]])
-    local = pinhole.unit_vectors(np.stack([along, down], axis=-1)) @ grid.frame.T
+    local = _border(pinhole) @ grid.frame.T
     polar, azimuth = np.arccos(np.clip(local[:, 2], -1.0, 1.0)), np.arctan2(local[:, 1], local[:, 0])
     count, margin = len(grid.azimuth), _BORDER_STEP / pinhole.focal_length
     step = grid.azimuth[1] - grid.azimuth[0]
