@@ -8,11 +8,11 @@ excluded.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -43,7 +43,6 @@ class ReducedFrame:
         signal: counts of each pixel above the background.
         sums: sum of `signal` over the 3 x 3 pixels around each pixel.
         floor: noise variance of each pixel without a star, counts^2.
-        least_floor: lower limit of `floor`, counts^2.
         counts: raw counts.
         top: smallest raw counts at which a pixel is saturated.
         bad: mask of the saturated and hot pixels, which the fit excludes.
@@ -55,7 +54,6 @@ class ReducedFrame:
     signal: Float32Array
     sums: Float32Array
     floor: Float32Array
-    least_floor: float
     counts: Image
     top: float
     bad: BoolArray
@@ -79,11 +77,11 @@ def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> Reduce
     top, gain = (top - offset) / step, gain * step
     background = estimate_background(pixels)
     signal, floor = background.subtracted(pixels)
-    bad, least = at_least(pixels, top), float(background.noise.min()) ** 2
-    hot = find_hot_pixels(signal, floor, least)
+    bad = at_least(pixels, top)
+    hot = find_hot_pixels(signal, floor, float(background.noise.min()) ** 2)
     signal[hot] = 0.0
     bad[hot] = True
-    flat = signal.reshape(-1), box_sum(signal).reshape(-1), floor.reshape(-1), least, pixels.reshape(-1)
+    flat = signal.reshape(-1), box_sum(signal).reshape(-1), floor.reshape(-1), pixels.reshape(-1)
     return ReducedFrame((pixels.shape[0], pixels.shape[1]), *flat, top, bad.reshape(-1), gain, len(hot[0]))
 
 
@@ -124,7 +122,7 @@ class BrightRegions:
 
 def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> BrightRegions:
     """Return up to `most` of the brightest regions with 3 x 3 sums above `sigmas` standard deviations."""
-    pixel = _significant(frame.sums, frame.floor, frame.least_floor, 3.0 * sigmas)
+    pixel = _significant(frame.sums, frame.floor, 3.0 * sigmas)
     number, count = label_pixels(pixel, frame.shape[1])
     flux = _fluxes(pixel, number, count, frame.signal)
     chosen = np.argsort(-flux, kind="stable")[:most]
@@ -202,41 +200,45 @@ def _region_pixels(
     return owner[:count].copy(), column[:count].copy(), row[:count].copy(), light[:count].copy(), cut
 
 
-def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
+def _significant_numpy(sums: Float32Array, floor: Float32Array, threshold: float) -> IntArray:
     """Return the ascending indices of the pixels whose `sums` exceed `threshold` times their noise.
 
-    The noise of a pixel is the square root of its variance `floor`, counts^2, which is at least `least`.
+    The noise of a pixel is the square root of its variance `floor`, counts^2.
     """
-    pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(least)))
+    pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(floor.min())))
     return np.asarray(pixel[sums[pixel] > np.float32(threshold) * np.sqrt(floor[pixel])])
 
 
 @compiled_form_of(_significant_numpy)
-def _significant(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
-    """See `_significant_numpy`."""
-    found, count, lowest = np.empty(len(sums), np.int64), 0, np.float32(threshold * math.sqrt(least))
+def _significant(sums: Float32Array, floor: Float32Array, threshold: float) -> IntArray:
+    found, count = np.empty(len(sums), dtype=np.int64), 0
+    bright = np.zeros(_AT_ONCE, dtype=np.uint8)
+    groups = bright.view(np.uint64)
     for begin in range(0, len(sums), _AT_ONCE):
-        stop = min(begin + _AT_ONCE, len(sums))
-        # Most groups of pixels contain no bright pixel.
-        if _any_above(sums[begin:stop], lowest):
-            for k in range(begin, stop):
+        size = min(_AT_ONCE, len(sums) - begin)
+        _mark_bright(bright[:size], sums[begin : begin + size], floor[begin : begin + size], threshold)
+        for group in range((size + 7) // 8):
+            # Most groups of eight pixels contain no bright pixel.
+            if groups[group]:
                 # Each index is stored without a branch, because the processor could not predict a branch.
-                found[count] = k
-                count += (sums[k] > lowest) & (sums[k] > np.float32(threshold) * np.sqrt(floor[k]))
+                for k in range(8 * group, min(8 * group + 8, size)):
+                    found[count] = begin + k
+                    count += bright[k] > 0
     return found[:count].copy()
 
 
-# Number of pixels that are compared with the threshold in one step.
-_AT_ONCE = 32
+# Number of pixels that are compared with the threshold in one step, a multiple of eight.
+_AT_ONCE = 1024
 
 
 @loop_helper
-def _any_above(values: Float32Array, threshold: np.float32) -> bool:
-    """Return whether any of `values` (k,) exceeds the `threshold`; the count permits vector instructions."""
-    above = np.int32(0)
-    for k in range(len(values)):
-        above += np.int32(values[k] > threshold)
-    return bool(above > 0)
+def _mark_bright(
+    bright: npt.NDArray[np.uint8], sums: Float32Array, floor: Float32Array, threshold: float
+) -> None:
+    """Set `bright` (k,) to 1 for pixels whose `sums` exceed `threshold` times their noise, otherwise to 0."""
+    least = np.float32(threshold * threshold)
+    for k in range(len(bright)):
+        bright[k] = (sums[k] > np.float32(0.0)) & (sums[k] * sums[k] > least * floor[k])
 
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
@@ -318,8 +320,7 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     each = np.tile(response, (rows // 2 + 1, columns // 2 + 1))[:rows, :columns].astype(np.float32)
     signal = frame.signal.reshape(frame.shape) / each
     floor = (frame.floor / np.square(each).reshape(-1)).astype(np.float32)
-    sums, least = box_sum(signal).reshape(-1), float(floor.min())
-    return replace(frame, signal=signal.reshape(-1), sums=sums, floor=floor, least_floor=least)
+    return replace(frame, signal=signal.reshape(-1), sums=box_sum(signal).reshape(-1), floor=floor)
 
 
 _OwnedPixels = tuple[IntArray, IntArray, IntArray, FloatArray]

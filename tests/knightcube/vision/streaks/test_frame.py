@@ -35,7 +35,7 @@ def _frame(mask: np.ndarray) -> ReducedFrame:
     light += mask.reshape(-1) * np.arange(mask.size, dtype=np.float32) % 7
     nothing = np.zeros(mask.size, dtype=np.bool_)
     counts = np.zeros(mask.size, dtype=np.uint16)
-    return ReducedFrame(_SHAPE, light, light, np.ones_like(light), 1.0, counts, 4095.0, nothing, 1.0, 0)
+    return ReducedFrame(_SHAPE, light, light, np.ones_like(light), counts, 4095.0, nothing, 1.0, 0)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.35, 0.45, 0.7])
