@@ -73,14 +73,14 @@ def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: 
     """
     texts = Texts.read()
     old = {run: cache_folder(cache, commit, run.name, run.key) for run in (PICTURES, *runs)}
-    needed = dict.fromkeys(runs if all(run.flight for run in runs) else (PICTURES, *runs))
+    needed = dict.fromkeys((PICTURES, *runs) if any(run.reads_pictures for run in runs) else runs)
     missing = [run for run in needed if refresh or not old[run].is_dir()]
     pictures = old[PICTURES]
     with scratch() as temporary:
         checkout = temporary / "checkout"
         if missing:
             check_out(commit, checkout)
-        if PICTURES in missing:  # the other groups need the pictures
+        if PICTURES in missing:  # other groups read the pictures
             _timed(checkout, PICTURES, old[PICTURES], pictures)
         with ThreadPoolExecutor(AT_ONCE) as pool:
             first = [

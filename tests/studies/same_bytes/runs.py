@@ -79,6 +79,11 @@ class Run:
         """List of all values on which the results depend, apart from revision and machine."""
         return [_ASK, _DUMP_TABLE, self.commands, self.flight, self.changes]
 
+    @property
+    def reads_pictures(self) -> bool:
+        """Whether a command reads a picture of the group `PICTURES`."""
+        return any("pictures/" in command for command in self.commands)
+
 
 _DEMO, _THESIS = "config/step_demo.yaml", "config/step_thesis.yaml"
 
