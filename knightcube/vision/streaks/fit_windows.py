@@ -594,11 +594,18 @@ def at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float3
     """
     _, count, size = images.shape
     block, drawn = np.empty_like(crowded), np.empty((count - 1, len(crowded)), dtype=np.float32)
-    for e in range(len(crowded)):
-        block[e] = crowded[e] // size
-        of_block, place = images[block[e]], crowded[e] - block[e] * size
+    first = 0
+    while first < len(crowded):
+        b, last = crowded[first] // size, first
+        while last < len(crowded) and crowded[last] < (b + 1) * size:
+            last += 1
+        block[first:last] = b
+        places = crowded[first:last] - b * size
         for i in range(count - 1):
-            drawn[i, e] = of_block[i, place]
+            image, values = images[b, i], drawn[i, first:last]
+            for e in range(len(places)):
+                values[e] = image[places[e]]
+        first = last
     return block, drawn
 
 
