@@ -228,7 +228,8 @@ def _summits(flat: Float32Array, high: BoolArray, columns: int) -> IntArray:
         if not _any_set(high[begin:stop]):
             continue
         for k in range(begin, stop):
-            if not high[k] or flat[k] < flat[k - 1] or flat[k] < flat[(k + 1) % size]:
+            # Most running sums are lower than a neighbour on their circle.
+            if not high[k] or flat[k] < flat[k - 1] or (k + 1 < size and flat[k] < flat[k + 1]):
                 continue
             highest = True
             for down in range(-1, 2):
@@ -277,7 +278,7 @@ def _refined(values: Float32Array, row: IntArray, column: IntArray) -> tuple[Flo
 
 @loop_helper
 def _vertex(left: float, own: float, right: float) -> float:
-    """Return the place of the vertex of the parabola through values at -1, 0 and 1, limited to +-0.5."""
+    """Return the position of the vertex of the parabola through values at -1, 0 and 1, limited to +-0.5."""
     bend = left + right - 2.0 * own
     return min(max(0.5 * (left - right) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
 
