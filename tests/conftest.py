@@ -30,6 +30,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # are compared with the numpy implementations. With the numpy implementations, results equal recorded results
 # byte for byte, and programs that tests start do not load numba.
 os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
+# While numba compiles a function, it formats messages of rejected overloads that nobody reads.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 # No test may fail because the machine is busy, or because hypothesis draws a rare example in one of many
 # runs. All runs use the same examples, so a larger number of examples would slow each run without new
