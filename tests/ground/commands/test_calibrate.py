@@ -32,15 +32,23 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def calibrated(pictures: list[Path]) -> tuple[dict[str, Any], Path]:
+    """Return the JSON object of a calibration with an inaccurate field of view, and its camera file."""
+    out = pictures[0].with_name("camera.yaml")
+    done = command("calibrate", *pictures, "--fov", "12.3", "--out", out, "--json")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), out
+
+
+def test_the_lens_found_is_the_one_that_took_the_pictures(
+    pictures: list[Path], calibrated: tuple[dict[str, Any], Path]
+) -> None:
     """The calibration finds the lens of the simulated camera, which has no distortion and a centred axis.
 
     All fitted values must lie within five standard deviations of the truth.
     """
-    out = tmp_path / "camera.yaml"
-    done = command("calibrate", *pictures, "--fov", "12.3", "--out", out, "--json")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
+    facts, out = calibrated
     truth = {"focal_length": NARROW.pinhole.focal_length, "k1": 0.0, "k2": 0.0}
     for name, value in truth.items():
         assert abs(facts[name] - value) < 5.0 * facts["sigma"][name], name
@@ -66,11 +74,9 @@ def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path]
     assert load_camera(out).lens.k2 == 0.0  # type: ignore[union-attr]  # it has just been written
 
 
-def test_a_camera_file_says_how_well_the_lens_is_known(pictures: list[Path], tmp_path: Path) -> None:
+def test_a_camera_file_says_how_well_the_lens_is_known(calibrated: tuple[dict[str, Any], Path]) -> None:
     """`knightcube rate` uses the uncertainty of the focal length in the camera file."""
-    out = tmp_path / "camera.yaml"
-    done = command("calibrate", *pictures, "--fov", "12", "--out", out, "--json")
-    facts = json.loads(done.stdout)
+    facts, out = calibrated
     accuracy = load_camera(out).accuracy
     assert accuracy.focal_length == pytest.approx(facts["accuracy"]["focal_length"], rel=1e-2)
     least = facts["sigma"]["focal_length"] / facts["focal_length"]
