@@ -306,9 +306,13 @@ def _judged(done: StreakFit, guess: MotionGuess, ends: float) -> tuple[float, bo
 
 
 def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
-    """Return a preliminary fit that includes a vibration, or None if the residuals show no vibration."""
+    """Return a preliminary fit that includes a vibration, or None if the residuals show no vibration.
+
+    The fit is as precise as the last one, because residuals of bright stars would look like faint stars.
+    """
+    limits = replace(FIRST, tolerance=LAST.tolerance)
     return fit_vibration(
-        camera, fit, lambda scene: iterate(camera, scene, camera.free, FIRST, camera.windows(scene))
+        camera, fit, lambda scene: iterate(camera, scene, camera.free, limits, camera.windows(scene))
     )
 
 

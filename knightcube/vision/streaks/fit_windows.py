@@ -79,6 +79,11 @@ class Strips:
     index: IntArray
     inside: BoolArray
 
+    def select(self, blocks: IntArray | slice) -> Strips:
+        """Return the strips with only some of the `blocks`."""
+        at_lines = self.time[blocks], self.corner[blocks], self.step[blocks]
+        return Strips(self.star[blocks], *at_lines, self.index[blocks], self.inside[blocks])
+
 
 def cut_strips(
     pinhole: Pinhole,

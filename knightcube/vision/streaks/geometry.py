@@ -73,9 +73,10 @@ class Vibration:
 class CameraMotion:
     """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
-    The vibration is added to the smooth motion, which is described by its rate (3,), rad per exposure, and
-    angular acceleration (3,) at mid-exposure, and by the known coefficients `higher_terms` (k, 3), rad, of
-    t^3, t^4, ... in the rotation vector.
+    The vibration turns the camera after the smooth motion, about axes that are fixed in the camera. The
+    smooth motion is described by its rate (3,), rad per exposure, and angular acceleration (3,) at
+    mid-exposure, and by the known coefficients `higher_terms` (k, 3), rad, of t^3, t^4, ... in the rotation
+    vector.
     """
 
     rate: FloatArray
@@ -128,7 +129,11 @@ class CameraMotion:
     @property
     def rotation(self) -> FloatArray:
         """The rotation vector (3,), rad, from start to end of the exposure."""
-        return np.asarray(self.rate + self.higher(np.array([-0.5, 0.5])) @ np.array([-1.0, 1.0]))
+        rotation = self.rate + self.smooth.higher(_ENDS) @ np.array([-1.0, 1.0])
+        if self.vibration.exists:
+            before, after = self.vibration.rotation(_ENDS).T
+            rotation = rotation + after - before + 0.5 * np.cross(rotation, before + after)
+        return np.asarray(rotation)
 
     @property
     def halfway(self) -> FloatArray:
@@ -155,9 +160,12 @@ class CameraMotion:
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the higher-order terms and vibration (3, m) of the rotation vector, or a derivative."""
+        """Return the higher-order terms and vibration (3, m) of the rotation vector, or a derivative.
+
+        The contribution of the vibration is correct to second order in the rotation.
+        """
         if self.vibration.exists:
-            return self.smooth.higher(time, derivative) + self.vibration.rotation(time, derivative)
+            return self.smooth.higher(time, derivative) + self._shaken(time)[derivative]
         out = np.zeros((3, len(time)))
         if not len(self.higher_terms):
             return out
@@ -168,7 +176,19 @@ class CameraMotion:
             out = coefficient[:, None] + time * out
         return out * (time * time * time, time * time, time)[derivative]
 
+    def _shaken(self, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the vibration's part (3, m) of the rotation vector at `time` (m,), and two derivatives."""
+        smooth, acceleration = self.smooth, self.acceleration[:, None]
+        turn = self.rate[:, None] * time + 0.5 * acceleration * time**2 + smooth.higher(time)
+        rate, bent = _rate(smooth, time) + 0.0 * turn, acceleration + smooth.higher(time, 2)
+        v, faster, pulled = (self.vibration.rotation(time, order) for order in range(3))
+        first = _cross(rate, v) + _cross(turn, faster)
+        second = _cross(bent, v) + 2.0 * _cross(rate, faster) + _cross(turn, pulled)
+        return v + 0.5 * _cross(turn, v), faster + 0.5 * first, pulled + 0.5 * second
 
+
+# Start and end of the exposure, in exposure times since mid-exposure.
+_ENDS = np.array([-0.5, 0.5])
 # Number of iterations for the inversion of the distortion, which is about 1 % of the image radius.
 _INVERSIONS = 6
 

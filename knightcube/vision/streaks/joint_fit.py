@@ -50,12 +50,15 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.scene_images import light_images, light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
+from knightcube.vision.streaks.vibrating_streaks import mean_paths
 
 # Number of processed pixels per frame after which no further motion is fitted.
 # A fit in progress is completed, so that the number of processed pixels can reach twice this limit.
 _MOST_WORK = 2_000_000
 # Fixed work of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
+# Ratio of the work per pixel in an evaluation with a vibration to the work per pixel without one.
+_VIBRATING = 6
 # Ratio of the work per pixel in a pass over the frame to the work per pixel in a model evaluation.
 _PASS = 0.15
 
@@ -167,11 +170,13 @@ class FitProblem:
 
     def windows(self, scene: StreakScene) -> FitWindows:
         """Return the fit windows, which contain the pixels near the streaks of `scene`."""
-        return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
+        mean = mean_paths(self.pinhole, scene)
+        return cut_windows(self.frame, self.pinhole, self.shutter, mean, self.settings.reach)
 
     def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
         """Return the normal equations for `scene`, see `normal_equations.evaluate`."""
-        self.work.evaluated(len(windows.slot) * len(scene.profile.widths))
+        times = _VIBRATING if scene.motion.vibration.exists else 1
+        self.work.evaluated(len(windows.slot) * len(scene.profile.widths) * times)
         growth = self.growing or (self.undecided and clip > 0.0)
         return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
 

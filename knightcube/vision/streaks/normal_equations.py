@@ -26,7 +26,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks import streak_model, vibrating_streaks
 from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows, at_pixels
 from knightcube.vision.streaks.frame import MEDIAN_ERROR
 from knightcube.vision.streaks.geometry import Shutter, StreakScene
@@ -122,7 +122,8 @@ def evaluate(
     sums = np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n)
     out = Evaluation(*sums, [], windows.shared, [])
     long = scene.stars[windows.long]
-    geometry = streak_model.coefficients(pinhole, scene.motion, shutter, long, strips, growing)
+    model = vibrating_streaks if scene.motion.vibration.exists else streak_model
+    geometry = model.coefficients(pinhole, scene.motion, shutter, long, strips, growing)
     matrix = _matrices(geometry, scene.light[of_block], scene.trusted[of_block])
     _add(out, of_block, windows.on_strips, images, matrix, total, clip)
     if not len(windows.spot):

@@ -12,15 +12,16 @@ import numpy as np
 
 from knightcube.astro.arrays import Float32Array, FloatArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks import streak_model, vibrating_streaks
 from knightcube.vision.streaks.fit_windows import FitWindows, StarPixels
 from knightcube.vision.streaks.geometry import GAUSSIAN, Shutter, StreakScene
 
 ModelImages = tuple[Float32Array, FloatArray, FloatArray]
 """Images that are combined to model long streaks, images of spots, and the derivatives of these images."""
 
-# Number of images of a streak that depend on the PSF, and index of the derivative with respect to the width.
-_OF_PSF, _BY_WIDTH = 6, 5
+# Index of the image of the sky level, which alone does not depend on the PSF, and of the derivative with
+# respect to the width.
+_SKY, _BY_WIDTH = 6, 5
 # Index of the derivative with respect to the width among the derivatives of a spot.
 _SPOT_BY_WIDTH = 8
 
@@ -50,7 +51,11 @@ def light_images(
     camera, long, spot = (pinhole, scene.motion, shutter), pixels.long, pixels.spot
     streaks, spots = [], []
     for part in _gaussian_scenes(scene):
-        streaks.append(streak_model.images(*camera, scene.stars[long], part.width, pixels.strips, 1))
+        if scene.motion.vibration.exists:
+            whole = vibrating_streaks.images(*camera, scene.stars[long], part.width, pixels.strips)
+            streaks.append(whole[:, :1])
+        else:
+            streaks.append(streak_model.images(*camera, scene.stars[long], part.width, pixels.strips, 1))
         spots.append(streak_model.spot_derivatives(*camera, scene.stars[spot], part.sigma, pixels.patches)[0])
     if scene.profile == GAUSSIAN:
         return streaks[0], spots[0]
@@ -69,7 +74,8 @@ def model_images(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows
     scaled = [_share(scene, *each, share) for each, share in zip(parts, scene.profile.shares, strict=True)]
     images, spots, change = scaled[0]
     for other in scaled[1:]:
-        images[:, :_OF_PSF] += other[0][:, :_OF_PSF]
+        for of_psf in (slice(_SKY), slice(_SKY + 1, -1)):
+            images[:, of_psf] += other[0][:, of_psf]
         spots += other[1]
         change += other[2]
     return images, spots, change
@@ -81,7 +87,8 @@ def _share(scene: StreakScene, part: StreakScene, images: ModelImages, share: fl
     A change of the scene's width changes the widths of all Gaussians in proportion.
     """
     streaks, spots, change = images
-    streaks[:, :_OF_PSF] *= np.float32(share)
+    streaks[:, :_SKY] *= np.float32(share)
+    streaks[:, _SKY + 1 : -1] *= np.float32(share)
     streaks[:, _BY_WIDTH] *= np.float32(part.width / scene.width)
     change[:, _SPOT_BY_WIDTH] *= (part.width / scene.width) ** 2 * scene.sigma / part.sigma
     return streaks, share * spots, share * change
@@ -92,7 +99,8 @@ def _gaussian_images(
 ) -> ModelImages:
     """Return the result of `model_images` for a Gaussian PSF of the width of the `scene`."""
     camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
-    images = streak_model.images(*camera, scene.stars[long], scene.width, windows.strips)
+    model = vibrating_streaks if scene.motion.vibration.exists else streak_model
+    images = model.images(*camera, scene.stars[long], scene.width, windows.strips)
     spots = streak_model.spot_derivatives(*camera, scene.stars[spot], scene.sigma, windows.patches)
     return images, *spots
 

@@ -98,8 +98,8 @@ def spot_derivatives(
     repeated = np.repeat(stars, instants, axis=0)
     place = positions(pinhole, motion, repeated, time.reshape(-1)).reshape(count, instants, 2)
     change = sensitivities(pinhole, motion, repeated, time.reshape(-1)).reshape(count, instants, 2, 8)
-    x, dx, sx = _profile(patches.column, place[..., 0], sigma)
-    y, dy, sy = _profile(patches.row, place[..., 1], sigma)
+    x, dx, sx = profile(patches.column, place[..., 0], sigma)
+    y, dy, sy = profile(patches.row, place[..., 1], sigma)
     y, dy, sy = (weight[..., None] * part for part in (y, dy, sy))
     down = y.swapaxes(1, 2)
     light = down @ x
@@ -145,7 +145,7 @@ def _pieces(
     return out
 
 
-def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the fractions (n, m, p) of the flux on p columns or rows of pixels, and two derivatives.
 
     Each of m Gaussians of standard deviation `sigma` (px) is centred on its `place` (n, m), in px along one

@@ -6,8 +6,9 @@ functions of time. The vibration is modelled as a sum of few sinusoids of the ca
 initial value of each frequency is the trial frequency that decreases chi-square most. Gauss-Newton steps
 improve frequencies and amplitudes, and the motion and the stars are fitted again between the steps.
 
-In one time bin, the residuals depend linearly on 12 numbers: the rotation vector, its time derivative, and
-the rotation vectors at the start and the end of the exposure, which move the ends of the streaks.
+In the search for a frequency, the residuals in one time bin depend linearly on 12 numbers: the rotation
+vector, its time derivative, and the rotation vectors at the start and the end of the exposure, which move the
+ends of the streaks. The Gauss-Newton steps use the derivatives of `vibrating_streaks`.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ import numpy.typing as npt
 
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.vision.streaks.fit_windows import LINES, SLOWEST
+from knightcube.vision.streaks import vibrating_streaks
+from knightcube.vision.streaks.fit_windows import LINES, SLOWEST, Strips
 from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
 from knightcube.vision.streaks.normal_equations import Pixels, residuals
 from knightcube.vision.streaks.scene_images import model_images
+from knightcube.vision.streaks.vibrating_streaks import Rotations
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
@@ -42,6 +45,7 @@ class StreakResiduals:
     """Residuals of the streaks that determine the motion, on b blocks of pixels.
 
     Attributes:
+        strips: pixels of the blocks.
         star: index in the scene of the star of each block (b,).
         time: time at which the star crosses each line of pixels (b, LINES), in exposure times since
             mid-exposure.
@@ -50,11 +54,19 @@ class StreakResiduals:
         residual: measured minus modelled counts of each pixel (b, LINES, k).
     """
 
+    strips: Strips
     star: IntArray
     time: FloatArray
     images: Float32Array
     weight: Float32Array
     residual: Float32Array
+
+    def trust(self, stars: int) -> FloatArray:
+        """Return the weight (n,) of each star, which is limited by the scatter of its residuals."""
+        squares = np.sum(self.weight * self.residual * self.residual, axis=(1, 2), dtype=np.float64)
+        used = np.count_nonzero(self.weight, axis=(1, 2))
+        scatter = np.bincount(self.star, squares, stars) / np.maximum(np.bincount(self.star, used, stars), 1)
+        return np.asarray(1.0 / np.maximum(scatter, 1.0))
 
     @functools.cached_property
     def line_sums(self) -> LineSums:
@@ -146,7 +158,8 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
     star, gain = of_block[chosen], float(view.gain)
     weight, residual = _chosen_residuals(images, scene.light[star], chosen, total, pixels, gain)
     images = images if len(chosen) == len(images) else images[chosen]
-    return StreakResiduals(star, windows.strips.time[chosen], images, weight, residual)
+    strips = windows.strips.select(chosen)
+    return StreakResiduals(strips, star, strips.time, images, weight, residual)
 
 
 def _chosen_residuals_numpy(
@@ -283,13 +296,13 @@ _USUAL, _LOOSE = 1.0, 10.0
 # Lowest frequency of a vibration, and step between trial frequencies, in cycles per exposure.
 _LOWEST, _GRID = 0.75, 0.2
 # Shortest fitted wavelength of a vibration along the streaks, in point-spread widths.
-_SHORTEST_WAVE = 6.0
+_SHORTEST_WAVE = 4.0
 # Limits of the wavelength of an unresolved vibration along the streaks, in point-spread widths.
 _UNRESOLVED = (2.2, 6.0)
 # Number of samples of the spectrum of the residuals.
 _SPECTRUM = 4096
-# Minimum decrease of chi-square by a sinusoid.
-_LEAST_GAIN = 60.0
+# Minimum decrease of chi-square by a sinusoid, and the same as a fraction of the excess chi-square.
+_LEAST_GAIN, _LEAST_SHARE = 60.0, 0.2
 # Maximum number of sinusoids, and minimum difference (cycles per exposure) between their frequencies.
 _MOST_SINUSOIDS, _LEAST_APART = 2, 1.0
 # Maximum number of Gauss-Newton steps, and displacement (px) by one step below which the fit has converged.
@@ -298,8 +311,10 @@ _MOST_STEPS, _CONVERGED = 4, 0.02
 _MOST_DETUNED = 0.3
 # Largest accepted amplitude of a vibration, px.
 _LARGEST = 2.5
-# Ratio of the rotation's error to the loss of amplitude by averaging over the point spread function.
-_LOST_SHARE = 2.0
+# Error of the streak ends due to motions other than the sinusoids, as a fraction of their amplitudes.
+_MODEL_ERROR = 0.02
+# Instants at which the changes of a vibration are compared, in exposure times since mid-exposure.
+_SAMPLES = np.linspace(-0.5, 0.5, 257)
 # Start and end of the exposure, relative to mid-exposure and in units of the exposure time.
 _ENDS = np.array([-0.5, 0.5])
 
@@ -313,30 +328,53 @@ def fit_vibration(
     succeed. If `fit` already includes a vibration, this vibration is improved. Returns None also if the
     vibration is too large.
     """
-    while True:
-        vibration = fit.scene.motion.vibration
-        for _ in range(_MOST_STEPS if vibration.exists else 0):
-            sums = _rotation_sums(camera, fit.scene, residuals_of_fit(camera, fit))
-            after, _ = _improved(sums, vibration)
-            moved = np.abs(after.rotation(sums.time) - vibration.rotation(sums.time)).max()
-            vibration = after
-            once_more = again(replace(fit.scene, motion=replace(fit.scene.motion, vibration=vibration)))
-            if once_more is None:
-                return None
-            fit = once_more
-            if moved * camera.pinhole.focal_length < _CONVERGED:
-                break
-        if np.any(vibration.amplitude * camera.pinhole.focal_length > _LARGEST):
-            return None
-        if len(vibration.frequency) == _MOST_SINUSOIDS:
-            return fit
-        sums = _rotation_sums(camera, fit.scene, residuals_of_fit(camera, fit))
-        highest = _median_length(camera, fit.scene) / (_SHORTEST_WAVE * fit.scene.width)
+    best = _converged(camera, fit, again) if fit.scene.motion.vibration.exists else fit
+    if best is None or _too_large(camera, best):
+        return None
+    while len(best.scene.motion.vibration.frequency) < _MOST_SINUSOIDS:
+        vibration = best.scene.motion.vibration
+        sums = _rotation_sums(camera, best.scene, residuals_of_fit(camera, best))
+        highest = _median_length(camera, best.scene) / (_SHORTEST_WAVE * best.scene.width)
         frequency = _strongest_frequency(sums, vibration, highest)
         if frequency is None:
-            return fit if vibration.exists else None
-        motion = replace(fit.scene.motion, vibration=vibration.with_frequency(frequency))
-        fit = replace(fit, scene=replace(fit.scene, motion=motion))
+            break
+        motion = replace(best.scene.motion, vibration=vibration.with_frequency(frequency))
+        more = _converged(camera, replace(best, scene=replace(best.scene, motion=motion)), again)
+        if more is None or _too_large(camera, more):
+            break
+        gain = _excess(best) - _excess(more)
+        if gain < max(_LEAST_GAIN, _LEAST_SHARE * _excess(best)):
+            break
+        best = more
+    return best if best.scene.motion.vibration.exists else None
+
+
+def _converged(
+    camera: FitProblem, fit: StreakFit, again: Callable[[StreakScene], StreakFit | None]
+) -> StreakFit | None:
+    """Return `fit` after steps of its vibration, each followed by a fit of motion and stars, or None."""
+    before = _excess(fit)
+    for turn in range(_MOST_STEPS):
+        vibration = fit.scene.motion.vibration
+        after, _ = _improved(camera, fit.scene, residuals_of_fit(camera, fit))
+        moved = np.abs(after.rotation(_SAMPLES) - vibration.rotation(_SAMPLES)).max()
+        once_more = again(replace(fit.scene, motion=replace(fit.scene.motion, vibration=after)))
+        if once_more is None:
+            return None
+        fit = once_more
+        if moved * camera.pinhole.focal_length < _CONVERGED or (turn and _excess(fit) >= before):
+            break
+    return fit
+
+
+def _excess(fit: StreakFit) -> float:
+    """Return chi-square minus the number of pixels of the fit before its last step."""
+    return float(np.sum(fit.evaluation.chi2 - fit.evaluation.pixels))
+
+
+def _too_large(camera: FitProblem, fit: StreakFit) -> bool:
+    """Return whether the amplitude of a sinusoid of the fitted vibration exceeds its limit."""
+    return bool(np.any(fit.scene.motion.vibration.amplitude * camera.pinhole.focal_length > _LARGEST))
 
 
 def vibration_covariance(
@@ -344,13 +382,9 @@ def vibration_covariance(
 ) -> tuple[FloatArray, float]:
     """Return the covariance (3, 3), rad^2, that vibrations add, and the amplitude of an unresolved one, rad.
 
-    The covariance applies to the rotation over the exposure.
-
-    The point spread function averages a vibration whose wavelength along the streaks is short. The model of
-    the streaks neglects this averaging, so that the fitted amplitudes are too small. The covariance includes
-    the corresponding error of the streak ends. The covariance also includes the displacement of the streak
-    ends by a fast vibration that is not fitted but is significant in the spectrum of the residuals. The
-    amplitude of this fast vibration is 0 if none is significant.
+    The covariance applies to the rotation over the exposure. It includes the displacement of the streak ends
+    by a fast vibration that is not fitted but is significant in the spectrum of the residuals. The amplitude
+    of this fast vibration is 0 if none is significant.
     """
     vibration = scene.motion.vibration
     if not len(left.star):
@@ -362,10 +396,8 @@ def vibration_covariance(
     fast = amplitude**2 * np.eye(3)
     if not vibration.exists:
         return fast, amplitude
-    kept = _kept_share(vibration.frequency, length / scene.width)
-    lost = np.maximum(_LOST_SHARE * (1.0 - kept), 1.0 / kept - 1.0)
-    added = _improved(sums, vibration)[1] + np.eye(3) * float(np.sum((lost * vibration.amplitude) ** 2))
-    return fast + added, amplitude
+    unmodelled = float(np.sum((_MODEL_ERROR * vibration.amplitude) ** 2))
+    return fast + _improved(camera, scene, left)[1] + unmodelled * np.eye(3), amplitude
 
 
 def _kept_share(frequency: FloatArray, length: float) -> FloatArray:
@@ -529,17 +561,6 @@ def _waves(frequency: FloatArray, time: FloatArray) -> FloatArray:
     return _functions(np.concatenate([sine, cosine - 1.0]), np.concatenate([w * cosine, -w * sine]), at_ends)
 
 
-def _detuned_waves(frequency: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivatives (2k, b, 4) of `_waves` with respect to the frequency."""
-    w, t = 2.0 * np.pi * frequency[:, None], 2.0 * np.pi * time
-    ends = 2.0 * np.pi * _ENDS
-    sine, cosine = np.sin(w * time), np.cos(w * time)
-    slopes = [cosine - w * time * sine, -(sine + w * time * cosine)]
-    at_ends = np.concatenate([ends * np.cos(w * _ENDS), -ends * np.sin(w * _ENDS)])
-    values = np.concatenate([t * cosine, -t * sine])
-    return _functions(values, 2.0 * np.pi * np.concatenate(slopes), at_ends)
-
-
 def _precisions(focal_length: float, sinusoids: int) -> FloatArray:
     """Return the inverse prior variances, 1/rad^2, of the coefficients of powers and sinusoids."""
     return np.repeat([(focal_length / _LOOSE) ** 2, (focal_length / _USUAL) ** 2], [9, 6 * sinusoids])
@@ -573,35 +594,79 @@ def _solved(matrix: FloatArray, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return np.asarray(np.linalg.pinv(matrix) @ right)
 
 
-def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, FloatArray]:
+def _improved(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> tuple[Vibration, FloatArray]:
     """Return the vibration after a Gauss-Newton step, and the covariance (3, 3), rad^2, that it adds.
 
-    The vibration adds this covariance to the rotation over the exposure. Errors of position, rate and
-    acceleration common to all stars are estimated together with the vibration.
+    The vibration adds this covariance to the rotation over the exposure. Errors of rate, acceleration and
+    point-spread width, and of all stars, are estimated together with the vibration.
     """
-    k, time = len(vibration.frequency), sums.time
-    functions = [_powers(time), _waves(vibration.frequency, time), _detuned_waves(vibration.frequency, time)]
-    information, score = sums.normal_equations(np.concatenate(functions))
-    n = 9 + 6 * k
-    # The last k parameters are the changes of the frequencies, scaled by the previous amplitudes.
-    chosen = np.zeros((len(score), n + k))
-    chosen[:n, :n] = np.eye(n)
+    vibration = scene.motion.vibration
+    k = len(vibration.frequency)
+    information, score = _normal_equations(camera, scene, left)
+    smooth, loose = 7, (camera.pinhole.focal_length / _LOOSE) ** 2
+    usual = np.full(6 * k, (camera.pinhole.focal_length / _USUAL) ** 2)
+    prior = np.concatenate([np.full(6, loose), [1.0], usual, np.full(k, _MOST_DETUNED**-2)])
     amplitudes = np.stack([vibration.sine, vibration.cosine])
-    for index in range(k):
-        only = amplitudes * (np.arange(k) == index)[:, None]
-        chosen[n:, n + index] = only.reshape(-1)
-    prior = np.append(_precisions(sums.focal_length, k), np.full(k, _MOST_DETUNED**-2))
-    mean = np.concatenate([np.zeros(9), amplitudes.reshape(-1), np.zeros(k)])
-    matrix = chosen.T @ information @ chosen + np.diag(prior)
-    step = _solved(matrix, chosen.T @ score - prior * mean)
-    sine, cosine = amplitudes + step[9:n].reshape(2, k, 3)
-    detuned = np.clip(step[n:], -_MOST_DETUNED, _MOST_DETUNED)
-    # The derivative of the rotation over the exposure with respect to each parameter.
-    over = np.concatenate(functions)[:, 0, 2:] @ np.array([-1.0, 1.0])
-    rotation = np.kron(over, np.eye(3)) @ chosen
-    total = rotation @ _solved(matrix, rotation.T)
-    without = _solved(matrix[:9, :9], np.eye(9))[3:6, 3:6]
-    size, axes = np.linalg.eigh(total - without)
-    added = axes * np.maximum(size, 0.0) @ axes.T
+    mean = np.concatenate([np.zeros(smooth), amplitudes.reshape(-1), np.zeros(k)])
+    matrix = information + np.diag(prior)
+    step = _solved(matrix, score - prior * mean)
+    sine, cosine = amplitudes + step[smooth : smooth + 6 * k].reshape(2, k, 3)
+    detuned = np.clip(step[smooth + 6 * k :], -_MOST_DETUNED, _MOST_DETUNED)
     frequency = np.maximum(vibration.frequency + detuned, _LOWEST)
-    return Vibration(frequency, sine, cosine), np.asarray(added)
+    # The derivative of the rotation over the exposure with respect to each parameter except the width.
+    begin, end = _rotations(vibration)(_ENDS).transpose(2, 1, 0)
+    rotation = np.insert(end - begin, smooth - 1, 0.0, axis=1)
+    total = rotation @ _solved(matrix, rotation.T)
+    without = _solved(matrix[:smooth, :smooth], np.eye(smooth))[:3, :3]
+    size, axes = np.linalg.eigh(total - without)
+    return Vibration(frequency, sine, cosine), np.asarray(axes * np.maximum(size, 0.0) @ axes.T)
+
+
+def _rotations(vibration: Vibration) -> Rotations:
+    """Return the rotations by a change of rate, of acceleration, and of each parameter of a `vibration`.
+
+    The parameters of k sinusoids are the amplitudes of the sines (k, 3) and of the cosines (k, 3), and the
+    frequencies (k,).
+    """
+    axes, angular = np.eye(3)[None, :, :, None], 2.0 * np.pi * vibration.frequency[:, None]
+
+    def at(time: FloatArray) -> FloatArray:
+        sine, cosine = np.sin(angular * time), np.cos(angular * time)
+        functions = np.concatenate([[time, time**2], sine, cosine - 1.0])
+        detuned = vibration.sine[..., None] * cosine[:, None] - vibration.cosine[..., None] * sine[:, None]
+        along_axes = (functions[:, None, None] * axes).reshape(-1, 3, len(time))
+        return np.concatenate([along_axes, 2.0 * np.pi * time * detuned])
+
+    return at
+
+
+def _normal_equations(
+    camera: FitProblem, scene: StreakScene, left: StreakResiduals
+) -> tuple[FloatArray, FloatArray]:
+    """Return information (p, p) and gradient (p,) of the p parameters that all stars share.
+
+    The parameters are those of `_rotations`, with the point-spread width after rate and acceleration. The
+    position, the flux and the sky level of each star are eliminated. The weight of a star is limited by the
+    scatter of its residuals, which includes model errors.
+    """
+    star, light = left.star, scene.light[left.star, None, None, None]
+    strips, rotations = replace(left.strips, star=star), _rotations(scene.motion.vibration)
+    images = vibrating_streaks.derivatives(
+        camera.pinhole, scene.motion, camera.shutter, scene.stars, scene.width, strips, rotations
+    )
+    shared, position = images[:, :-2], images[:, -2:]
+    by_width = left.images[:, None, 5]
+    design = light * np.concatenate([shared[:, :6], by_width, shared[:, 6:], position], axis=1)
+    design = np.concatenate([design, left.images[:, [0, 6]]], axis=1)
+    blocks, size = design.shape[:2]
+    design, weight = design.reshape(blocks, size, -1), left.weight.reshape(blocks, 1, -1)
+    weighted = design * weight
+    first = np.flatnonzero(np.diff(star, prepend=-1))
+    gram = np.add.reduceat(weighted @ design.swapaxes(1, 2), first)
+    score = np.add.reduceat(np.einsum("bqp,bp->bq", weighted, left.residual.reshape(blocks, -1)), first)
+    own = slice(size - 4, size)
+    gain = np.stack([_solved(each[own, own], each[own, : size - 4]) for each in gram])
+    information = gram[:, : size - 4, : size - 4] - gram[:, : size - 4, own] @ gain
+    gradient = score[:, : size - 4] - np.einsum("sop,so->sp", gain, score[:, own])
+    trust = left.trust(len(scene.stars))[star[first]]
+    return np.einsum("s,spq->pq", trust, information), trust @ gradient
