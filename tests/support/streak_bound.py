@@ -20,7 +20,8 @@ from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.geometry import CameraMotion, paths, sensitivities
+from knightcube.vision.streaks.camera_motion import CameraMotion
+from knightcube.vision.streaks.geometry import paths, sensitivities
 
 # Number of parameters that stars share: rotation (3) and point spread. Each star also has position (2),
 # electrons and background as parameters.

@@ -27,10 +27,10 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import StreakVerdict, with_rate, with_stars
 from knightcube.vision.streaks.frame import ReducedFrame, reduce_frame
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     Shutter,
     StreakScene,
     azimuth_differences,

@@ -27,6 +27,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.frame import saturation_count
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
 from knightcube.vision.streaks.first_guess import (
     SCANNED_STARS,
@@ -44,7 +45,6 @@ from knightcube.vision.streaks.first_guess import (
 from knightcube.vision.streaks.frame import BrightRegions, PreparedFrame, prepare_frames
 from knightcube.vision.streaks.geometry import (
     GAUSSIAN,
-    CameraMotion,
     Course,
     Shutter,
     StreakScene,

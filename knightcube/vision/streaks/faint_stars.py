@@ -19,8 +19,9 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.frame import ReducedFrame
-from knightcube.vision.streaks.geometry import CameraMotion, paths
+from knightcube.vision.streaks.geometry import paths
 from knightcube.vision.streaks.polar_grid import (
     ACROSS,
     SAMPLE_NOISE,

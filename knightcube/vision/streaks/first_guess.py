@@ -35,8 +35,9 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, cross_product, median
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
-from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_lengths, positions
+from knightcube.vision.streaks.geometry import image_flow, path_lengths, positions
 from knightcube.vision.streaks.polar_grid import SAMPLE_NOISE, cumulative_sums, polar_grid
 
 SCANNED_STARS = 14

@@ -17,9 +17,9 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     PointsAtLines,
     Shutter,
     StarPaths,
@@ -751,6 +751,7 @@ def _frame_values(
 
 def star_pixels(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float) -> StarPixels:
     """Return all pixels within `reach` point-spread widths of the paths of the stars of `scene`."""
+    scene = scene.without_vibration(pinhole)
     room = reach * scene.width
     times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
     fast, slow = _divided(pinhole, scene, times)

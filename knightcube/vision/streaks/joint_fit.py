@@ -22,11 +22,11 @@ from scipy.special import fdtri
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
 from knightcube.vision.streaks.fit_windows import FitWindows, cut_windows, star_pixels, window_areas
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     Shutter,
     StreakScene,
     exposure_bounds,
@@ -50,7 +50,6 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.scene_images import light_images, light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
-from knightcube.vision.streaks.vibrating_streaks import mean_paths
 
 # Number of processed pixels per frame after which no further motion is fitted.
 # A fit in progress is completed, so that the number of processed pixels can reach twice this limit.
@@ -170,8 +169,7 @@ class FitProblem:
 
     def windows(self, scene: StreakScene) -> FitWindows:
         """Return the fit windows, which contain the pixels near the streaks of `scene`."""
-        mean = mean_paths(self.pinhole, scene)
-        return cut_windows(self.frame, self.pinhole, self.shutter, mean, self.settings.reach)
+        return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
 
     def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
         """Return the normal equations for `scene`, see `normal_equations.evaluate`."""

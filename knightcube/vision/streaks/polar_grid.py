@@ -16,7 +16,7 @@ import numpy.typing as npt
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, cross_product
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.geometry import CameraMotion
+from knightcube.vision.streaks.camera_motion import CameraMotion
 
 Int32Array = npt.NDArray[np.int32]
 

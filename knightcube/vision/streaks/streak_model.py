@@ -44,9 +44,9 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import LINES, Patches, Strips, path_distances
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     PointsAtLines,
     Shutter,
     exposure_bounds,

@@ -17,11 +17,11 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import SLOWEST
 from knightcube.vision.streaks.geometry import (
     GAUSSIAN,
     PIXEL_VARIANCE,
-    CameraMotion,
     DistortedPinhole,
     StreakScene,
     path_lengths,

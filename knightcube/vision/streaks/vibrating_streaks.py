@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +18,11 @@ import numpy as np
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST, Strips
 from knightcube.vision.streaks.geometry import (
     PIXEL_VARIANCE,
-    CameraMotion,
     Shutter,
-    StreakScene,
     image_flow,
     paths,
     positions,
@@ -148,14 +146,6 @@ def derivatives(
     moved = np.concatenate([moved, shifted], axis=1)
     count = strips.index.shape[2]
     return _sums(strips.corner, strips.step, count, seen.place, seen.weight, moved, _sigma(width))[:, 2:]
-
-
-def mean_paths(pinhole: Pinhole, scene: StreakScene) -> StreakScene:
-    """Return `scene` without its vibration, with stars whose paths are the means of the vibrating paths."""
-    if not scene.motion.vibration.exists:
-        return scene
-    shift = image_flow(pinhole, scene.stars) @ -scene.motion.vibration.cosine.sum(axis=0)
-    return replace(scene, motion=scene.motion.smooth, stars=scene.stars + shift)
 
 
 def _centres(strips: Strips) -> FloatArray:

@@ -25,8 +25,9 @@ import numpy.typing as npt
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.streaks import vibrating_streaks
+from knightcube.vision.streaks.camera_motion import Vibration
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST, Strips
-from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
+from knightcube.vision.streaks.geometry import StreakScene, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
 from knightcube.vision.streaks.normal_equations import Pixels, residuals
 from knightcube.vision.streaks.scene_images import model_images

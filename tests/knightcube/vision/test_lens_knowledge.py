@@ -35,7 +35,8 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
 )
 from knightcube.vision.startracker.survey import FrameKind
-from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, positions
+from knightcube.vision.streaks.camera_motion import CameraMotion
+from knightcube.vision.streaks.geometry import DistortedPinhole, positions
 from knightcube.vision.streaks.streak_result import (
     FrameMotion,
     LikelihoodSettings,

@@ -23,8 +23,9 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_motion
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.geometry import CameraMotion, positions
+from knightcube.vision.streaks.geometry import positions
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky
 from tests.studies.command import Seed, Table, command

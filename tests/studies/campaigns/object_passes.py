@@ -27,7 +27,7 @@ from knightcube.vision.frame_job import run as look
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.startracker.survey import DetectionSettings
-from knightcube.vision.streaks.geometry import CameraMotion
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.statistics import grouped, mean, rms, squared_sigmas

@@ -12,7 +12,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.streaks.geometry import CameraMotion
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.support.streak_bound import rate_bound, star_information
 

@@ -21,9 +21,10 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene
+from knightcube.vision.streaks.geometry import Shutter, StreakScene
 from knightcube.vision.streaks.joint_fit import FitProblem
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel

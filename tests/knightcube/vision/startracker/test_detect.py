@@ -26,7 +26,7 @@ from knightcube.vision.startracker.detect import (
     measure_near,
 )
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Method, survey
-from knightcube.vision.streaks.geometry import CameraMotion
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still

@@ -8,7 +8,8 @@ import numpy as np
 
 from knightcube.astro import catalogue, quaternion
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.streaks.geometry import CameraMotion, paths
+from knightcube.vision.streaks.camera_motion import CameraMotion
+from knightcube.vision.streaks.geometry import paths
 from sim_hal.star_camera import StarCameraModel, render
 from tests.support.streak_bound import RateBound, rate_bound
 

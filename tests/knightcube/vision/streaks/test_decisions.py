@@ -13,11 +13,12 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import estimate
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import StreakVerdict, alike, check_streaks, with_rate, with_stars
 from knightcube.vision.streaks.faint_stars import FaintStars
 from knightcube.vision.streaks.first_guess import MotionGuess
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, path_lengths, positions
+from knightcube.vision.streaks.geometry import Shutter, StreakScene, path_lengths, positions
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
 from knightcube.vision.streaks.normal_equations import (
     ALONE,

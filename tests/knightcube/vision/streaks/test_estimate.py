@@ -12,11 +12,12 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import CameraKnowledge, Lens
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import chained_stars, estimate_motion, estimate_rate
 from knightcube.vision.streaks.faint_stars import find_faint
 from knightcube.vision.streaks.first_guess import frame_angles, sharper_widths
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Course, Shutter, StreakScene
+from knightcube.vision.streaks.geometry import Course, Shutter, StreakScene
 from knightcube.vision.streaks.joint_fit import FitProblem, true_ends, unbroken
 from knightcube.vision.streaks.streak_result import (
     LikelihoodSettings,

@@ -11,6 +11,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import box_sum
 from knightcube.vision.streaks import faint_stars
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import (
     find_faint,
     less_boxes,
@@ -20,7 +21,7 @@ from knightcube.vision.streaks.faint_stars import (
     standing_peaks,
 )
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, paths
+from knightcube.vision.streaks.geometry import paths
 from knightcube.vision.streaks.polar_grid import ACROSS, PolarGrid, RunningSums
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree

@@ -10,6 +10,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import first_guess
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.first_guess import (
     Circles,
     find_axis,
@@ -22,7 +23,7 @@ from knightcube.vision.streaks.first_guess import (
     sharper_widths,
 )
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame, find_bright_regions, reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, paths
+from knightcube.vision.streaks.geometry import paths
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky, taken, turn_of
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree

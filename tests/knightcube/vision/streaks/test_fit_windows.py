@@ -8,9 +8,10 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import fit_windows
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import cut_patches, cut_windows, path_distances, window_areas
 from knightcube.vision.streaks.frame import ReducedFrame, reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, path_lengths, paths
+from knightcube.vision.streaks.geometry import Shutter, StreakScene, path_lengths, paths
 from tests.support.compiled_forms import assert_forms_agree
 
 _PINHOLE = Pinhole(150, 120, 800.0)

@@ -10,12 +10,11 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import CameraKnowledge, Lens, Pinhole
 from knightcube.vision.streaks import geometry
+from knightcube.vision.streaks.camera_motion import CameraMotion, Vibration
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     Course,
     DistortedPinhole,
     Shutter,
-    Vibration,
     azimuth_differences,
     exposure_bounds,
     image_flow,

@@ -12,16 +12,10 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import joint_fit
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import window_areas
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import (
-    CameraMotion,
-    Shutter,
-    StreakScene,
-    path_lengths,
-    paths,
-    positions,
-)
+from knightcube.vision.streaks.geometry import Shutter, StreakScene, path_lengths, paths, positions
 from knightcube.vision.streaks.joint_fit import (
     ROUGH,
     FitProblem,

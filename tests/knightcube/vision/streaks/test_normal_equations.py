@@ -11,9 +11,10 @@ import pytest
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import normal_equations
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import FitWindows, cut_windows
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene
+from knightcube.vision.streaks.geometry import Shutter, StreakScene
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
     PRIOR,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.streaks.geometry import CameraMotion
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.polar_grid import ACROSS, cumulative_sums, polar_grid, running_sums
 from tests.knightcube.vision.streaks.scenes import CAMERA, turn_of
 

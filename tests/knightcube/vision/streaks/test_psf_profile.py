@@ -12,10 +12,11 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.streaks import estimate
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.fit_windows import cut_windows
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, PsfProfile, Shutter, StreakScene
+from knightcube.vision.streaks.geometry import PsfProfile, Shutter, StreakScene
 from knightcube.vision.streaks.scene_images import gaussian_lights, light_of, model_images
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 from tests.support.supersampled import Optics, Sky, Spread, disc, light, ring

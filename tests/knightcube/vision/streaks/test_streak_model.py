@@ -8,10 +8,10 @@ import pytest
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import LINES, cut_patches, cut_strips, cut_windows
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     Shutter,
     StreakScene,
     paths,

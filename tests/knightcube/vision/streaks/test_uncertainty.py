@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
 from knightcube.vision.streaks import uncertainty
+from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.fit_windows import Strips
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import (
-    CameraMotion,
     DistortedPinhole,
     PsfProfile,
     Shutter,
@@ -243,7 +245,8 @@ def _left(residual: float, noise: float, shift: str) -> tuple[StreakResiduals, S
         CameraMotion.steady(np.zeros(3)), 1.04, np.zeros((1, 2)), np.array([500.0]), np.zeros(1), everyone
     )
     star, time = np.zeros(40, dtype=np.int64), np.zeros((40, 10))
-    return StreakResiduals(star, time, images, weight, left.astype(np.float32)), scene
+    no_strips = cast("Strips", None)  # not used here
+    return StreakResiduals(no_strips, star, time, images, weight, left.astype(np.float32)), scene
 
 
 @pytest.mark.parametrize(("shift", "measured"), [("ends", end_displacement), ("sides", side_displacement)])

@@ -13,10 +13,11 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.streaks import vibration
+from knightcube.vision.streaks.camera_motion import CameraMotion, Vibration
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.fit_windows import LINES, Strips
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, Vibration, paths
+from knightcube.vision.streaks.geometry import Shutter, StreakScene, paths
 from knightcube.vision.streaks.joint_fit import FitProblem
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from knightcube.vision.streaks.vibration import CommonMotion, StreakResiduals, find_common_motion
