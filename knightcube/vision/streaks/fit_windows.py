@@ -317,14 +317,8 @@ def _selected_pixels(
 def _strip_pixels(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field) -> _StripArrays:
     position, velocity, bent = points
     (low, high, outer), (columns, rows, width) = bounds, field
-    (blocks, each), steepest = lines.line.shape, 1.0
-    for b in range(blocks):
-        for i in range(each):
-            speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), SLOWEST)
-            major = velocity[0, b, i] if lines.along_rows[b] else velocity[1, b, i]
-            steep = max(abs(major) / speed, _MOST_BENT) if lines.real[b, i] else 1.0
-            steepest = min(steepest, steep)
-    half = math.ceil(width / steepest) if lines.real.any() else 0
+    blocks, each = lines.line.shape
+    half = _half_width(velocity, lines, width)
     count = 2 * half + 1
     within, minor = np.zeros((blocks, each, count), np.bool_), np.empty((blocks, each), np.int64)
     crossed, used, found = np.zeros(count, np.bool_), np.empty(blocks, np.int64), 0
@@ -351,10 +345,8 @@ def _strip_pixels(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: 
                 any_pixel |= near[k]
         used[found] = b
         found += any_pixel
-    begin, end = 0, 0
-    for k in range(count):
-        if crossed[k]:
-            begin, end = (k if end == 0 else begin), k + 1
+    chosen = np.flatnonzero(crossed)
+    begin, end = (chosen[0], chosen[-1] + 1) if len(chosen) else (0, 0)
     star, time, size = np.empty(found, np.int64), np.empty((found, each)), end - begin
     corner, step = np.empty((found, each, 2), np.int64), np.empty((found, 2), np.int64)
     index, inside = np.zeros((found, each, size), np.int64), np.empty((found, each, size), np.bool_)
@@ -371,6 +363,19 @@ def _strip_pixels(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: 
                 place = first_pixel + k * (columns if along else 1)
                 index[u, i, k] = place if inside[u, i, k] else 0
     return star, time, corner, step, index, inside
+
+
+@loop_helper
+def _half_width(velocity: FloatArray, lines: _Lines, width: float) -> int:
+    """Return the number of pixels of a line on each side of a path that reach `width` px from the path."""
+    steepest = 1.0
+    for b in range(len(lines.line)):
+        for i in range(lines.line.shape[1]):
+            speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), SLOWEST)
+            major = velocity[0, b, i] if lines.along_rows[b] else velocity[1, b, i]
+            if lines.real[b, i]:
+                steepest = min(steepest, max(abs(major) / speed, _MOST_BENT))
+    return math.ceil(width / steepest) if lines.real.any() else 0
 
 
 # Number of pixels that the processor handles at once.

@@ -157,10 +157,10 @@ def test_the_commands_of_the_reference_controllers_are_as_recorded() -> None:
     }
     found: dict[str, Any] = {}
     for name, controller in controllers.items():
-        commands = [controller.command(*sample) for sample in samples()]
+        commands = [controller.command(*sample)._asdict() for sample in samples()]
         found[name] = [commands[::6], getattr(controller, "parameters", None)]
         controller.reset()
-        found[f"{name} after a reset"] = controller.command(*samples()[5])
+        found[f"{name} after a reset"] = controller.command(*samples()[5])._asdict()
     check(__file__, "controllers", found)
 
 
