@@ -7,7 +7,6 @@ import inspect
 import os
 import re
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +86,7 @@ def test_the_interfaces_of_the_page_are_those_of_the_code() -> None:
             re.findall(r"`(\w+)\(", row[2])
         ), row[1]
         for name, parameters in re.findall(r"`([A-Z]\w+)\(([^`]*)\)`", row[3]):
-            assert [one.name for one in fields(getattr(devices, name))] == _words(parameters), name
+            assert [*inspect.signature(getattr(devices, name)).parameters] == _words(parameters), name
 
 
 def _words(text: str) -> list[str]:

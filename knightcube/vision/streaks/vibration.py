@@ -64,9 +64,8 @@ class StreakResiduals:
 
     def trust(self, stars: int) -> FloatArray:
         """Return the weight (n,) of each star, which is limited by the scatter of its residuals."""
-        squares = np.sum(self.weight * self.residual * self.residual, axis=(1, 2), dtype=np.float64)
-        used = np.count_nonzero(self.weight, axis=(1, 2))
-        scatter = np.bincount(self.star, squares, stars) / np.maximum(np.bincount(self.star, used, stars), 1)
+        star, sums = np.repeat(self.star, LINES), self.line_sums
+        scatter = np.bincount(star, sums.squares, stars) / np.maximum(np.bincount(star, sums.used, stars), 1)
         return np.asarray(1.0 / np.maximum(scatter, 1.0))
 
     @functools.cached_property
@@ -353,11 +352,16 @@ def fit_vibration(
 def _converged(
     camera: FitProblem, fit: StreakFit, again: Callable[[StreakScene], StreakFit | None]
 ) -> StreakFit | None:
-    """Return `fit` after steps of its vibration, each followed by a fit of motion and stars, or None."""
+    """Return `fit` after steps of its vibration, each followed by a fit of motion and stars.
+
+    Returns None if a fit does not succeed, or if no long streak shows the vibration.
+    """
     before = _excess(fit)
     for turn in range(_MOST_STEPS):
-        vibration = fit.scene.motion.vibration
-        after, _ = _improved(camera, fit.scene, residuals_of_fit(camera, fit))
+        vibration, left = fit.scene.motion.vibration, residuals_of_fit(camera, fit)
+        if not len(left.star):
+            return None
+        after, _ = _improved(camera, fit.scene, left)
         moved = np.abs(after.rotation(_SAMPLES) - vibration.rotation(_SAMPLES)).max()
         once_more = again(replace(fit.scene, motion=replace(fit.scene.motion, vibration=after)))
         if once_more is None:
@@ -483,8 +487,7 @@ def _rotation_sums(
     flow = image_flow(camera.pinhole, path.position)
     across, along = (np.einsum("li,lij->lj", way, flow) for way in (normal, tangent))
     sums = left.line_sums if rows == 2 else left.sums_of_lines(rows)
-    scatter = np.bincount(star, sums.squares) / np.maximum(np.bincount(star, sums.used), 1)
-    trust = 1.0 / np.maximum(scatter, 1.0)[star]
+    trust = left.trust(len(scene.stars))[star]
     light = scene.light[star]
     design = np.stack([across, -along / speed[:, None], -along, along][:rows], axis=1)
     place = np.clip(((time / _RANGE + 1.0) * 0.5 * _FINE_BINS).astype(np.int64), 0, _FINE_BINS - 1)

@@ -431,16 +431,17 @@ def _fitted_vibration(
     frequencies: list[float | None],
     sizes: list[float],
     fails: int = 99,
-    left: Sequence[float] = (),
+    excess: Sequence[float] = (),
+    streaks: bool = True,
 ) -> tuple[Any, int]:
     """Return the fit for trial frequencies and steps to given amplitudes (px), and the number of fits.
 
-    The excess chi-square is 10,000 before the first fit, and `left` after each fit. By default, each fit
-    halves it.
+    The excess chi-square is 10,000 before the first fit, and `excess` after each fit. By default, each fit
+    halves it. If `streaks` is false, no streak is long.
     """
     camera, scene = _plain_camera()
     trials, steps, made = iter(frequencies), iter(sizes), []
-    excesses = iter(left or [10_000.0 / 2.0**fit for fit in range(1, 9)])
+    excesses = iter(excess or [10_000.0 / 2.0**fit for fit in range(1, 9)])
 
     def improved(_: object, changed: StreakScene, __: object) -> tuple[Vibration, None]:
         one, size = changed.motion.vibration, next(steps) / 1200.0
@@ -452,7 +453,10 @@ def _fitted_vibration(
         made.append(changed)
         return None if len(made) >= fails else _SimpleFit(changed, next(excesses))
 
-    monkeypatch.setattr(vibration, "residuals_of_fit", lambda *_: None)
+    star = np.zeros(1 if streaks else 0, np.int64)
+    unused: Any = np.zeros(0)
+    left = StreakResiduals(_NO_STRIPS, star, unused, unused, unused, unused)
+    monkeypatch.setattr(vibration, "residuals_of_fit", lambda *_: left)
     monkeypatch.setattr(vibration, "_rotation_sums", lambda *_: None)
     monkeypatch.setattr(vibration, "_excess", lambda fit: fit.excess)
     monkeypatch.setattr(vibration, "_improved", improved)
@@ -486,16 +490,17 @@ def test_a_vibration_is_fitted_until_its_steps_are_small(monkeypatch: pytest.Mon
     assert _fitted_vibration(monkeypatch, [2.0, None], [2.55, 2.56])[0] is None
     assert _fitted_vibration(monkeypatch, [2.0, None], [2.44, 2.45])[0] is not None
     assert _fitted_vibration(monkeypatch, [2.0, None], [0.5, 0.51], fails=2) == (None, 2)
+    assert _fitted_vibration(monkeypatch, [2.0, None], [0.5, 0.51], streaks=False) == (None, 0)
 
 
 def test_a_sinusoid_that_explains_little_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """A sinusoid must explain a fifth of the excess chi-square, and its steps end if they explain nothing."""
-    found, made = _fitted_vibration(monkeypatch, [2.0], [0.5, 0.51], left=[9000.0, 8200.0])
+    found, made = _fitted_vibration(monkeypatch, [2.0], [0.5, 0.51], excess=[9000.0, 8200.0])
     assert (found, made) == (None, 2)
-    found, made = _fitted_vibration(monkeypatch, [2.0], [0.5, 0.9, 0.5], left=[11_000.0, 10_500.0, 0.0])
+    found, made = _fitted_vibration(monkeypatch, [2.0], [0.5, 0.9, 0.5], excess=[11_000.0, 10_500.0, 0.0])
     assert (found, made) == (None, 2)
     one, made = _fitted_vibration(
-        monkeypatch, [2.0, 5.0], [0.5, 0.51, 0.6, 0.61], left=[900.0, 800.0, 790.0, 750.0]
+        monkeypatch, [2.0, 5.0], [0.5, 0.51, 0.6, 0.61], excess=[900.0, 800.0, 790.0, 750.0]
     )
     assert made == 4
     assert one.scene.motion.vibration.frequency.tolist() == [2.0]
