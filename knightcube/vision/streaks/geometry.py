@@ -608,6 +608,14 @@ GAUSSIAN = PsfProfile((1.0,), (1.0,))
 """The profile of a PSF that is one Gaussian."""
 
 
+def without_pixel(width: float) -> float:
+    """Return the standard deviation (px) of a PSF that has the `width` (px) after convolution with a pixel.
+
+    The result is at least 0.1 px.
+    """
+    return math.sqrt(max(width**2 - PIXEL_VARIANCE, 0.01))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakScene:
     """The unknowns of the fit: the motion, the width of the point spread function (PSF), and the stars.
@@ -639,7 +647,7 @@ class StreakScene:
     @property
     def sigma(self) -> float:
         """The standard deviation (px) of the PSF without pixel convolution."""
-        return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
+        return without_pixel(self.width)
 
     def select(self, chosen: BoolArray | IntArray) -> StreakScene:
         """Return the scene with only the `chosen` stars, given as a mask or as indices."""

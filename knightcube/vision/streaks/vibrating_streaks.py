@@ -21,12 +21,12 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST, Strips
 from knightcube.vision.streaks.geometry import (
-    PIXEL_VARIANCE,
     Shutter,
     image_flow,
     paths,
     positions,
     sensitivities_and_velocity,
+    without_pixel,
 )
 from knightcube.vision.streaks.streak_model import IMAGES, profile
 
@@ -36,8 +36,6 @@ _ALONG_IMAGES = 2
 _BEYOND = 5.0
 # Number of quadrature nodes per point-spread width of the path, for an error of about 1e-4 of the counts.
 _DENSITY = 1.2
-# Smallest standard deviation (px) of the point spread function.
-_NARROWEST = 0.1
 # Time step of numerical derivatives, in units of the exposure time.
 _STEP = 1e-4
 # Distance (standard deviations) from a line of pixels beyond which a Gaussian is neglected.
@@ -81,7 +79,7 @@ def images(
     """
     shape = strips.index.shape
     out = np.empty((shape[0], IMAGES + _ALONG_IMAGES + 1, *shape[1:]), dtype=np.float32)
-    sigma = _sigma(width)
+    sigma = without_pixel(width)
     seen, ends, speed = _instants(pinhole, motion, shutter, stars, width, strips)
     normal = np.stack([-seen.tangent[..., 1], seen.tangent[..., 0]], axis=-1)
     along = seen.along[..., None]
@@ -144,18 +142,13 @@ def derivatives(
     moved = np.einsum("pcbi,biuc->bpiu", turned, seen.flow)
     shifted = np.broadcast_to(np.eye(2)[:, None], (blocks, 2, instants, 2))
     moved = np.concatenate([moved, shifted], axis=1)
-    count = strips.index.shape[2]
-    return _sums(strips.corner, strips.step, count, seen.place, seen.weight, moved, _sigma(width))[:, 2:]
+    count, sigma = strips.index.shape[2], without_pixel(width)
+    return _sums(strips.corner, strips.step, count, seen.place, seen.weight, moved, sigma)[:, 2:]
 
 
 def _centres(strips: Strips) -> FloatArray:
     """Return the times (b,) at which the stars pass the centres of their blocks."""
     return np.asarray(strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1))
-
-
-def _sigma(width: float) -> float:
-    """Return the standard deviation (px) of a PSF whose convolution with a pixel has the given `width`."""
-    return math.sqrt(max(width**2 - PIXEL_VARIANCE, _NARROWEST**2))
 
 
 def _instants(
