@@ -23,6 +23,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from multiprocessing import connection, get_context
 from pathlib import Path
 from typing import IO, Any
@@ -94,6 +95,7 @@ def _duration(seconds: float) -> str:
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 _RESULTS = "results.jsonl"  # name of the file of the results in the folder of a campaign
+_LABEL = "campaign.json"  # name of the file of the campaign's name, runs and seed, written at its beginning
 
 Result = dict[str, Any]
 Parameters = dict[str, Any]
@@ -217,11 +219,20 @@ def fly(
                         bar.advance()
             if bar is not None:
                 bar.close()
+        elif progress:
+            _note_complete(out)
         summary = campaign.summarise([done[case.key] for case in cases], out)
         facts = json.dumps(summary.facts, indent=1, allow_nan=False) + "\n"
         (out / "summary.json").write_text(facts, encoding="utf-8")
         (out / "summary.txt").write_text(summary.text, encoding="utf-8")
     return summary
+
+
+def _note_complete(out: Path) -> None:
+    """Write that no case ran, because an earlier campaign ran them all, and when that campaign began."""
+    begun = datetime.fromtimestamp((out / _LABEL).stat().st_mtime).isoformat(" ", "minutes")
+    whole = f"contains all results of the campaign of {begun}; delete the folder to run it again"
+    sys.stderr.write(f"no case ran: {out} {whole}\n")
 
 
 def results_in(out: Path) -> list[Result]:
@@ -250,7 +261,7 @@ def _opened(out: Path) -> Iterator[IO[str]]:
 
 def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
     """Return the results by key, and remove an incomplete last line. Raises UsageError if `label` differs."""
-    label_path = out / "campaign.json"
+    label_path = out / _LABEL
     if label_path.exists():
         found = json.loads(label_path.read_text(encoding="utf-8"))
         if found != label:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import fcntl
 import io
 import json
+import os
 import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from datetime import datetime
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -272,8 +274,18 @@ def test_progress_counts_all_cases_and_those_that_were_done_before(
     assert shown.count("\r\x1b[K[") == 3  # at the start, and after each case
     assert "] 2/3  0 s left" in shown
     assert shown.endswith("] 3/3  0 s left\r\x1b[K")
+
+
+def test_a_complete_campaign_says_when_it_began_and_that_nothing_ran(
+    tmp_path: Path, in_process: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly(TOY, 3, 5, tmp_path)
+    begun = datetime(2026, 11, 28, 21, 16)
+    os.utime(tmp_path / "campaign.json", times=(begun.timestamp(), begun.timestamp()))
+    watch = Watch(monkeypatch, terminal=True)
     fly(TOY, 3, 5, tmp_path, progress=True)
-    assert not watch.screen.new()
+    said = "contains all results of the campaign of 2026-11-28 21:16; delete the folder to run it again"
+    assert watch.screen.new() == f"no case ran: {tmp_path} {said}\n"
 
 
 def test_a_campaign_in_this_process_returns_its_results() -> None:
