@@ -124,6 +124,8 @@ class CameraMotion:
     @property
     def rotation(self) -> FloatArray:
         """The rotation vector (3,), rad, from start to end of the exposure."""
+        if not (len(self.higher_terms) or self.vibration.exists):
+            return self.rate
         rotation = self.rate + self.smooth.higher(_ENDS) @ np.array([-1.0, 1.0])
         if self.vibration.exists:
             before, after = self.vibration.rotation(_ENDS).T

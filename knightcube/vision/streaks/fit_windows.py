@@ -582,41 +582,44 @@ def _summed(slot: IntArray, blocks: _Blocks, patches: _Spots, count: int) -> Flo
     return total.astype(np.float32)
 
 
-def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
+def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
     """See `at_pixels`."""
     _, count, size = images.shape
     block, place = np.divmod(crowded, size)
+    first = np.flatnonzero(np.diff(block, prepend=-1))
     place += block * (count * size)
     drawn = np.empty((count - 1, len(place)), dtype=np.float32)
     for image in drawn:
         image[:] = images.reshape(-1).take(place)
         place += size
-    return block, drawn
+    return block[first], first, drawn
 
 
 @compiled_form_of(_at_pixels_numpy)
-def at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
-    """Return the blocks (e,) that contain e pixels, and the values (i, e) of i images on these pixels.
+def at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
+    """Return the values (i, e) of i images on e pixels, after the c blocks (c,) that contain these pixels.
 
+    The second returned array (c,) contains the index of the first of the e pixels in each of the c blocks.
     The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
     the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
-    of the given pixels in an array (b, p).
+    of the given pixels in an array (b, p), in ascending order.
     """
-    _, count, size = images.shape
-    block, drawn = np.empty_like(crowded), np.empty((count - 1, len(crowded)), dtype=np.float32)
-    first = 0
+    blocks, count, size = images.shape
+    block, begin, found = np.empty(blocks, np.int64), np.empty(blocks, np.int64), 0
+    drawn, first = np.empty((count - 1, len(crowded)), dtype=np.float32), 0
     while first < len(crowded):
         b, last = crowded[first] // size, first
         while last < len(crowded) and crowded[last] < (b + 1) * size:
             last += 1
-        block[first:last] = b
+        block[found], begin[found] = b, first
+        found += 1
         places = crowded[first:last] - b * size
         for i in range(count - 1):
             image, values = images[b, i], drawn[i, first:last]
             for e in range(len(places)):
                 values[e] = image[places[e]]
         first = last
-    return block, drawn
+    return block[:found].copy(), begin[:found].copy(), drawn
 
 
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:

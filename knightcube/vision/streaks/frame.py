@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray, median
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import estimate_background
 from knightcube.vision.camera.lens import Pinhole
@@ -63,7 +63,7 @@ class ReducedFrame:
     @property
     def usual_noise(self) -> float:
         """Standard deviation (counts) of the noise of a typical pixel without a star."""
-        return float(np.sqrt(median(self.floor[::_SPARSE])))
+        return float(np.sqrt(np.median(self.floor[::_SPARSE])))
 
 
 def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> ReducedFrame:

@@ -672,11 +672,16 @@ class StreakScene:
         )
 
 
+# Start and end of the exposure, and the instants at which a path is sampled for its length.
+_EXPOSURE, _INSTANTS = (-0.5, 0.5), np.linspace(-0.5, 0.5, 9)
+
+
 def exposure_bounds(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, stars: FloatArray
 ) -> FloatArray:
     """Return the start and end times (n, 2) between which each of `stars` (n, 2), px, is exposed."""
-    times = np.tile([-0.5, 0.5], (len(stars), 1))
+    times = np.empty((len(stars), 2))
+    times[:] = _EXPOSURE
     if shutter.delay_per_row == 0.0:
         return times
     # The end time and the row in which the streak ends are found by fixed-point iteration.
@@ -703,11 +708,11 @@ def mid_exposure_positions(
 
 def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> FloatArray:
     """Return the path lengths (n,), px, during the exposure of stars that are at `stars` (n, 2), px."""
-    samples = 9
-    time = np.tile(np.linspace(-0.5, 0.5, samples), len(stars))
-    there = positions(pinhole, motion, np.repeat(stars, samples, axis=0), time).reshape(-1, samples, 2)
-    step = np.diff(there, axis=1)
-    return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=1))
+    samples, count = len(_INSTANTS), len(stars)
+    repeated, time = np.concatenate([stars] * samples), np.repeat(_INSTANTS, count)
+    there = positions(pinhole, motion, repeated, time).reshape(samples, count, 2)
+    step = there[1:] - there[:-1]
+    return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=0))
 
 
 def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -233,8 +233,13 @@ def iterate(
     free: BoolArray,
     how: IterationLimits,
     windows: FitWindows | None = None,
+    known: Evaluation | None = None,
 ) -> StreakFit | None:
-    """Return the fit of all stars and the shared parameters in the mask `free`, or None if it fails."""
+    """Return the fit of all stars and the shared parameters in the mask `free`, or None if it fails.
+
+    The argument `known` contains the normal equations of `scene`, which the first iteration uses; None if
+    they are unknown.
+    """
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
@@ -242,7 +247,9 @@ def iterate(
     before_step, solution, evaluation = scene, None, None
     for turn in range(how.rounds):
         evaluation = None  # The old normal equations, tens of MB, are freed before the next evaluation.
-        evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
+        evaluation, known = known, None
+        if evaluation is None:
+            evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
             return None
@@ -727,9 +734,12 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
         done = iterate(camera, done.scene, camera.free, LAST, done.windows)
     if done is None or _excessive(done.scene.motion):
         return None
-    scene, windows = _with_majority(camera, done), [done.windows]
+    trusted = _trusted(camera, done)
+    start = replace(done.before, trusted=trusted)
+    known = done.evaluation.without(done.scene.trusted & ~trusted)
+    windows = [done.windows]
     del done  # The old fit is deleted and its windows are removed from the list, which frees tens of MB.
-    done = iterate(camera, scene, camera.free, LAST, windows.pop())
+    done = iterate(camera, start, camera.free, LAST, windows.pop(), known)
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
     return None if done is None or _excessive(done.scene.motion) else replace(done, hidden=hidden)
@@ -782,22 +792,6 @@ def _excessive(motion: CameraMotion) -> bool:
     if motion.higher_terms.any():
         return False
     return float(np.linalg.norm(motion.acceleration)) > _MOST_CHANGE * float(np.linalg.norm(motion.rate))
-
-
-def _with_majority(camera: FitProblem, rough: StreakFit) -> StreakScene:
-    """Return the scene of a fit whose last step is repeated with the stars that agree with the majority.
-
-    The step with fewer stars is computed from the normal equations of `rough`, which saves an evaluation.
-    """
-    trusted = _trusted(camera, rough)
-    rejected = rough.scene.trusted & ~trusted
-    if not rejected.any():
-        return rough.scene
-    start = replace(rough.before, trusted=trusted)
-    solution = solve(rough.evaluation.without(rejected), start, rough.free, ROUGH.conjugate)
-    if solution is None:
-        return replace(rough.scene, trusted=trusted)
-    return _stepped(start, solution, camera.pinhole)[0]
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray, tangent_basis
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model, vibrating_streaks
@@ -192,9 +192,7 @@ def _add(
     _sum_products(*sums, weight, flat, (star, matrix), total, pixels, limits)
     out.kept.append((weight > 0.0).reshape(view.inside.shape))
     if len(view.crowded):
-        block, drawn = at_pixels(flat, view.crowded)
-        first = np.flatnonzero(np.diff(block, prepend=-1))
-        held = block[first]
+        held, first, drawn = at_pixels(flat, view.crowded)
         crowded = weight.reshape(-1)[view.crowded]
         out.crowds.append(SharedPixels(star[held], matrix[held], first, view.common, crowded, drawn))
 
@@ -554,9 +552,9 @@ def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: i
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
+    alone = evaluation.gradient[:, SHARED:].copy()
     # The prior of the sky level is centred on zero, and the prior of the position on the current position.
-    offset = np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
-    alone = evaluation.gradient[:, SHARED:] - PRIOR * offset
+    alone[:, 3] -= PRIOR[3] * scene.sky
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
     step = _coupled(evaluation, eliminated, free, np.concatenate([shared, alone.reshape(-1)]), rounds)
     return Solution(step[:SHARED], step[SHARED:].reshape(alone.shape), eliminated)
@@ -832,11 +830,10 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> tuple[FloatArray, 
     array (n, 4) contains the standard deviations of the estimates.
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
-    across = np.linalg.svd(axis[None])[2][1:]
     directions = np.zeros((4, SHARED))
-    directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, across, 1.0
+    directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, tangent_basis(axis), 1.0
     directions = directions[:, alone.kept]
-    information = np.einsum("ai,nij,aj->na", directions, alone.information, directions)
+    information = np.sum((alone.information @ directions.T) * directions.T, axis=1)
     informed = information > _NOTHING * information.max(axis=0)
     information = np.where(informed, information, _NOTHING * information.max(axis=0) + 1e-300)
     change = np.where(informed, alone.score @ directions.T / information, 0.0)

@@ -567,7 +567,7 @@ def coefficients(
     The eight derivatives are with respect to rate (3), acceleration (3), and the star's position x and y. The
     derivatives with respect to the acceleration are zero unless the rate changes (`growing`).
     """
-    centre = strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1)
+    centre = 0.5 * (strips.time[:, LINES // 2 - 1] + strips.time[:, LINES // 2])
     of_block = stars[strips.star]
     # With a rolling shutter, the time of a streak's end depends on the row of the block of pixels.
     delay = np.zeros(len(stars))
