@@ -352,7 +352,8 @@ def find_faint(
 
 def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
     """Return the 3 x 3 sums (rows * columns,) of the frame without modelled stars and bad pixels."""
-    pixels, light = (values[~frame.bad[modelled[0]]] for values in modelled)
+    good = ~frame.bad[modelled[0]]
+    pixels, light = modelled[0][good], modelled[1][good]
     signal, floor = frame.signal[pixels], frame.floor[pixels]
     # Pixels with subtracted stars get a smaller weight, because their residuals are mostly photon noise.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))

@@ -428,14 +428,15 @@ def _unresolved_amplitude(sums: _RotationSums, known: Vibration, length: float) 
     if not len(frequency):
         return 0.0
     angular = 2.0 * np.pi * frequency[:, None]
-    value, slope = (np.fft.rfft(sums.score[:, i], _SPECTRUM, axis=0)[chosen] for i in (0, 1))
+    value, slope = (np.fft.rfft(sums.score[:, i].T, _SPECTRUM)[:, chosen].T for i in (0, 1))
     # The transform of the slope's gradient corresponds to the derivative of a complex exponential.
     score = value - 1j * angular * slope
+    parts = np.stack([score.real, score.imag], axis=-1)
     constant, square = (0.5 * sums.information[:, i, :, i].sum(axis=0) for i in (0, 1))
     information = constant + angular[..., None] ** 2 * square
     information = information + (sums.focal_length / _USUAL) ** 2 * np.eye(3)
-    amplitude = _solved(information, score[..., None])[..., 0]
-    gain = np.sum((score.conj() * amplitude).real, axis=1)
+    amplitude = _solved(information, parts)
+    gain = np.sum(parts * amplitude, axis=(1, 2))
     best = int(np.argmax(gain))
     if gain[best] <= _LEAST_GAIN:
         return 0.0
