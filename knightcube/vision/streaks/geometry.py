@@ -673,7 +673,7 @@ class StreakScene:
 
 
 # Start and end of the exposure, and the instants at which a path is sampled for its length.
-_EXPOSURE, _INSTANTS = (-0.5, 0.5), np.linspace(-0.5, 0.5, 9)
+_EXPOSURE, _SAMPLED = (-0.5, 0.5), np.linspace(-0.5, 0.5, 9)
 
 
 def exposure_bounds(
@@ -708,8 +708,8 @@ def mid_exposure_positions(
 
 def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> FloatArray:
     """Return the path lengths (n,), px, during the exposure of stars that are at `stars` (n, 2), px."""
-    samples, count = len(_INSTANTS), len(stars)
-    repeated, time = np.concatenate([stars] * samples), np.repeat(_INSTANTS, count)
+    samples, count = len(_SAMPLED), len(stars)
+    repeated, time = np.concatenate([stars] * samples), np.repeat(_SAMPLED, count)
     there = positions(pinhole, motion, repeated, time).reshape(samples, count, 2)
     step = there[1:] - there[:-1]
     return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=0))

@@ -237,19 +237,16 @@ def iterate(
 ) -> StreakFit | None:
     """Return the fit of all stars and the shared parameters in the mask `free`, or None if it fails.
 
-    The argument `known` contains the normal equations of `scene`, which the first iteration uses; None if
-    they are unknown.
+    The first iteration uses the normal equations `known` of `scene`, unless they are None.
     """
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
-    widest = _WIDER * scene.width if how.clipped else _WIDEST
+    clip, widest = (camera.settings.clip, _WIDER * scene.width) if how.clipped else (0.0, _WIDEST)
     before_step, solution, evaluation = scene, None, None
     for turn in range(how.rounds):
         evaluation = None  # The old normal equations, tens of MB, are freed before the next evaluation.
-        evaluation, known = known, None
-        if evaluation is None:
-            evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
+        evaluation, known = known or camera.evaluate(scene, windows, clip), None
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
             return None
@@ -736,10 +733,9 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
         return None
     trusted = _trusted(camera, done)
     start = replace(done.before, trusted=trusted)
-    known = done.evaluation.without(done.scene.trusted & ~trusted)
-    windows = [done.windows]
+    windows, known = [done.windows], [done.evaluation.without(done.scene.trusted & ~trusted)]
     del done  # The old fit is deleted and its windows are removed from the list, which frees tens of MB.
-    done = iterate(camera, start, camera.free, LAST, windows.pop(), known)
+    done = iterate(camera, start, camera.free, LAST, windows.pop(), known.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
     return None if done is None or _excessive(done.scene.motion) else replace(done, hidden=hidden)
@@ -779,7 +775,7 @@ def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     whole = first.with_stars(stars[near], light[near])
     fitted = _affordable(camera, whole, 1.0)
     camera = _subtracted(camera, whole.select(~fitted))
-    done = iterate(camera, whole.select(fitted), last.free, LAST)
+    done = iterate(camera, whole.select(fitted), last.free, replace(LAST, settled=ROUGH.settled))
     lost = done is None or _excessive(done.scene.motion) or _far(camera, scene, done.scene)
     return None if lost else done
 
