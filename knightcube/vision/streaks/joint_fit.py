@@ -210,9 +210,7 @@ class StreakFit:
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
                 return False
-            each = star_equations(self.evaluation, solution.shared != 0.0)
-            if each is None:
-                return False
+            each = star_equations(self.evaluation, solution.eliminated)
             part = solution.shared[each.kept]
             asked, due = each.score @ part, np.einsum("i,nij,j->n", part, each.information, part)
             stars = int(np.count_nonzero(due > 0.0))
@@ -288,8 +286,8 @@ def _stepped(scene: StreakScene, solution: Solution, pinhole: Pinhole) -> tuple[
     stars, time = np.tile(scene.stars, (2, 1)), np.repeat([-0.5, 0.5], len(scene.stars))
     growing = bool(solution.shared[3:6].any())
     change = sensitivities(pinhole, scene.motion, stars, time, growing)
-    along = change[:, :, :6] @ solution.shared[:6]
-    ends = float(np.hypot(along[:, 0], along[:, 1]).max(initial=0.0))
+    along = change.reshape(-1, 8) @ np.append(solution.shared[:6], [0.0, 0.0])
+    ends = float(np.hypot(along[::2], along[1::2]).max(initial=0.0))
     share = min(1.0, _LONGEST_STEP / max(ends, 1e-9), 0.3 * scene.width / max(abs(solution.shared[6]), 1e-9))
     step = solution.alone * share
     far = np.hypot(step[:, 0], step[:, 1])
@@ -792,11 +790,9 @@ def _excessive(motion: CameraMotion) -> bool:
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
     """Return the stars in the motion fit that agree with the majority, or all stars if too few agree."""
-    equations = star_equations(rough.evaluation, camera.free)
-    before = rough.scene.trusted
-    if equations is None:
-        return before
+    equations = star_equations(rough.evaluation, rough.solution.eliminated)
     change, deviation = estimates_of(equations, rough.scene)
+    before = rough.scene.trusted
     had = np.flatnonzero(before)
     length = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
     turn = float(np.linalg.norm(rough.scene.motion.rotation))

@@ -560,11 +560,10 @@ def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: i
     return Solution(step[:SHARED], step[SHARED:].reshape(alone.shape), eliminated)
 
 
-def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
-    """Return the covariance (3, 3) of the rate with the effect of shared pixels, or None if singular."""
-    eliminated = eliminate(evaluation, free)
-    if eliminated is None:
-        return None
+def rate_covariance(
+    evaluation: Evaluation, eliminated: EliminatedEquations, free: BoolArray, rounds: int
+) -> FloatArray:
+    """Return the covariance (3, 3) of the rate with the effect of shared pixels."""
     out = np.empty((3, 3))
     for k in range(3):
         # The equations are scaled so that the same tolerance is valid for all frames.
@@ -840,11 +839,8 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> tuple[FloatArray, 
     return change, 1.0 / np.sqrt(information)
 
 
-def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | None:
-    """Return the normal equations of each star for the `free` shared parameters, or None if singular."""
-    eliminated = eliminate(evaluation, free)
-    if eliminated is None:
-        return None
+def star_equations(evaluation: Evaluation, eliminated: EliminatedEquations) -> StarEquations:
+    """Return the normal equations of each star for the shared parameters of the `eliminated` equations."""
     kept, gain = eliminated.kept, eliminated.gain
     cross = evaluation.information[:, SHARED:][:, :, kept]
     schur = evaluation.information[:, kept[:, None], kept] - gain @ cross

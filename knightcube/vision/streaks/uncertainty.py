@@ -430,8 +430,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     brightest = brightest_fit(camera, whole)
     last = whole if brightest is None else brightest
     scene, settings = last.scene, camera.settings
-    exact = rate_covariance(last.evaluation, last.free, _CONJUGATE)
-    noise = last.solution.covariance[:3, :3] if exact is None else exact
+    noise = rate_covariance(last.evaluation, last.solution.eliminated, last.free, _CONJUGATE)
     if brightest is not None:
         lens = _lens_effect(camera, brightest, result.exposure, lens.counted)
     rotation = scene.motion.rotation + lens.step
@@ -522,9 +521,7 @@ def _lens_effect(
     The fit has already corrected the calibration errors `counted` (m,), in standard deviations.
     """
     nothing = np.zeros((3, 3))
-    equations = star_equations(last.evaluation, last.free)
-    if equations is None:
-        return _LensEffect(np.zeros(3), nothing, nothing, 1.0, np.zeros(0), counted, False)
+    equations = star_equations(last.evaluation, last.solution.eliminated)
     trusted = np.flatnonzero(last.scene.trusted)
     scene = last.scene.select(trusted)
     equations = StarEquations(equations.kept, equations.information[trusted], equations.score[trusted])
