@@ -217,7 +217,8 @@ def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
     """Return the cells (rows, columns) of the detector in a layer convolved with a point spread.
 
     The layer extends beyond the detector by the `radius` (px) of the point spread, so that the periodic
-    convolution reaches no cell of the detector from the opposite side.
+    convolution reaches no cell of the detector from the opposite side. The points of the layer are shared by
+    neighbouring cells, which is a convolution with a triangle along each axis; it is undone.
     """
     half = _reach(radius)
     fine = (np.arange((2 * half + 1) * _FINER) + 0.5) / (_FINER * CELLS) - (half + 0.5) / CELLS
@@ -225,5 +226,7 @@ def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
     kernel = density.reshape(2 * half + 1, _FINER, 2 * half + 1, _FINER).sum(axis=(1, 3))
     shape = [fft.next_fast_len(size, real=True) for size in layer.shape]
     product = fft.rfft2(layer, shape) * fft.rfft2((kernel / kernel.sum()).astype(np.float32), shape)
+    down, across = np.sinc(fft.fftfreq(shape[0])) ** 2, np.sinc(fft.rfftfreq(shape[1])) ** 2
+    product /= np.outer(down, across).astype(np.float32)
     whole = fft.irfft2(product, shape)
     return np.asarray(whole[2 * half : layer.shape[0], 2 * half : layer.shape[1]])

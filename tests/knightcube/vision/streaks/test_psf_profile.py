@@ -57,7 +57,7 @@ def test_a_defocused_camera_gives_the_rate_within_its_covariance(spread: Spread,
     assert found.covariance is not None
     error = found.rate - _RATE
     assert error @ np.linalg.solve(found.covariance, error) < 4.0**2
-    assert np.linalg.norm(error) < 0.008 * np.linalg.norm(_RATE)
+    assert np.linalg.norm(error) < 0.012 * np.linalg.norm(_RATE)
 
 
 def test_without_a_learned_profile_rings_give_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,8 +60,7 @@ def test_streaks_equal_those_of_an_independent_renderer() -> None:
         smooth = from_rotation_vector(times[:, None] * _MOTION.rate)
         return multiply(from_rotation_vector(_SHAKING.rotation(times).T), smooth)
 
-    # Two cells of a third of a pixel widen the point spread of the renderer.
-    sigma = np.sqrt(_WIDTH**2 - 1.0 / 12.0 - 1.0 / 54.0)
+    sigma = np.sqrt(_WIDTH**2 - 1.0 / 12.0)
     sky = Sky(_PINHOLE.unit_vectors(_STARS), np.ones(2))
     optics = Optics((gaussian(float(sigma)),), radius=8.0)
     drawn = light(_PINHOLE, optics, sky, at, 400.0, 0.0, np.random.default_rng(1)).reshape(-1)
