@@ -372,14 +372,18 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 _CONJUGATE = 12
 # Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
 _UNCHECKED = (2, 4.0)
-# Difference between fitted and configured PSF variance, as a fraction, below which it is neglected.
-_SAME_SPREAD = 0.02
+# Index of the point-spread width among the parameters that all stars share.
+_WIDTH = 6
+# Relative difference between fitted and configured PSF variance that is neglected if the fitted PSF is
+# narrower, and if it is wider. A fast vibration makes streaks wider; therefore the latter is small, but one
+# standard deviation of the fitted variance is neglected in addition.
+_NARROWER, _WIDER = 0.02, 0.002
 # Ratio of a streak end's error to the square root of the difference of fitted and configured PSF variance.
 _END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
-# Minimum uncertainty (px) of streak ends if the profile of the PSF was learned from the frame.
-_LEARNED_FLOOR = 0.04
+# Minimum uncertainty (px) of streak ends if the profile of the PSF or a vibration was fitted to the frame.
+_FITTED_FLOOR = 0.04
 # Fraction of the rate's uncertainty that counts as model error if the profile of the PSF was learned.
 _LEARNED_SHARE = 0.5
 # Ratio of the uncertainty of the streak ends to the significant displacement that explains their residuals.
@@ -446,7 +450,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if fast > 0.0:
         # The covariance of the unresolved vibration replaces the limits on the motion common to all streaks.
         common_motion = CommonMotion()
-    end = _end_uncertainty(residuals, whole.scene, settings.psf_sigma, result.misfit)
+    end = _end_uncertainty(residuals, whole, settings.psf_sigma, result.misfit)
     shaken = _END_COMMON * max(common_motion.across, common_motion.along)
     ends = float(np.sqrt(2.0) * np.hypot(end, shaken) / result.length)
     # If the fit did not converge, the uncertainty includes its last step.
@@ -593,22 +597,26 @@ def contradiction(alone: StarEquations) -> float:
     return float(np.sum(left[known] ** 2 / values[known])) / freedom
 
 
-def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
+def _end_uncertainty(left: StreakResiduals, whole: StreakFit, sigma: float, misfit: float) -> float:
     """Return the uncertainty (px) of streak ends due to a PSF that may differ from the model.
 
     If the residuals at the streak ends are not significant, the PSF has the modelled profile, with the same
     width along and across the streaks. Significant residuals at the streak ends indicate a different profile
-    of the PSF or an unresolved fast vibration, which shifts the apparent ends.
+    of the PSF or an unresolved fast vibration, which shifts the apparent ends. If a profile or a vibration
+    was fitted, the width of the streaks does not limit the errors of their ends.
     """
-    described, learned = sigma**2 + PIXEL_VARIANCE, scene.profile != GAUSSIAN
-    beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
-    if beyond <= 0.0 and not learned:
+    scene, described = whole.scene, sigma**2 + PIXEL_VARIANCE
+    deviation = 2.0 * scene.width * float(np.sqrt(whole.solution.covariance[_WIDTH, _WIDTH]))
+    wider = scene.width**2 - described
+    beyond = max(wider - _WIDER * described - deviation, -wider - _NARROWER * described)
+    fitted = scene.profile != GAUSSIAN or scene.motion.vibration.exists
+    if beyond <= 0.0 and not fitted:
         return 0.0
     another = _END_SHARE * float(np.sqrt(max(beyond, 0.0))) * max(misfit, 1.0)
     ends = end_displacement(left, scene)
     if ends is None:
         return another
     seen = np.hypot(_END_SHOWN * ends.shown, _END_CHANCE * ends.chance)
-    if learned:
-        return float(np.hypot(_LEARNED_FLOOR, seen))
+    if fitted:
+        return float(np.hypot(_FITTED_FLOOR, seen))
     return min(another, float(np.hypot(_END_FLOOR, seen)))

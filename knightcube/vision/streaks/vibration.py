@@ -301,7 +301,9 @@ _SHORTEST_WAVE = 4.0
 _UNRESOLVED = (2.2, 6.0)
 # Number of samples of the spectrum of the residuals.
 _SPECTRUM = 4096
-# Minimum decrease of chi-square by a sinusoid, and the same as a fraction of the excess chi-square.
+# Minimum decrease of chi-square by an unresolved vibration; chance decreases it by up to 33 in 190 frames.
+_LEAST_UNRESOLVED = 36.0
+# Minimum decrease of chi-square by a fitted sinusoid, and the same as a fraction of the excess chi-square.
 _LEAST_GAIN, _LEAST_SHARE = 60.0, 0.2
 # Maximum number of sinusoids, and minimum difference (cycles per exposure) between their frequencies.
 _MOST_SINUSOIDS, _LEAST_APART = 2, 1.0
@@ -438,7 +440,7 @@ def _unresolved_amplitude(sums: _RotationSums, known: Vibration, length: float) 
     amplitude = _solved(information, parts)
     gain = np.sum(parts * amplitude, axis=(1, 2))
     best = int(np.argmax(gain))
-    if gain[best] <= _LEAST_GAIN:
+    if gain[best] <= _LEAST_UNRESOLVED:
         return 0.0
     shown = float(np.linalg.norm(amplitude[best]))
     return min(shown / float(_kept_share(frequency, length)[best]), _LARGEST / sums.focal_length)

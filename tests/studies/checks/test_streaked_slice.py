@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from ground.campaigns.runner import Case
 from tests.studies.campaigns.resting import STREAKS, streaked_run, summarise
 
@@ -24,10 +26,18 @@ def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path)
 
 
 def test_a_shutter_that_is_described_costs_nothing(tmp_path: Path) -> None:
-    """On the same frames, the claimed uncertainty is larger if the line time is not known."""
+    """On the same frames, the claimed uncertainty is larger if the line time is not known.
+
+    Which excess of the streaks' width counts differs slightly between the two fits of a frame; therefore, one
+    frame of six may be an exception.
+    """
+    flown = [_flown(f"rolling 0 us, {how}", 2) for how in ("stated", "unstated")]
+    for results in flown:
+        own = summarise(results, tmp_path).facts["all"]
+        assert own["attitudes"] == 6
+        assert own["worst"] < 4.5
+        assert own["claim"] < 0.03
     stated, unstated = (
-        summarise(_flown(f"rolling 0 us, {how}", 2), tmp_path).facts["all"] for how in ("stated", "unstated")
+        np.array([np.trace(np.array(frame["covariance"])[:2, :2]) for frame in results]) for results in flown
     )
-    assert stated["attitudes"] == unstated["attitudes"] == 6
-    assert max(stated["worst"], unstated["worst"]) < 4.5
-    assert stated["claim"] < unstated["claim"] < 0.03
+    assert np.count_nonzero(stated < unstated) >= 5

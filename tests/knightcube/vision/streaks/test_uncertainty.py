@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -14,7 +15,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
 from knightcube.vision.streaks import uncertainty
-from knightcube.vision.streaks.camera_motion import CameraMotion
+from knightcube.vision.streaks.camera_motion import CameraMotion, Vibration
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.fit_windows import Strips
 from knightcube.vision.streaks.frame import reduce_frame
@@ -25,8 +26,8 @@ from knightcube.vision.streaks.geometry import (
     StreakScene,
     sensitivities,
 )
-from knightcube.vision.streaks.joint_fit import FitProblem, brightest_fit
-from knightcube.vision.streaks.normal_equations import StarEquations
+from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, brightest_fit
+from knightcube.vision.streaks.normal_equations import SHARED, StarEquations
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from knightcube.vision.streaks.uncertainty import (
     Displacement,
@@ -410,29 +411,47 @@ def test_the_intensity_of_a_reversing_motion_is_that_of_many_instants(share: flo
 
 
 def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The uncertainty is the root of the difference of the variances, or less if the residuals are small."""
+    """The uncertainty is the root of the difference of the variances, or less if the residuals are small.
+
+    An excess within one standard deviation of the fitted variance is neglected.
+    """
     left, scene = _left(0.0, 1.0, "ends")
     described = 1.2**2 + 1.0 / 12.0
-    difference = 0.49 + uncertainty._SAME_SPREAD * described
 
-    def found(change: float, misfit: float, ends: Displacement | None) -> float:
+    def found(
+        change: float,
+        misfit: float,
+        ends: Displacement | None,
+        deviation: float = 0.0,
+        scene: StreakScene = scene,
+    ) -> float:
         monkeypatch.setattr(uncertainty, "end_displacement", lambda *_: ends)
         width = float(np.sqrt(described + change))
-        return uncertainty._end_uncertainty(left, replace(scene, width=width), 1.2, misfit)
+        covariance = np.zeros((SHARED, SHARED))
+        covariance[-1, -1] = (deviation / (2.0 * width)) ** 2
+        fit = SimpleNamespace(
+            scene=replace(scene, width=width), solution=SimpleNamespace(covariance=covariance)
+        )
+        return uncertainty._end_uncertainty(left, cast("StreakFit", fit), 1.2, misfit)
 
-    another = uncertainty._END_SHARE * 0.7
+    difference, another = 0.49 + uncertainty._WIDER * described, uncertainty._END_SHARE * 0.7
     assert found(difference, 0.5, None) == pytest.approx(another)
-    assert found(-difference, 0.5, None) == pytest.approx(another)
+    assert found(-0.49 - uncertainty._NARROWER * described, 0.5, None) == pytest.approx(another)
+    assert found(difference + 0.1, 0.5, None, deviation=0.1) == pytest.approx(another)
     assert found(difference, 1.5, None) == pytest.approx(1.5 * another)
-    assert found(0.99 * uncertainty._SAME_SPREAD * described, 1.0, None) == 0.0
+    assert found(0.99 * uncertainty._WIDER * described, 1.0, None) == 0.0
+    assert found(0.09, 1.0, None, deviation=0.1) == 0.0
+    assert found(-0.99 * uncertainty._NARROWER * described, 1.0, None) == 0.0
     assert found(difference, 1.0, Displacement(50.0, 60.0)) == pytest.approx(another)
     ends = Displacement(0.04, 0.1)
     shown = np.array([uncertainty._END_FLOOR, uncertainty._END_SHOWN * 0.04, uncertainty._END_CHANCE * 0.1])
     assert found(difference, 1.0, ends) == pytest.approx(float(np.linalg.norm(shown)))
-    # With a learned profile, the difference of the variances does not limit the uncertainty.
-    scene = replace(scene, profile=PsfProfile((0.5, 1.0), (-0.5, 1.5)))
-    shown[0] = uncertainty._LEARNED_FLOOR
-    assert found(0.0, 1.0, ends) == pytest.approx(float(np.linalg.norm(shown)))
+    # With a learned profile or a fitted vibration, the variances do not limit the uncertainty.
+    shown[0] = uncertainty._FITTED_FLOOR
+    vibration = Vibration(np.array([3.0]), np.array([[1e-4, 0.0, 0.0]]), np.zeros((1, 3)))
+    learned = replace(scene, profile=PsfProfile((0.5, 1.0), (-0.5, 1.5)))
+    for fitted in (learned, replace(scene, motion=replace(scene.motion, vibration=vibration))):
+        assert found(0.0, 1.0, ends, scene=fitted) == pytest.approx(float(np.linalg.norm(shown)))
 
 
 def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -> None:
