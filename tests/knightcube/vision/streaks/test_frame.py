@@ -167,10 +167,14 @@ def test_without_regions_no_width_is_measured() -> None:
 def test_a_point_spread_of_another_width_gives_a_rate_within_its_covariance(
     true: float, described: float
 ) -> None:
+    """The fitted width is near the true width, which a learned profile determines less well than a Gaussian.
+
+    The shares of the Gaussians of a learned profile also describe a part of the width.
+    """
     scene = real_sky(12, np.radians(70.0), 80.0, 1.0, replace(CAMERA, psf_sigma=true))
     found = _found(scene, psf_sigma=described)
     assert _nees(found, scene) < _HONEST
-    assert found.psf_sigma == pytest.approx(true, rel=0.1)
+    assert found.psf_sigma == pytest.approx(true, rel=0.15)
 
 
 def test_a_bright_limb_is_excluded_and_the_stars_give_the_rate() -> None:
