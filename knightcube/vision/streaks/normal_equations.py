@@ -776,10 +776,14 @@ def _add_changes(crowd: SharedPixels, vector: FloatArray, light: Float32Array, c
     light[:] = 0.0
     for b in range(len(first)):
         stop = first[b + 1] if b + 1 < len(first) else len(slot)
+        own = vector[star[b]]
         for i in range(len(images)):
-            share = np.float32(_scalar_product(matrix[b, i], vector[star[b]]))
+            row, share = matrix[b, i], 0.0
+            # The constant number of parameters permits the compiler to unroll the loop.
+            for q in range(_PARAMETERS):
+                share += row[q] * own[q]
             if share != 0.0:
-                _add_scaled(light[first[b] : stop], share, images[i, first[b] : stop])
+                _add_scaled(light[first[b] : stop], np.float32(share), images[i, first[b] : stop])
     for e in range(len(slot)):
         change[slot[e]] += light[e]
 
@@ -792,10 +796,13 @@ def _add_coupling(crowd: SharedPixels, change: FloatArray, light: Float32Array, 
         light[e] = weight[e] * (change[slot[e]] - light[e])
     for b in range(len(first)):
         stop = first[b + 1] if b + 1 < len(first) else len(slot)
+        own = out[star[b]]
         for i in range(len(images)):
-            if matrix[b, i].any():
+            row = matrix[b, i]
+            if row.any():
                 slope = float(_scalar_product(light[first[b] : stop], images[i, first[b] : stop]))
-                _add_scaled(out[star[b]], slope, matrix[b, i])
+                for q in range(_PARAMETERS):
+                    own[q] += slope * row[q]
 
 
 @loop_helper
