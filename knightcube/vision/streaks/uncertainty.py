@@ -377,7 +377,7 @@ _WIDTH = 6
 # Relative difference between fitted and configured PSF variance that is neglected if the fitted PSF is
 # narrower, and if it is wider. A fast vibration makes streaks wider; therefore the latter is small, but one
 # standard deviation of the fitted variance is neglected in addition.
-_NARROWER, _WIDER = 0.02, 0.002
+_NARROWER, _WIDER = 0.02, 0.004
 # Ratio of a streak end's error to the square root of the difference of fitted and configured PSF variance.
 _END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
