@@ -12,6 +12,7 @@ import ctypes
 import fcntl
 import importlib.util
 import json
+import math
 import os
 import shutil
 import signal
@@ -22,7 +23,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from multiprocessing import connection, get_context
 from pathlib import Path
@@ -222,10 +223,20 @@ def fly(
         elif progress:
             _note_complete(out)
         summary = campaign.summarise([done[case.key] for case in cases], out)
+        summary = replace(summary, facts=_without_nan(summary.facts))
         facts = json.dumps(summary.facts, indent=1, allow_nan=False) + "\n"
         (out / "summary.json").write_text(facts, encoding="utf-8")
         (out / "summary.txt").write_text(summary.text, encoding="utf-8")
     return summary
+
+
+def _without_nan(value: Any) -> Any:
+    """Return values for JSON, with None in place of NaN, the mean of the results of a row without cases."""
+    if isinstance(value, dict):
+        return {key: _without_nan(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(each) for each in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _note_complete(out: Path) -> None:

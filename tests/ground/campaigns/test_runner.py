@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -239,6 +240,16 @@ def test_only_the_cases_with_a_text_run(tmp_path: Path, in_process: list[str]) -
     assert json.loads((tmp_path / "out" / "campaign.json").read_text())["only"] == "-1"
     with pytest.raises(UsageError, match="--only 'x': no case of toy contains this text"):
         fly(TOY, 3, 5, tmp_path / "out", only="x")
+
+
+def test_a_row_without_results_is_null_in_the_summary(tmp_path: Path, in_process: list[str]) -> None:
+    facts = {"rows": [{"mean": float("nan")}, {"mean": 2.0}], "none": None}
+    campaign = replace(TOY, summarise=lambda *_: Summary("-", facts))
+    fly(campaign, 1, 5, tmp_path)
+    assert json.loads((tmp_path / "summary.json").read_text()) == {
+        "rows": [{"mean": None}, {"mean": 2.0}],
+        "none": None,
+    }
 
 
 @pytest.mark.parametrize("other", [{"runs": 4, "seed": 5}, {"runs": 3, "seed": 6}, {"only": "-1"}])

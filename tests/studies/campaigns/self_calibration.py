@@ -187,7 +187,7 @@ def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return claimed uncertainties and NEES by row, before and after the lens is estimated."""
     facts: dict[str, dict[str, Any]] = {}
-    for row in ROWS:
+    for row in (row for row in ROWS if any(r["row"] == row for r in results)):
         frames = [f for r in results if r["row"] == row for f in r["frames"]]
         stages = {"first": (0, 1), "learning": (1, LEARNED), "learned": (LEARNED, SHIFTED)}
         facts[row] = {
