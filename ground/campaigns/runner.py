@@ -231,7 +231,7 @@ def fly(
 
 
 def _without_nan(value: Any) -> Any:
-    """Return values for JSON, with None in place of NaN, the mean of the results of a row without cases."""
+    """Return values for JSON, with None instead of NaN, the mean of a row without results."""
     if isinstance(value, dict):
         return {key: _without_nan(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
