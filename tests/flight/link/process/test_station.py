@@ -91,7 +91,7 @@ def test_refusals_and_the_highest_counter_stand_in_the_very_first_packet(link: B
     link.turn()
     link.restart()
     link.packets.clear()
-    link.wire.up += [frame, frame[:-1] + b"x"]
+    link.wire.up += [frame, frame[:-1] + bytes([frame[-1] ^ 1])]
     link.turn(1.1)
     assert link.packets[0][1][:2] == LAYOUTS["link"].identifier.to_bytes(2, "big")
     (first,) = LAYOUTS["link"].array(link.packets[0][1])
