@@ -235,14 +235,14 @@ def iterate(
 ) -> StreakFit | None:
     """Return the fit of all stars and the shared parameters in the mask `free`, or None if it fails.
 
-    The first iteration uses the normal equations `known` of `scene`, unless they are None.
+    An additional first iteration uses the normal equations `known` of `scene`, unless they are None.
     """
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
     clip, widest = (camera.settings.clip, _WIDER * scene.width) if how.clipped else (0.0, _WIDEST)
     before_step, solution, evaluation = scene, None, None
-    for turn in range(how.rounds):
+    for turn in range(how.rounds + (known is not None)):
         evaluation = None  # The old normal equations, tens of MB, are freed before the next evaluation.
         evaluation, known = known or camera.evaluate(scene, windows, clip), None
         solution = solve(evaluation, scene, free, how.conjugate)

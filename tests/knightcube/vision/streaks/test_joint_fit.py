@@ -157,7 +157,7 @@ def test_a_step_without_rejected_stars_needs_no_further_evaluation(monkeypatch: 
     assert expected is not None
     monkeypatch.setattr(joint_fit, "evaluate", None)
     start, known = replace(rough.before, trusted=trusted), rough.evaluation.without(~trusted)
-    found = iterate(camera, start, camera.free, once, rough.windows, known)
+    found = iterate(camera, start, camera.free, replace(once, rounds=0), rough.windows, known)
     assert found is not None
     np.testing.assert_array_equal(found.scene.trusted, trusted)
     assert not np.array_equal(found.scene.motion.rate, rough.scene.motion.rate)
