@@ -217,8 +217,8 @@ def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
     """Return the cells (rows, columns) of the detector in a layer convolved with a point spread.
 
     The layer extends beyond the detector by the `radius` (px) of the point spread, so that the periodic
-    convolution reaches no cell of the detector from the opposite side. The points of the layer are shared by
-    neighbouring cells, which is a convolution with a triangle along each axis; it is undone.
+    convolution reaches no cell of the detector from the opposite side. Neighbouring cells share the light of
+    a point, which blurs the layer by a triangle along each axis; the function removes this blur.
     """
     half = _reach(radius)
     fine = (np.arange((2 * half + 1) * _FINER) + 0.5) / (_FINER * CELLS) - (half + 0.5) / CELLS

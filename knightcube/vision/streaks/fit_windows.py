@@ -597,9 +597,10 @@ def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray,
 
 @compiled_form_of(_at_pixels_numpy)
 def at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Return the values (i, e) of i images on e pixels, after the c blocks (c,) that contain these pixels.
+    """Return the blocks (c,) that contain e pixels, the first pixel of each, and i images on the pixels.
 
-    The second returned array (c,) contains the index of the first of the e pixels in each of the c blocks.
+    The first pixels (c,) are indices among the e pixels. The third array (i, e) contains the values of the
+    images.
     The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
     the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
     of the given pixels in an array (b, p), in ascending order.

@@ -301,7 +301,7 @@ _SHORTEST_WAVE = 4.0
 _UNRESOLVED = (2.2, 6.0)
 # Number of samples of the spectrum of the residuals.
 _SPECTRUM = 4096
-# Minimum decrease of chi-square by an unresolved vibration; chance decreases it by up to 33 in 190 frames.
+# Minimum decrease of chi-square by an unresolved vibration. Noise decreased it by at most 33 in 190 frames.
 _LEAST_UNRESOLVED = 36.0
 # Minimum decrease of chi-square by a fitted sinusoid, and the same as a fraction of the excess chi-square.
 _LEAST_GAIN, _LEAST_SHARE = 60.0, 0.2

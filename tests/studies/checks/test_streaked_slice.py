@@ -28,8 +28,8 @@ def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path)
 def test_a_shutter_that_is_described_costs_nothing(tmp_path: Path) -> None:
     """On the same frames, the claimed uncertainty is larger if the line time is not known.
 
-    Which excess of the streaks' width counts differs slightly between the two fits of a frame; therefore, one
-    frame of six may be an exception.
+    The two fits of a frame find slightly different widths of the streaks, which also change the claim.
+    Therefore, one frame of six may be an exception.
     """
     flown = [_flown(f"rolling 0 us, {how}", 2) for how in ("stated", "unstated")]
     for results in flown:
