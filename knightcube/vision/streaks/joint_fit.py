@@ -175,8 +175,8 @@ class FitProblem:
         """Return the normal equations for `scene`, see `normal_equations.evaluate`."""
         times = _VIBRATING if scene.motion.vibration.exists else 1
         self.work.evaluated(len(windows.slot) * len(scene.profile.widths) * times)
-        growth = self.growing or (self.undecided and clip > 0.0)
-        return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
+        tested = self.undecided and clip > 0.0
+        return evaluate(self.pinhole, self.shutter, scene, windows, clip, self.growing, tested)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

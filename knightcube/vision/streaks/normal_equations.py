@@ -107,23 +107,33 @@ class SharedPixels(NamedTuple):
 
 
 def evaluate(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, clip: float, growing: bool
+    pinhole: Pinhole,
+    shutter: Shutter,
+    scene: StreakScene,
+    windows: FitWindows,
+    clip: float,
+    growing: bool,
+    tested: bool = False,
 ) -> Evaluation:
     """Return the normal equations of `scene` on the pixels of its fit windows.
 
     The residual limit `clip` for outlier pixels is in standard deviations. The flag `growing` states whether
-    the angular acceleration is fitted.
+    the angular acceleration is fitted, and `tested` whether a score test needs its derivatives. The test is
+    valid for the approximate derivatives that are linear within a block of pixels, the fit is not.
     """
     strips = windows.strips
-    images, spots, change = model_images(pinhole, shutter, scene, windows)
+    images, spots, change = model_images(pinhole, shutter, scene, windows, growing)
     of_block = windows.long[strips.star]
     total = windows.total(images, spots, scene.light, scene.sky)
     n, size = len(scene.stars), SHARED + ALONE
     sums = np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n)
     out = Evaluation(*sums, [], windows.shared, [])
     long = scene.stars[windows.long]
-    model = vibrating_streaks if scene.motion.vibration.exists else streak_model
-    geometry = model.coefficients(pinhole, scene.motion, shutter, long, strips, growing)
+    camera, accelerated = (pinhole, scene.motion, shutter), growing or tested
+    if scene.motion.vibration.exists:
+        geometry = vibrating_streaks.coefficients(*camera, long, strips, accelerated)
+    else:
+        geometry = streak_model.coefficients(*camera, long, strips, accelerated, growing)
     matrix = _matrices(geometry, scene.light[of_block], scene.trusted[of_block])
     _add(out, of_block, windows.on_strips, images, matrix, total, clip)
     if not len(windows.spot):

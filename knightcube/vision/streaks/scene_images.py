@@ -63,14 +63,18 @@ def light_images(
     return np.tensordot(shares.astype(np.float32), streaks, 1), np.tensordot(shares, spots, 1)
 
 
-def model_images(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: StarPixels) -> ModelImages:
+def model_images(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: StarPixels, quadratic: bool = False
+) -> ModelImages:
     """Return the images that are combined to model long streaks, and the images and derivatives of spots.
 
-    The last image of each long streak is an uninitialised buffer for the residuals.
+    The last image of each long streak is an uninitialised buffer for the residuals. If `quadratic` is True,
+    the images describe displacements that are quadratic along the path within a block of pixels.
     """
     if scene.profile == GAUSSIAN:
-        return _gaussian_images(pinhole, shutter, scene, windows)
-    parts = [(part, _gaussian_images(pinhole, shutter, part, windows)) for part in _gaussian_scenes(scene)]
+        return _gaussian_images(pinhole, shutter, scene, windows, quadratic)
+    each = [_gaussian_images(pinhole, shutter, part, windows, quadratic) for part in _gaussian_scenes(scene)]
+    parts = list(zip(_gaussian_scenes(scene), each, strict=True))
     scaled = [_share(scene, *each, share) for each, share in zip(parts, scene.profile.shares, strict=True)]
     images, spots, change = scaled[0]
     for other in scaled[1:]:
@@ -95,12 +99,15 @@ def _share(scene: StreakScene, part: StreakScene, images: ModelImages, share: fl
 
 
 def _gaussian_images(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: StarPixels
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: StarPixels, quadratic: bool
 ) -> ModelImages:
     """Return the result of `model_images` for a Gaussian PSF of the width of the `scene`."""
     camera, long, spot = (pinhole, scene.motion, shutter), windows.long, windows.spot
-    model = vibrating_streaks if scene.motion.vibration.exists else streak_model
-    images = model.images(*camera, scene.stars[long], scene.width, windows.strips)
+    if scene.motion.vibration.exists:
+        images = vibrating_streaks.images(*camera, scene.stars[long], scene.width, windows.strips)
+    else:
+        count = streak_model.IMAGES + (streak_model.QUADRATIC_IMAGES if quadratic else 0) + 1
+        images = streak_model.images(*camera, scene.stars[long], scene.width, windows.strips, count)
     spots = streak_model.spot_derivatives(*camera, scene.stars[spot], scene.sigma, windows.patches)
     return images, *spots
 
