@@ -472,6 +472,7 @@ class LensKnowledge:
             math.sqrt(float(corner @ self.covariance @ corner)),
             self.shutter[1],
             tuple(map(tuple, covariance.tolist())),
+            float(self.sigma[_PSF]),
         )
 
     def restored(self, values: FloatArray, covariance: FloatArray, changed: float) -> LensKnowledge | None:

@@ -441,6 +441,7 @@ class CameraKnowledge:
         covariance: covariance (5, 5) of relative focal length, optical axis along x and y, distortion and
             line time, in the units of the other attributes, if the lens parameters were estimated from
             frames. If the covariance is None, the errors are independent.
+        psf_sigma: standard deviation of the width of the point spread function, px.
     """
 
     focal_length: float = 0.0
@@ -448,6 +449,7 @@ class CameraKnowledge:
     distortion: float = 0.005
     line_time: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
+    psf_sigma: float = 0.0
 
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)

@@ -464,6 +464,7 @@ class Binning:
         line_time = None if settings.line_time is None else settings.line_time * self.size
         centre, delay = settings.knowledge.centre / self.size, settings.line_time_sigma * self.size
         knowledge = replace(settings.knowledge, centre=centre, line_time=delay, covariance=covariance)
+        knowledge = replace(knowledge, psf_sigma=settings.knowledge.psf_sigma / self.size)
         psf_sigma = settings.psf_sigma / self.size
         return replace(settings, psf_sigma=psf_sigma, line_time=line_time, knowledge=knowledge)
 

@@ -35,7 +35,7 @@ from knightcube.vision.streaks.normal_equations import (
     rate_covariance,
     star_equations,
 )
-from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 from knightcube.vision.streaks.vibration import (
     CommonMotion,
     StreakResiduals,
@@ -376,7 +376,7 @@ _UNCHECKED = (2, 4.0)
 _WIDTH = 6
 # Relative difference between fitted and configured PSF variance that is neglected if the fitted PSF is
 # narrower, and if it is wider. A fast vibration makes streaks wider; therefore the latter is small, but one
-# standard deviation of the fitted variance is neglected in addition.
+# standard deviation of the difference between fitted and configured variance is neglected in addition.
 _NARROWER, _WIDER = 0.02, 0.004
 # Ratio of a streak end's error to the square root of the difference of fitted and configured PSF variance.
 _END_SHARE = 1.0
@@ -450,7 +450,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if fast > 0.0:
         # The covariance of the unresolved vibration replaces the limits on the motion common to all streaks.
         common_motion = CommonMotion()
-    end = _end_uncertainty(residuals, whole, settings.psf_sigma, result.misfit)
+    end = _end_uncertainty(residuals, whole, settings, result.misfit)
     shaken = _END_COMMON * max(common_motion.across, common_motion.along)
     ends = float(np.sqrt(2.0) * np.hypot(end, shaken) / result.length)
     # If the fit did not converge, the uncertainty includes its last step.
@@ -597,7 +597,9 @@ def contradiction(alone: StarEquations) -> float:
     return float(np.sum(left[known] ** 2 / values[known])) / freedom
 
 
-def _end_uncertainty(left: StreakResiduals, whole: StreakFit, sigma: float, misfit: float) -> float:
+def _end_uncertainty(
+    left: StreakResiduals, whole: StreakFit, settings: LikelihoodSettings, misfit: float
+) -> float:
     """Return the uncertainty (px) of streak ends due to a PSF that may differ from the model.
 
     If the residuals at the streak ends are not significant, the PSF has the modelled profile, with the same
@@ -605,18 +607,20 @@ def _end_uncertainty(left: StreakResiduals, whole: StreakFit, sigma: float, misf
     of the PSF or an unresolved fast vibration, which shifts the apparent ends. If a profile or a vibration
     was fitted, the width of the streaks does not limit the errors of their ends.
     """
-    scene, described = whole.scene, sigma**2 + PIXEL_VARIANCE
-    deviation = 2.0 * scene.width * float(np.sqrt(whole.solution.covariance[_WIDTH, _WIDTH]))
+    scene, described = whole.scene, settings.psf_sigma**2 + PIXEL_VARIANCE
+    learned = 2.0 * settings.psf_sigma * settings.knowledge.psf_sigma
+    fitted = 2.0 * scene.width * float(np.sqrt(whole.solution.covariance[_WIDTH, _WIDTH]))
     wider = scene.width**2 - described
-    beyond = max(wider - _WIDER * described - deviation, -wider - _NARROWER * described)
-    fitted = scene.profile != GAUSSIAN or scene.motion.vibration.exists
-    if beyond <= 0.0 and not fitted:
+    beyond = wider - _WIDER * described - float(np.hypot(fitted, learned))
+    beyond = max(beyond, -wider - _NARROWER * described - learned)
+    resolved = scene.profile != GAUSSIAN or scene.motion.vibration.exists
+    if beyond <= 0.0 and not resolved:
         return 0.0
     another = _END_SHARE * float(np.sqrt(max(beyond, 0.0))) * max(misfit, 1.0)
     ends = end_displacement(left, scene)
     if ends is None:
         return another
     seen = np.hypot(_END_SHOWN * ends.shown, _END_CHANCE * ends.chance)
-    if fitted:
+    if resolved:
         return float(np.hypot(_FITTED_FLOOR, seen))
     return min(another, float(np.hypot(_END_FLOOR, seen)))

@@ -261,6 +261,7 @@ def test_the_accuracy_of_the_lens_contains_the_scatter_of_the_corner() -> None:
     tangent = np.hypot(*DESCRIBED.centre) / values[0]
     radius = drawn[:, 0] * tangent * (1.0 + drawn[:, 3] * tangent**2 + drawn[:, 4] * tangent**4)
     assert known.accuracy.distortion == pytest.approx(np.std(radius) / np.mean(radius), rel=0.1)
+    assert known.accuracy.psf_sigma == unit[6]
 
 
 def test_the_configured_axis_shows_the_same_direction_through_the_learned_lens() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 from knightcube.astro.arrays import Image
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.frame import (
     Binning,
@@ -122,6 +122,13 @@ def test_the_line_time_of_binned_rows_is_a_multiple_whether_stated_or_not() -> N
     assert binning.settings(nobody).shutter_unstated
     assert binning.settings(stated).line_time == pytest.approx(3e-5)
     assert binning.settings(stated).line_time_sigma == 0.0
+
+
+def test_the_uncertainty_of_the_point_spread_is_given_in_binned_pixels() -> None:
+    settings = LikelihoodSettings(psf_sigma=3.0, knowledge=replace(EXACT, psf_sigma=0.06))
+    binned = Binning.suited(Pinhole(1024, 768, 3000.0), 3.0).settings(settings)
+    assert binned.psf_sigma == pytest.approx(1.0)
+    assert binned.knowledge.psf_sigma == pytest.approx(0.02)
 
 
 # Chi-square with 3 degrees of freedom that one of a thousand frames exceeds by chance.

@@ -413,7 +413,7 @@ def test_the_intensity_of_a_reversing_motion_is_that_of_many_instants(share: flo
 def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: pytest.MonkeyPatch) -> None:
     """The uncertainty is the root of the difference of the variances, or less if the residuals are small.
 
-    An excess within one standard deviation of the fitted variance is neglected.
+    An excess within one standard deviation of the fitted and of the learned variance is neglected.
     """
     left, scene = _left(0.0, 1.0, "ends")
     described = 1.2**2 + 1.0 / 12.0
@@ -424,6 +424,7 @@ def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: p
         ends: Displacement | None,
         deviation: float = 0.0,
         scene: StreakScene = scene,
+        learned: float = 0.0,
     ) -> float:
         monkeypatch.setattr(uncertainty, "end_displacement", lambda *_: ends)
         width = float(np.sqrt(described + change))
@@ -432,7 +433,9 @@ def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: p
         fit = SimpleNamespace(
             scene=replace(scene, width=width), solution=SimpleNamespace(covariance=covariance)
         )
-        return uncertainty._end_uncertainty(left, cast("StreakFit", fit), 1.2, misfit)
+        knowledge = replace(EXACT, psf_sigma=learned / (2.0 * 1.2))
+        settings = LikelihoodSettings(psf_sigma=1.2, knowledge=knowledge)
+        return uncertainty._end_uncertainty(left, cast("StreakFit", fit), settings, misfit)
 
     difference, another = 0.49 + uncertainty._WIDER * described, uncertainty._END_SHARE * 0.7
     assert found(difference, 0.5, None) == pytest.approx(another)
@@ -442,6 +445,10 @@ def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: p
     assert found(0.99 * uncertainty._WIDER * described, 1.0, None) == 0.0
     assert found(0.09, 1.0, None, deviation=0.1) == 0.0
     assert found(-0.99 * uncertainty._NARROWER * described, 1.0, None) == 0.0
+    assert found(difference + 0.5, 0.5, None, deviation=0.3, learned=0.4) == pytest.approx(another)
+    assert found(-0.49 - uncertainty._NARROWER * described - 0.1, 0.5, None, learned=0.1) == pytest.approx(
+        another
+    )
     assert found(difference, 1.0, Displacement(50.0, 60.0)) == pytest.approx(another)
     ends = Displacement(0.04, 0.1)
     shown = np.array([uncertainty._END_FLOOR, uncertainty._END_SHOWN * 0.04, uncertainty._END_CHANCE * 0.1])
