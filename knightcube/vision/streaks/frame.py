@@ -498,7 +498,7 @@ _MOST_REGIONS = 48
 # Minimum measured point-spread width (px) for which a frame is binned.
 _WIDE = 2.2
 # Minimum ratio of measured to configured point-spread width for which a frame is binned.
-_WIDER = 1.5
+_TOO_WIDE = 1.5
 
 
 # Minimum ratio of measured to configured point-spread width for which a second attempt uses a binned frame.
@@ -526,7 +526,7 @@ def prepare_frames(
 
     first = binning, frame, regions, _ = prepared(settings.psf_sigma)
     sigma = measured_psf_sigma(frame, regions) if binning.size == 1 else None
-    if sigma is not None and sigma > _WIDER * settings.psf_sigma:
+    if sigma is not None and sigma > _TOO_WIDE * settings.psf_sigma:
         sigma = max(sigma, measured_psf_sigma(frame, regions, near=2) or 0.0)
         if sigma > _WIDE:
             first = prepared(sigma)

@@ -40,6 +40,7 @@ from knightcube.vision.streaks.geometry import (
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
     SHARED,
+    WIDTH,
     Evaluation,
     Solution,
     consistent_stars,
@@ -108,7 +109,7 @@ GROWING = np.ones(SHARED, dtype=np.bool_)
 # Largest point-spread width (px) in a joint fit.
 _WIDEST = 6.0
 # Largest ratio of the fitted to the initial point-spread width in a joint fit.
-_WIDER = 1.6
+_WIDEST_RATIO = 1.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +241,7 @@ def iterate(
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
-    clip, widest = (camera.settings.clip, _WIDER * scene.width) if how.clipped else (0.0, _WIDEST)
+    clip, widest = (camera.settings.clip, _WIDEST_RATIO * scene.width) if how.clipped else (0.0, _WIDEST)
     before_step, solution, evaluation = scene, None, None
     for turn in range(how.rounds + (known is not None)):
         evaluation = None  # The old normal equations, tens of MB, are freed before the next evaluation.
@@ -288,7 +289,9 @@ def _stepped(scene: StreakScene, solution: Solution, pinhole: Pinhole) -> tuple[
     change = sensitivities(pinhole, scene.motion, stars, time, growing)
     along = change.reshape(-1, 8) @ np.append(solution.shared[:6], [0.0, 0.0])
     ends = float(np.hypot(along[::2], along[1::2]).max(initial=0.0))
-    share = min(1.0, _LONGEST_STEP / max(ends, 1e-9), 0.3 * scene.width / max(abs(solution.shared[6]), 1e-9))
+    share = min(
+        1.0, _LONGEST_STEP / max(ends, 1e-9), 0.3 * scene.width / max(abs(solution.shared[WIDTH]), 1e-9)
+    )
     step = solution.alone * share
     far = np.hypot(step[:, 0], step[:, 1])
     step[:, :2] *= np.minimum(1.0, _LONGEST_STEP / np.maximum(far, 1e-9))[:, None]
@@ -297,12 +300,12 @@ def _stepped(scene: StreakScene, solution: Solution, pinhole: Pinhole) -> tuple[
     after = replace(
         scene,
         motion=replace(scene.motion, rate=turn, acceleration=growth),
-        width=scene.width + float(shared[6]),
+        width=scene.width + float(shared[WIDTH]),
         stars=scene.stars + step[:, :2],
         light=np.maximum(scene.light + step[:, 2], 0.3 * scene.light),
         sky=scene.sky + step[:, 3],
     )
-    return after, max(ends, abs(float(solution.shared[6])))
+    return after, max(ends, abs(float(solution.shared[WIDTH])))
 
 
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:

@@ -37,10 +37,13 @@ SHARED = 7
 ALONE = 4
 """Number of parameters of a single star: x, y, flux and sky level."""
 _PARAMETERS = SHARED + ALONE
+WIDTH = 6
+"""Index of the point-spread width among the shared parameters."""
 
-# Margin (standard deviations) between modelled counts and saturation below which a pixel is excluded.
-# A selection by measured instead of modelled counts would be biased by their noise.
-_MARGIN = 3.0
+SATURATION_MARGIN = 3.0
+"""Margin (standard deviations) between modelled counts and saturation below which a pixel is excluded.
+
+A selection by measured instead of modelled counts would be biased by their noise."""
 # Allowance for model errors in the exclusion of outliers, as a fraction of a pixel's modelled counts.
 _UNRESOLVED = 0.1
 # Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.
@@ -155,7 +158,7 @@ def _matrices_numpy(geometry: FloatArray, light: FloatArray, trusted: BoolArray)
     """
     out = np.zeros((*geometry.shape[:2], SHARED + ALONE))
     out[:, :, :6] = geometry[:, :, :6] * light[:, None, None]
-    out[:, 5, 6] = light
+    out[:, 5, WIDTH] = light
     out[:, :, 7:9] = geometry[:, :, 6:] * light[:, None, None]
     out[:, 0, 9] = out[:, 6, 10] = 1.0
     out[:, :, :SHARED] *= trusted[:, None, None]
@@ -171,7 +174,7 @@ def _matrices(geometry: FloatArray, light: FloatArray, trusted: BoolArray) -> Fl
             for k in range(6):
                 out[b, i, k] = geometry[b, i, k] * shared
             out[b, i, 7], out[b, i, 8] = geometry[b, i, 6] * light[b], geometry[b, i, 7] * light[b]
-        out[b, 5, 6], out[b, 0, 9], out[b, 6, 10] = shared, 1.0, 1.0
+        out[b, 5, WIDTH], out[b, 0, 9], out[b, 6, 10] = shared, 1.0, 1.0
     return out
 
 
@@ -227,7 +230,7 @@ def residuals(
     variance += floor
     residual = signal - model
     deviation = np.sqrt(variance)
-    good = inside & (model + np.float32(_MARGIN) * deviation < ceiling)
+    good = inside & (model + np.float32(SATURATION_MARGIN) * deviation < ceiling)
     if clip > 0.0:
         deviation *= np.float32(clip)
         deviation += np.float32(_UNRESOLVED) * model
@@ -292,7 +295,11 @@ def _sum_products(
     blocks, count, size = images.shape
     gram, weighted = np.zeros((count, count)), np.empty(size, dtype=np.float32)
     model, least = np.empty(size, dtype=np.float32), np.float32(0.0)
-    per_count, margin, unresolved = np.float32(1.0 / gain), np.float32(_MARGIN), np.float32(_UNRESOLVED)
+    per_count, margin, unresolved = (
+        np.float32(1.0 / gain),
+        np.float32(SATURATION_MARGIN),
+        np.float32(_UNRESOLVED),
+    )
     share, room = np.float32(clip), np.float32(0.0 if clip > 0.0 else np.inf)
     for b in range(blocks):
         owner, left, weights = star[b], images[b, count - 1], weight[b]
@@ -383,7 +390,7 @@ def _spot_images(
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
     images[:, :6] = change[:, :6] * light
     # The squared width is sigma^2 plus the variance of a pixel, so that d sigma / d width = width / sigma.
-    images[:, 6] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
+    images[:, WIDTH] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
     images[:, 7:9] = change[:, 6:8] * light
     images[:, 9] = spots
     images[:, 10] = 1.0
@@ -847,7 +854,7 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> tuple[FloatArray, 
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     directions = np.zeros((4, SHARED))
-    directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, tangent_basis(axis), 1.0
+    directions[0, :3], directions[1:3, :3], directions[3, WIDTH] = axis, tangent_basis(axis), 1.0
     directions = directions[:, alone.kept]
     information = np.sum((alone.information @ directions.T) * directions.T, axis=1)
     informed = information > _NOTHING * information.max(axis=0)

@@ -30,6 +30,7 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, brightest_fit, refit
 from knightcube.vision.streaks.normal_equations import (
+    WIDTH,
     StarEquations,
     estimates_of,
     rate_covariance,
@@ -372,8 +373,6 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 _CONJUGATE = 12
 # Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
 _UNCHECKED = (2, 4.0)
-# Index of the point-spread width among the parameters that all stars share.
-_WIDTH = 6
 # Relative difference between fitted and configured PSF variance that is neglected if the fitted PSF is
 # narrower, and if it is wider. A fast vibration makes streaks wider; therefore the latter is small, but one
 # standard deviation of the difference between fitted and configured variance is neglected in addition.
@@ -609,7 +608,7 @@ def _end_uncertainty(
     """
     scene, described = whole.scene, settings.psf_sigma**2 + PIXEL_VARIANCE
     learned = 2.0 * settings.psf_sigma * settings.knowledge.psf_sigma
-    fitted = 2.0 * scene.width * float(np.sqrt(whole.solution.covariance[_WIDTH, _WIDTH]))
+    fitted = 2.0 * scene.width * float(np.sqrt(whole.solution.covariance[WIDTH, WIDTH]))
     wider = scene.width**2 - described
     beyond = wider - _WIDER * described - float(np.hypot(fitted, learned))
     beyond = max(beyond, -wider - _NARROWER * described - learned)

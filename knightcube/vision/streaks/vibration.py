@@ -29,7 +29,7 @@ from knightcube.vision.streaks.camera_motion import Vibration
 from knightcube.vision.streaks.fit_windows import LINES, SLOWEST, Strips
 from knightcube.vision.streaks.geometry import StreakScene, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
-from knightcube.vision.streaks.normal_equations import Pixels, residuals
+from knightcube.vision.streaks.normal_equations import SATURATION_MARGIN, Pixels, residuals
 from knightcube.vision.streaks.scene_images import model_images
 from knightcube.vision.streaks.vibrating_streaks import Rotations
 
@@ -37,8 +37,6 @@ from knightcube.vision.streaks.vibrating_streaks import Rotations
 _FOREIGN_SIGMAS = 5.0
 # Part of this residual limit, as a fraction of the brightest modelled pixel of the same line.
 _FOREIGN_SHARE = 0.6
-# Margin (standard deviations) to saturation below which a pixel is excluded, as in `normal_equations`.
-_MARGIN = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +198,7 @@ def _chosen_residuals(
     slot, inside, signal, floor, ceiling = pixels
     (_, lines, size), count = slot.shape, len(chosen)
     weight, residual = np.empty((count, lines, size), np.float32), np.empty((count, lines, size), np.float32)
-    per_count, margin, least = np.float32(1.0 / gain), np.float32(_MARGIN), np.float32(0.0)
+    per_count, margin, least = np.float32(1.0 / gain), np.float32(SATURATION_MARGIN), np.float32(0.0)
     sigmas, share = np.float32(_FOREIGN_SIGMAS), np.float32(_FOREIGN_SHARE)
     for c in range(count):
         b, flux = chosen[c], np.float32(light[c])

@@ -354,7 +354,7 @@ def test_outliers_and_pixels_near_saturation_have_no_weight(sign: float) -> None
     assert _weighted(36.0, 36.0 + sign * (limit - 0.1), 1e4, 3.0)[0] > 0.0
     assert _weighted(36.0, 36.0 + sign * (limit + 0.1), 1e4, 3.0) == (0.0, 0.0)
     assert _weighted(36.0, 36.0 + sign * 1000.0, 1e4, 0.0) == pytest.approx((1.0 / 16.0, sign * 1000.0))
-    room = normal_equations._MARGIN * 4.0
+    room = normal_equations.SATURATION_MARGIN * 4.0
     assert _weighted(36.0, 36.0, 36.0 + room + 0.1, 3.0)[0] > 0.0
     assert _weighted(36.0, 36.0, 36.0 + room - 0.1, 3.0)[0] == 0.0
 
