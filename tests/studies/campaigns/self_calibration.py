@@ -149,7 +149,9 @@ def run(case: Case) -> Result:
         assert one.tracker is not None
         found = run_with_lens(one, one.tracker, default_index())
         assert found.lens is not None
-        frames.append({**_judged(found, rate, bound), **_lens_error(found.lens, true), "before": lens.frames})
+        # A frame that contradicts the estimated lens is solved again with the configured lens.
+        before = lens.frames if found.lens.contradictions == lens.contradictions else 0
+        frames.append({**_judged(found, rate, bound), **_lens_error(found.lens, true), "before": before})
         lens = found.lens
     return {"row": row, "frames": frames}
 
