@@ -562,10 +562,11 @@ def _trial_starts(
     number = round(per_length * chain) + 1
     anchors, starts = np.empty((2 * size + number, 2)), np.empty(2 * size + number)
     for k in range(size):
-        anchors[2 * k], anchors[2 * k + 1] = corners[k], corners[k]
-        starts[2 * k], starts[2 * k + 1] = 0.0, 1.0
+        for end in range(2):
+            anchors[2 * k + end, 0], anchors[2 * k + end, 1] = corners[k, 0], corners[k, 1]
+            starts[2 * k + end] = end
     for k in range(number):
-        anchors[2 * size + k] = middle
+        anchors[2 * size + k, 0], anchors[2 * size + k, 1] = middle[0], middle[1]
         starts[2 * size + k] = 0.5 + chain * (k / (number - 1) - 0.5)
     return anchors, starts
 

@@ -135,13 +135,15 @@ def _of_sizes(
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         chord = max(squared[a, b], squared[b, c], squared[c, a])
         if shortest**2 <= chord <= medium**2:
-            found[count] = triangles[t]
+            found[count, 0], found[count, 1], found[count, 2] = a, b, c
             count += 1
         elif medium**2 < chord <= longest**2 and more < most:
-            larger[more] = triangles[t]
+            larger[more, 0], larger[more, 1], larger[more, 2] = a, b, c
             more += 1
     added = min(max(min(least, most) - count, 0), more)
-    found[count : count + added] = larger[:added]
+    for k in range(added):
+        for star in range(3):
+            found[count + k, star] = larger[k, star]
     return found[: count + added].copy()
 
 

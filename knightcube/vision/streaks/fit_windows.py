@@ -353,14 +353,15 @@ def _strip_pixels(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: 
     for u in range(found):
         b = used[u]
         along = lines.along_rows[b]
-        star[u], time[u], inside[u] = lines.star[b], lines.time[b], within[b, :, begin:end]
+        star[u] = lines.star[b]
         step[u, 0], step[u, 1] = (0, 1) if along else (1, 0)
         for i in range(each):
             column, row = (lines.line[b, i], minor[b, i]) if along else (minor[b, i], lines.line[b, i])
+            time[u, i] = lines.time[b, i]
             corner[u, i, 0], corner[u, i, 1] = column + begin * step[u, 0], row + begin * step[u, 1]
             first_pixel = corner[u, i, 1] * columns + corner[u, i, 0]
             for k in range(size):
-                place = first_pixel + k * (columns if along else 1)
+                place, inside[u, i, k] = first_pixel + k * (columns if along else 1), within[b, i, begin + k]
                 index[u, i, k] = place if inside[u, i, k] else 0
     return star, time, corner, step, index, inside
 

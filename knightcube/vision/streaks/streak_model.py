@@ -399,7 +399,9 @@ def _draw(
                 _exponential(pixels[_EXPONENT], power, exponential)
                 _draw_end(drawn, pixels, exponential, width, sign)
         if light_only:
-            out[b, 0] = drawn[0].reshape(line_count, count)
+            for line in range(line_count):
+                for k in range(count):
+                    out[b, 0, line, k] = drawn[0, line * count + k]
         else:
             _draw_moments(drawn, pixels, width)
 

@@ -259,7 +259,9 @@ def _sums(
                 if abs(apart) > _FARTHEST * sigma + 0.5:
                     continue
                 _profile_of(y, apart, sigma)
-                at_line[:] = x[:, i, first : first + count]
+                for row in range(3):
+                    for k in range(count):
+                        at_line[row, k] = x[row, i, first + k]
                 share = weight[b, i] * y[0, 0]
                 _add(out[b, 0, line], at_line[0], share)
                 _add(out[b, 1, line], at_line[2], share)
