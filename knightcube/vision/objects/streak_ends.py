@@ -350,15 +350,16 @@ def _corners_of_regions(
         left, right = max(box[2] - _PADDING, 0), min(box[3] + _PADDING, signal.shape[1])
         light, around = signal[top:bottom, left:right], labels[top:bottom, left:right]
         own, spans, margin = label[number], _spans_of(around, label[number]), max(half_width, 1)
-        if bottom - top <= right - left:
-            wanted = _widened(spans, margin, right - left)
-            response = _response(light, around, own, wanted, single, k, scratch)
-            found = _peaks(response, around, own, spans, limits, corners[total:])
-        else:
-            # A streak along columns is transposed, because few long rows take less time than many short ones.
-            wanted = _widened(_spans_across(around, own, spans), margin, bottom - top)
-            response = _response(light.T, around.T, own, wanted, single, k, scratch)
+        # A streak along columns is transposed, because few long rows take less time than many short ones.
+        upright = bottom - top > right - left
+        across = _spans_across(around, own, spans) if upright else spans
+        light, labelled = (light.T, around.T) if upright else (light, around)
+        wanted = _widened(across, margin, light.shape[1])
+        response = _response(light, labelled, own, wanted, single, k, scratch)
+        if upright:
             found = _peaks(response.T, around, own, spans, limits, corners[total:])
+        else:
+            found = _peaks(response, around, own, spans, limits, corners[total:])
         for n in range(total, total + found):
             corners[n, 0] += left
             corners[n, 1] += top

@@ -28,7 +28,8 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("night")
     paths = [folder / f"{number}.png" for number in range(3)]
     for number, path in enumerate(paths):
-        pillow.fromarray(sky_frame(np.random.default_rng([41, number]), 0.0, 0.5).pixels).save(path)
+        frame = sky_frame(np.random.default_rng([41, number]), 0.0, 0.5)
+        pillow.fromarray(frame.pixels).save(path, compress_level=1)
     return paths
 
 
@@ -63,7 +64,7 @@ def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path]
     The image covers only the central 7 deg, where a distortion is not measurable.
     """
     middle, out = tmp_path / "middle.png", tmp_path / "camera.yaml"
-    pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle)
+    pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle, compress_level=1)
     done = command("calibrate", middle, "--fov", "7.05", "--out", out)
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("k2:")]
@@ -89,7 +90,7 @@ def test_a_camera_file_says_how_well_the_lens_is_known(calibrated: tuple[dict[st
 def test_a_picture_of_another_focus_is_left_out_and_named(pictures: list[Path], tmp_path: Path) -> None:
     other = tmp_path / "other.png"
     picture = pillow.open(pictures[0])
-    picture.resize((1055, 1055)).crop((15, 15, 1039, 1039)).save(other)
+    picture.resize((1055, 1055)).crop((15, 15, 1039, 1039)).save(other, compress_level=1)
     done = command("calibrate", *pictures, other, "--fov", "12", "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
@@ -106,7 +107,8 @@ def test_few_stars_make_no_camera_file(pictures: list[Path], tmp_path: Path) -> 
         x, y = np.rint(star["point_px"]).astype(int)
         mask[max(0, y - 8) : y + 9, max(0, x - 8) : x + 9] = True
     dark = np.random.default_rng(3).normal(np.median(pixels), 11.0, pixels.shape)
-    pillow.fromarray(np.where(mask, pixels, np.clip(dark, 0, 4000)).astype(np.uint16)).save(corner)
+    kept = np.where(mask, pixels, np.clip(dark, 0, 4000)).astype(np.uint16)
+    pillow.fromarray(kept).save(corner, compress_level=1)
     done = command("calibrate", corner, "--fov", "12", "--out", out)
     assert done.returncode == 1
     assert "too few for a camera" in done.stderr
@@ -137,7 +139,8 @@ def test_mirrored_pictures_give_the_lens_of_the_pictures_as_they_are(
     paths = [tmp_path / path.name for path in pictures]
     for number, (path, source) in enumerate(zip(paths, pictures, strict=True)):
         pixels = np.asarray(pillow.open(source))
-        pillow.fromarray(pixels if number == 1 else np.ascontiguousarray(pixels[:, ::-1])).save(path)
+        seen = pixels if number == 1 else np.ascontiguousarray(pixels[:, ::-1])
+        pillow.fromarray(seen).save(path, compress_level=1)
     done = command("calibrate", *paths, "--fov", "12.3", "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)

@@ -180,7 +180,8 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(tmp_path: Path) -> Non
     """
     errors, variances = [], []
     for seed in (1, 2, 3):
-        pillow.fromarray(render(MODEL, SCENE, np.random.default_rng(seed))).save(tmp_path / "limb.png")
+        limb = pillow.fromarray(render(MODEL, SCENE, np.random.default_rng(seed)))
+        limb.save(tmp_path / "limb.png", compress_level=1)
         found = []
         for field in (("67",), ("70.3",), ("70.3", "--fov-error", "3.3")):
             words = ("--fov", *field, *_response(), "--altitude", "600", "--json")

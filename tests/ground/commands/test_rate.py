@@ -26,7 +26,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def picture(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pictures") / "frame.png"
-    pillow.fromarray(scene.pixels).save(path)
+    pillow.fromarray(scene.pixels).save(path, compress_level=1)
     return path
 
 
@@ -67,7 +67,7 @@ def test_the_overlay_marks_the_streaks_in_colour(picture: Path, tmp_path: Path) 
 def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path) -> None:
     noise = np.random.default_rng(1).normal(120.0, 10.0, (256, 256)).astype(np.uint16)
     path = tmp_path / "noise.png"
-    pillow.fromarray(noise).save(path)
+    pillow.fromarray(noise).save(path, compress_level=1)
     done = command("rate", path, "--fov", "5", "--exposure", "1", "--json")
     assert done.returncode == 1
     facts = json.loads(done.stdout)

@@ -25,7 +25,7 @@ from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame  # no
 
 
 def _written(frame: SkyFrame, path: Path) -> Path:
-    pillow.fromarray(frame.pixels).save(path)
+    pillow.fromarray(frame.pixels).save(path, compress_level=1)
     return path
 
 
@@ -143,7 +143,7 @@ def test_the_overlay_shows_the_stars_and_the_text_lists_them(picture: Path, tmp_
 def test_a_picture_without_stars_is_not_solved_and_says_why(tmp_path: Path) -> None:
     noise = np.random.default_rng(33).normal(100.0, 10.0, (256, 256)).astype(np.uint16)
     path = tmp_path / "noise.png"
-    pillow.fromarray(noise).save(path)
+    pillow.fromarray(noise).save(path, compress_level=1)
     done = command("solve", path, "--json")
     assert done.returncode == 1
     facts = json.loads(done.stdout)
