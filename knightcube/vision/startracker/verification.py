@@ -35,6 +35,9 @@ from knightcube.vision.startracker.attitude_fit import (
 from knightcube.vision.startracker.index import SkyIndex
 
 _MOST_ORDERED = 12
+# Share of the accepted chance matches that is used for comparisons with all observed stars. The rest is for
+# comparisons with the brightest observed stars alone.
+_ALL_OBSERVED = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +68,21 @@ class Chance:
         The observed stars with the indices `observed` match the expected stars `ranks` within `gate` standard
         deviations, both in order of brightness. Only expected stars down to a brightness limit are compared,
         and the limit with the most significant match is selected. The bound is therefore multiplied by j^2
-        pi^2/6, where j - 1 is the number of expected stars down to the limit without a match.
+        pi^2/6, where j - 1 is the number of expected stars down to the limit without a match. Either all
+        observed stars are compared, or only those down to the faintest match, with the same factor for their
+        limit. The choice between the two divides the bound by `_ALL_OBSERVED` or by 1 - `_ALL_OBSERVED`.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
         for matched in range(len(pairs), self.least - 1, -1):
             expected = pairs[matched - 1][0] + 1
-            value = self._of_places(gate, matched, expected)
-            value += math.log10(self.choices * math.pi**2 / 6.0 * (expected - matched + 1.0) ** 2)
+            bright = max(star for _, star in pairs[:matched]) + 1
+            limited = self._of_places(gate, matched, expected, bright) + _limit_choice(bright - matched)
+            value = min(
+                self._of_places(gate, matched, expected, self.observed) - math.log10(_ALL_OBSERVED),
+                limited - math.log10(1.0 - _ALL_OBSERVED),
+            )
+            value += math.log10(self.choices) + _limit_choice(expected - matched)
             if self.enough < value < self.enough + 8.0 and matched <= _MOST_ORDERED:
                 value += min(0.0, math.log10(2.0 * order_probability([star for _, star in pairs[:matched]])))
             best = min(best, value)
@@ -80,7 +90,7 @@ class Chance:
                 break
         return best
 
-    def _of_places(self, gate: float, matched: int, expected: int) -> float:
+    def _of_places(self, gate: float, matched: int, expected: int, observed: int) -> float:
         """Return log10 of the expected number of chance matches of at least `matched` of `expected` stars.
 
         The first matched star may be any star of the sky. The second matched star lies in a ring around the
@@ -92,16 +102,21 @@ class Chance:
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
-        if matched <= self.observed * chance:
+        if matched <= observed * chance:
             return math.log10(self.fields * expected)
         # The mean square distance of two points of a unit square is 1/3.
         ring = 2.0 * math.pi / 3.0 * expected * (self.scales + 2.0 * gate * math.sqrt(3.0 * self.spread))
-        lost = self.observed - matched
-        ways = math.lgamma(self.observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
+        lost = observed - matched
+        ways = math.lgamma(observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
         rest = (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
         # The probabilities of more matches decrease faster than a geometric series (Feller, section VI.3).
         ratio = lost / (matched + 1.0) * chance / (1.0 - chance)
         return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
+
+
+def _limit_choice(unmatched: int) -> float:
+    """Return log10 of the factor for a brightness limit above which `unmatched` stars have no match."""
+    return math.log10(math.pi**2 / 6.0 * (unmatched + 1.0) ** 2)
 
 
 def order_probability(sequence: Sequence[int]) -> float:
@@ -770,15 +785,16 @@ def _log10_chance(
         expected = ranks[matched - 1] + 1
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * spread / (1.0 - leverage) ** 2, 0.5)
-        if matched <= observed * chance:
-            value = math.log10(fields * expected)
-        else:
-            ring = 2.0 * math.pi / 3.0 * expected * (scales + 2.0 * gate * math.sqrt(3.0 * spread))
-            lost = observed - matched
-            value = math.lgamma(observed + 1.0) - math.lgamma(matched + 1.0) - math.lgamma(lost + 1.0)
-            value += (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
-            value -= math.log1p(-lost / (matched + 1.0) * chance / (1.0 - chance))
-            value = (value + math.log(fields * expected * ring)) / math.log(10.0)
+        ring = 2.0 * math.pi / 3.0 * expected * (scales + 2.0 * gate * math.sqrt(3.0 * spread))
+        unlikely = fields * expected * ring
+        bright = 0
+        for k in range(matched):
+            bright = max(bright, stars[k] + 1)
+        value = _log10_places(matched, observed, chance, fields * expected, unlikely)
+        value -= math.log10(_ALL_OBSERVED)
+        limited = _log10_places(matched, bright, chance, fields * expected, unlikely)
+        limited += math.log10(math.pi**2 / 6.0 * (bright - matched + 1.0) ** 2 / (1.0 - _ALL_OBSERVED))
+        value = min(value, limited)
         value += math.log10(choices * math.pi**2 / 6.0 * (expected - matched + 1.0) ** 2)
         if enough < value < enough + 8.0 and matched <= _MOST_ORDERED:
             value += min(0.0, math.log10(2.0 * _share_ordered(stars, matched)))
@@ -786,6 +802,21 @@ def _log10_chance(
         if best < enough - 2.0:
             break
     return best
+
+
+@loop_helper
+def _log10_places(matched: int, observed: int, chance: float, attitudes: float, pairs: float) -> float:
+    """Return the value of `Chance._of_places` for the probability `chance` that an observed star matches.
+
+    The expected numbers of first matched stars and of first pairs are `attitudes` and `pairs`.
+    """
+    if matched <= observed * chance:
+        return math.log10(attitudes)
+    lost = observed - matched
+    value = math.lgamma(observed + 1.0) - math.lgamma(matched + 1.0) - math.lgamma(lost + 1.0)
+    value += (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
+    value -= math.log1p(-lost / (matched + 1.0) * chance / (1.0 - chance))
+    return (value + math.log(pairs)) / math.log(10.0)
 
 
 @loop_helper

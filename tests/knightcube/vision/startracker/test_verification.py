@@ -44,34 +44,42 @@ def _chance(observed: int, spread: float) -> Chance:
 
 
 def test_the_bound_is_not_below_what_strewn_stars_show() -> None:
-    """Random star sets do not match by chance more often than the bound states.
+    """Random star sets match no more often than the bound states.
 
-    Sky and image are random sets of ten stars in a unit square. All rotations and shifts at a known scale are
-    tried: every pair of image stars is aligned with every sky pair of equal length, and the largest number of
-    matches is counted. The frequency of five matches is compared with the bound.
+    Sky and image are random sets of ten stars in a unit square, each in a random order of brightness. All
+    rotations and shifts at a known scale are tried: every pair of image stars is aligned with every sky pair
+    of equal length. The most significant bound of each trial is compared with its frequency.
     """
     rng = np.random.default_rng(5)
-    sigma, gate, stars, trials, reached = 0.004, 3.0, 10, 120, 0
-    for _ in range(trials):
+    sigma, gate, stars, trials = 0.004, 3.0, 10, 150
+    chance, bounds = _chance(stars, sigma**2), np.full(trials, np.inf)
+    for trial in range(trials):
         sky, seen = (rng.uniform(size=stars) + 1j * rng.uniform(size=stars) for _ in range(2))
-        best = 0
         for a, b in itertools.permutations(range(stars), 2):
             side = seen[b] - seen[a]
             turn = (sky[None, :] - sky[:, None]) / side + 10.0 * np.eye(stars)
             for i, j in np.argwhere(np.abs(np.abs(turn) - 1.0) * abs(side) < 2.0 * gate * sigma):
                 rotation = turn[i, j] / abs(turn[i, j])
                 laid = rotation * (seen - 0.5 * (seen[a] + seen[b])) + 0.5 * (sky[i] + sky[j])
-                best = max(best, int((np.abs(laid[:, None] - sky).min(axis=1) < gate * sigma).sum()))
-        reached += best >= 5
-    bound = 10.0 ** _chance(stars, sigma**2).log10(gate, range(5), range(5, 10))
-    assert reached / trials < min(bound, 1.0) + 0.05
+                apart = np.abs(laid[:, None] - sky)
+                near = np.flatnonzero(apart.min(axis=1) < gate * sigma)
+                if len(set(ranks := apart[near].argmin(axis=1).tolist())) == len(near) >= 3:
+                    bounds[trial] = min(bounds[trial], chance.log10(gate, near.tolist(), ranks))
+    for bound in (0.01, 0.1, 0.3):
+        assert np.mean(bounds < math.log10(bound)) < bound + 3.0 * math.sqrt(bound / trials)
+
+
+def test_the_brightest_stars_count_more_than_as_many_stars_of_any_brightness() -> None:
+    chance = _chance(40, 1e-6)
+    brightest, any_stars = (chance.log10(3.0, observed, range(5)) for observed in (range(5), range(0, 40, 8)))
+    assert brightest < any_stars - 3.0
 
 
 def test_more_matches_are_less_likely_and_wider_gates_more() -> None:
     chance = _chance(20, 1e-8)
-    values = [chance._of_places(3.5, matched, 20) for matched in range(4, 15)]
+    values = [chance._of_places(3.5, matched, 20, 20) for matched in range(4, 15)]
     assert np.all(np.diff(values) < 0.0)
-    assert chance._of_places(8.0, 6, 20) > chance._of_places(3.5, 6, 20)
+    assert chance._of_places(8.0, 6, 20, 20) > chance._of_places(3.5, 6, 20, 20)
 
 
 SKY = default_index()
