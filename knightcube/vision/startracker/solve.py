@@ -507,7 +507,7 @@ def _with_attitude(
             fix = attitude_by(settings.attitude, places, covariance, reference, camera, fit, late)
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
-    if problem := _contradiction(seen, fit):
+    if problem := _contradiction(seen, chosen, fit):
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=problem)
     camera = camera.rescaled(1.0 / fit.scale)
     if found.from_lens is not None:
@@ -536,18 +536,24 @@ def _with_attitude(
     )
 
 
-def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
+def _contradiction(seen: FrameSolution, chosen: IntArray, fit: ImageFit) -> str:
     """Return the reason to reject an attitude whose points have too large residuals, or an empty string.
 
     If the positions are wrong, for example because a defocused lens images stars as rings, only points that
     are within the gate by chance match. If fewer than half of the points match, the matching points may be
-    only those that lie near stars by chance. The residuals of matches by chance do not show the error.
+    only those that lie near stars by chance. The residuals of matches by chance do not show the error. Only
+    points down to the median brightness of the matching points are counted, because faint points may be noise
+    or stars that are not in the catalogue. The array `chosen` contains the indices of the fitted points.
     """
-    count, agreeing = len(seen.points), int(np.count_nonzero(fit.agree))
-    if seen.kind is not FrameKind.POINTS or 2 * agreeing >= count or fit.excess < _CONTRADICTED:
+    agreeing = chosen[fit.agree]
+    if seen.kind is not FrameKind.POINTS or fit.excess < _CONTRADICTED or not len(agreeing):
+        return ""
+    bright = int(np.sort(agreeing)[(len(agreeing) - 1) // 2]) + 1
+    missed = bright - int(np.count_nonzero(agreeing < bright))
+    if 2 * missed <= bright:
         return ""
     return (
-        f"{count - agreeing} of {count} points match no star, and the others are "
+        f"{missed} of the {bright} brightest points match no star, and the others are "
         f"{math.sqrt(fit.excess):.1f} times their uncertainty away from stars: check the focus"
     )
 
