@@ -43,6 +43,7 @@ from knightcube.vision.startracker.solve import (
     RatePrior,
     SolveSettings,
     SolveStatus,
+    solve_faint,
     solve_motion,
     solve_near,
     solve_points,
@@ -57,6 +58,7 @@ from knightcube.vision.streaks.streak_result import (
     StreakStatus,
 )
 
+_UNIDENTIFIED = {SolveStatus.NO_MATCH, SolveStatus.TOO_FEW_STARS}
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 # Correction of the assumed focal length, as a fraction, above which the motion is fitted a second time.
 _SCALE_TOLERANCE = 0.01
@@ -409,8 +411,13 @@ def _of_picture(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> Frame
 
 
 def _from_points(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, seen: Survey) -> FrameSolution:
+    """Return the attitude from the points of a frame, or from faint stars if too few points are stars."""
     stars = measure_areas(seen).stars()
-    return solve_points(stars, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
+    solution = solve_points(stars, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
+    if solution.status not in _UNIDENTIFIED or tracker.solve.method is not None:
+        return solution
+    faint = solve_faint(seen.pixels, stars, job.camera, tracker.scale, sky, tracker.solve)
+    return solution if faint is None or faint.fix is None else faint
 
 
 def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: MotionResult) -> FrameFound:

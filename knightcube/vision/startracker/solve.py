@@ -23,10 +23,11 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
-from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.astro.quaternion import attitude_matrix, conjugate, from_matrix, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, LensError, Pinhole
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.detect import Detections, measure_near
+from knightcube.vision.startracker.faint_stars import FrameLight, match_by_light
 from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, attitude_by, fit_in_image
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
@@ -217,6 +218,9 @@ _SPLIT_PX = 10.0
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference from the prior attitude (1 false rejection in 100,000 frames).
 _NEAR = 25.9
+# In a frame in which few stars are detected without a prediction: minimum height of a star near its predicted
+# position, in standard deviations, and minimum number of such stars.
+_FAINT_SIGMAS, _FEWEST_FAINT = 3.5, 3
 # Number of guide stars that the tracking mode searches near their predicted positions.
 _LOOKED_FOR = 30
 # Minimum and maximum search radius (px) around a predicted position.
@@ -284,6 +288,50 @@ def solve_points(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
     return _shape_unknown(solution, found, settings)
+
+
+def solve_faint(
+    pixels: Image,
+    found: Detections,
+    camera: CameraModel,
+    scale: tuple[float, float],
+    sky: SkyIndex,
+    settings: SolveSettings,
+) -> FrameSolution | None:
+    """Return the attitude of a frame in which few stars are detected, from the light of faint stars, or None.
+
+    The brightest sources `found` may be stars. At an attitude at which the light of faint stars is
+    significant, the stars are measured near their predicted positions with a lower threshold.
+    """
+    seen = FrameSolution(SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, found.points, found.covariance)
+    limit = settings.identification.verification.log10_false_alarm
+    field, light = star_field(seen, found.flux, scale), FrameLight.of(pixels, camera)
+    match = match_by_light(field, sky, light, limit)
+    if match is None:
+        return None
+    across, down = (width * match.scale for width in field.half_width)
+    star = expected_stars(sky, match.matrix, (across, down), _LOOKED_FOR)
+    places = camera.rescaled(1.0 / match.scale).project(sky.stars.direction[star] @ match.matrix.T)
+    width = found.psf_sigma if settings.detection.psf_sigma is None else settings.detection.psf_sigma
+    detection = replace(
+        settings.detection,
+        psf_sigma=width if math.isfinite(width) else None,
+        threshold_sigmas=_FAINT_SIGMAS,
+        search_radius=_LEAST_RADIUS_PX,
+    )
+    near = measure_near(pixels, places, detection).stars()
+    if len(near) < _FEWEST_FAINT:
+        return None
+    identified = StarMatch(
+        MatchStatus.IDENTIFIED,
+        star[near.prediction],
+        AttitudeFix(from_matrix(match.matrix), np.eye(3) / camera.focal_length**2, 0.0),
+        match.scale,
+        0.0 if scale[0] == scale[1] else 1.0,
+        match.log10_chance,
+    )
+    seen = replace(seen, points=near.points, covariance=near.covariance)
+    return _shape_unknown(_with_attitude(seen, identified, sky, settings), near, settings)
 
 
 def solve_places(

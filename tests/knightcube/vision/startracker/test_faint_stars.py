@@ -1,0 +1,135 @@
+"""Tests of the identification of frames in which few stars are detected, from the light of faint stars."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.vision.camera.lens import CameraModel, Lens
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.attitude_fit import StarField
+from knightcube.vision.startracker.detect import Detections, detect
+from knightcube.vision.startracker.faint_stars import (
+    _LEVELS,
+    FrameLight,
+    LightMatch,
+    _evidence,
+    _Search,
+    match_by_light,
+)
+from knightcube.vision.startracker.solve import (
+    FrameSolution,
+    SolveSettings,
+    SolveStatus,
+    solve_points,
+    star_field,
+)
+from knightcube.vision.startracker.survey import FrameKind
+from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.support.compiled_forms import assert_forms_agree
+
+_EXPOSURE = 0.0012
+_FIXED = 1.0, 1.0
+_CHI_SQUARE_3_DOF_1E_6 = 30.7
+
+
+@cache
+def _dim_frame(seed: int) -> SkyFrame:
+    """Return a frame of such a short exposure that in most frames too few stars are detected."""
+    return sky_frame(np.random.default_rng([39, seed]), 0.0, _EXPOSURE)
+
+
+def _field(found: Detections, scale: tuple[float, float] = _FIXED) -> StarField:
+    camera: CameraModel = NARROW.pinhole
+    seen = FrameSolution(SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, found.points, found.covariance)
+    return star_field(seen, found.flux, scale)
+
+
+def test_frames_with_too_few_detected_stars_are_answered_and_the_answers_are_right() -> None:
+    alone = answered = 0
+    for seed in range(16):
+        frame = _dim_frame(seed)
+        given = NARROW.pinhole, _FIXED
+        alone += solve_points(detect(frame.pixels).stars(), *given, sky(), SolveSettings()).fix is not None
+        found = solve_frame(frame.pixels, *given, _EXPOSURE, sky(), SolveSettings())
+        if found.fix is None:
+            continue
+        answered += 1
+        error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(frame.attitude)))
+        assert error @ np.linalg.solve(found.fix.covariance, error) < _CHI_SQUARE_3_DOF_1E_6
+    assert alone <= 6
+    assert answered >= alone + 5
+
+
+def test_the_light_of_a_sky_that_is_not_the_catalogue_s_matches_no_attitude() -> None:
+    """Fields with left and right swapped are not in the catalogue; the bound stays near one or above."""
+    lowest = 0.0
+    for seed in range(8):
+        pixels = np.ascontiguousarray(_dim_frame(seed).pixels[:, ::-1])
+        found = match_by_light(
+            _field(detect(pixels).stars()), sky(), FrameLight.of(pixels, NARROW.pinhole), 1.0
+        )
+        lowest = min(lowest, 0.0 if found is None else found.log10_chance)
+    assert lowest > -1.5
+
+
+def test_the_mean_likelihood_ratio_at_random_positions_is_one() -> None:
+    light = FrameLight.of(_dim_frame(0).pixels, NARROW.pinhole)
+    count = np.bincount(light.level.ravel(), minlength=_LEVELS + 1)[:_LEVELS]
+    mean = np.exp(light.log_ratio[:, :_LEVELS]) @ (count / count.sum())
+    assert np.all(mean < 1.02)
+
+
+def test_the_image_scale_is_found_within_its_range_and_a_wide_range_is_refused() -> None:
+    frame = sky_frame(np.random.default_rng(40), 0.0, 0.003)
+    light, found = FrameLight.of(frame.pixels, NARROW.pinhole), detect(frame.pixels).stars()
+    near = match_by_light(_field(found, (0.98, 1.02)), sky(), light, -4.5)
+    assert near is not None
+    assert abs(near.scale - 1.0) < 0.002
+    assert _pointing_error(near, frame) < 1e-3
+    assert match_by_light(_field(found, (0.8, 1.2)), sky(), light, -4.5) is None
+    assert match_by_light(_field(found.select(np.array([0]))), sky(), light, -4.5) is None
+
+
+def _pointing_error(found: LightMatch, frame: SkyFrame) -> float:
+    """Return the angle, rad, between the found and the true boresight."""
+    return math.acos(min(1.0, float(found.matrix[2] @ attitude_matrix(frame.attitude)[2])))
+
+
+def test_the_light_of_a_distorting_lens_is_at_the_positions_of_an_ideal_camera() -> None:
+    ideal = NARROW.pinhole
+    lens = Lens(ideal.columns, ideal.rows, ideal.focal_length, ideal.centre, k1=-1.5)
+    pixels = np.full((ideal.rows, ideal.columns), 100, dtype=np.uint16)
+    pixels += np.random.default_rng(1).integers(0, 5, pixels.shape, dtype=np.uint16)
+    direction = ideal.unit_vectors(np.array([[80.0, 60.0], [900.0, 700.0]]))
+    for column, row in np.rint(lens.project(direction)).astype(int):
+        pixels[row, column] += 500
+    light = FrameLight.of(pixels, lens)
+    assert np.all(np.abs(lens.project(direction) - [[80.0, 60.0], [900.0, 700.0]]).max(axis=1) > 3.0)
+    for column, row in np.rint(ideal.project(direction)).astype(int):
+        assert light.level[row, column] == _LEVELS - 1
+
+
+@pytest.mark.parametrize("scale", [_FIXED, (0.99, 1.01)])
+def test_all_forms_find_the_same_evidence(scale: tuple[float, float]) -> None:
+    frame = _dim_frame(1)
+    field, light = _field(detect(frame.pixels).stars(), scale), FrameLight.of(frame.pixels, NARROW.pinhole)
+    search = _Search(field, sky(), light)
+    pair, stars = next(search.pairs())
+    assert_forms_agree(
+        _evidence,
+        field.direction[pair],
+        *scale,
+        sky().stars.direction,
+        sky().stars.magnitude,
+        stars[:300],
+        search.guide.neighbours,
+        5.0,
+        NARROW.pinhole.focal_length,
+        light.without(search.points[pair]),
+        light.log_ratio,
+    )
