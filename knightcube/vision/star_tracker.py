@@ -253,8 +253,10 @@ class StarTracker:
         found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
         self.lens, frame = found.lens, found.solution
         assert frame is not None  # the job contains the settings of the star tracker
-        if frame.fix is None and exposure is None and self._camera is None and not self._learn:
-            frame = self._solved_coarser(image, sky, settings) or frame
+        few = frame.fix is None or frame.faint
+        if few and exposure is None and self._camera is None and not self._learn:
+            coarse = self._solved_coarser(image, sky, settings)
+            frame = frame if coarse is None or len(coarse.matched) < len(frame.matched) else coarse
         if frame.status is SolveStatus.NO_MATCH and scale[0] < scale[1]:
             low, high = (math.degrees(field_of_view(camera.rescaled(1.0 / limit))) for limit in scale)
             searched = f"fields of view of {low:.3g} to {high:.3g} deg were searched"

@@ -74,6 +74,7 @@ class FrameSolution:
         bend: fitted lens errors (8,), see `sky_map`; zeros if the lens is exact.
         log10_false_alarm: log10 of the probability that a frame of random points would match equally well.
         tracked: whether the stars were identified by a search near the prior attitude.
+        faint: whether the stars were identified by the light of faint stars (`solve_faint`).
         motion: motion of the camera from the streaks, camera frame, or None for points.
         mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
             image after left and right are swapped about the optical axis. The points of a solution are those
@@ -95,6 +96,7 @@ class FrameSolution:
     bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
     log10_false_alarm: float = 0.0
     tracked: bool = False
+    faint: bool = False
     motion: MotionResult | None = None
     mirrored: bool = False
     psf_sigma: float = math.nan
@@ -330,7 +332,7 @@ def solve_faint(
         0.0 if scale[0] == scale[1] else 1.0,
         match.log10_chance,
     )
-    seen = replace(seen, points=near.points, covariance=near.covariance)
+    seen = replace(seen, points=near.points, covariance=near.covariance, faint=True)
     return _shape_unknown(_with_attitude(seen, identified, sky, settings), near, settings)
 
 

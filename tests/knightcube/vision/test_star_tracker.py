@@ -148,13 +148,12 @@ def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> 
         np.testing.assert_array_equal(tracker.solve(image).quaternion, grey.quaternion)
 
 
-def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(
-    resting: SkyFrame, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images with stars of several pixels are solved in sums of pixels.
 
     Large photographs have such stars, and the noise of neighbouring pixels is correlated.
     """
+    resting = sky_frame(np.random.default_rng(5), 0.0, 0.1)
     spread = gaussian_filter(np.kron(resting.pixels.astype(float), np.ones((3, 3))), 3.0)
     image = np.rint(spread[1:-1, 1:-1]).astype(np.uint16)
     tracker = StarTracker(fov_deg=12.0)
