@@ -46,7 +46,7 @@ import numpy as np
 from flight.loop.coil_currents import ELECTRICAL, NEWEST, Bounds, CoilFault, Predicted, Supplied, fits
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.compiled import compiled_form_of
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
@@ -595,7 +595,8 @@ def _bin_equations(
     """See `_bin_equations_numpy`."""
     (count, columns), number, modes = samples.shape, len(free), len(gyroscopic) // 3 - 1
     coils, last = columns - 7, 2 * number + modes + columns - 7
-    after, moved, rows = _twice(sums[0]), np.zeros((2, 3)), np.zeros((3, last + 1))
+    after, moved, rows = np.empty_like(sums), np.zeros((2, 3)), np.zeros((3, last + 1))
+    after[:] = sums[0]
     fastest = 0.0
     for place in range(count):
         weight, (x, y, z) = samples[place, 0], (samples[place, 1], samples[place, 2], samples[place, 3])
@@ -630,15 +631,6 @@ def _bin_equations(
         for coil in range(coils):
             rows[axis, 2 * number + modes + coil] = change[3 * coil + axis]
     return after, moved, rows, math.sqrt(fastest)
-
-
-@loop_helper
-def _twice(values: FloatArray) -> FloatArray:
-    """Return an array (2, n) whose rows are both equal to `values` (n,)."""
-    both = np.empty((2, len(values)))
-    for place in range(len(values)):
-        both[0, place], both[1, place] = values[place], values[place]
-    return both
 
 
 class Finding(Enum):
