@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from flight.app.flight import fly
@@ -22,10 +23,12 @@ FLIGHT, LINK, SAFE = "knightcube.service", "knightcube-link.service", "knightcub
 
 
 def linked_text() -> str:
-    """Return a simulated configuration with a link."""
+    """Return a simulated configuration with a link, and without a camera, whose sky index takes seconds."""
+    text = CONFIG.read_text(encoding="utf-8")
+    text = re.sub(r"^camera:.*?^(?=\S)", "camera: none\n", text, flags=re.MULTILINE | re.DOTALL)
     link = json.dumps({"keys": KEYS, "udp": "127.0.0.1:5000"})
     commands = json.dumps({"socket": SOCKET})
-    return f"{CONFIG.read_text(encoding='utf-8')}\ncommands: {commands}\nlink: {link}\n"
+    return f"{text}\ncommands: {commands}\nlink: {link}\n"
 
 
 class RenewedEnds(FiledEnds):
