@@ -30,7 +30,7 @@ def halve(number: int) -> int:
         number = number // 2
     return number
 '''
-TEST = """from knightcube.product import halve, larger
+TEST = """from knightcube.product import larger
 
 
 def test_broken_without_a_mutant():
@@ -39,6 +39,8 @@ def test_broken_without_a_mutant():
 
 def test_larger():
     assert larger(2, 1) and not larger(1, 2) and not larger(2, 2)
+"""
+OTHER_TEST = """from knightcube.product import halve
 
 
 def test_halve():
@@ -47,13 +49,16 @@ def test_halve():
 
 
 @pytest.fixture
-def repository(tmp_path: Path) -> Path:
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a repository with one module and its tests, one of which fails."""
+    # The import of the installed plugins would take half of each run.
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     root = tmp_path / "repository"
     files = {
         "knightcube/__init__.py": "",
         "knightcube/product.py": PRODUCT,
         "tests/knightcube/test_product.py": TEST,
+        "tests/knightcube/test_of_another_module.py": OTHER_TEST,
         "pyproject.toml": '[tool.pytest.ini_options]\nmarkers = ["slow"]\naddopts = "-p no:cacheprovider"\n',
     }
     for name, text in files.items():
@@ -142,7 +147,7 @@ def test_killed_survived_and_equivalent(
 
 
 def test_a_hang_is_killed(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time limit kills a mutant whose loop never ends."""
+    """The time limit kills a mutant whose loop never ends, in a test file other than that of the module."""
     monkeypatch.setattr(mutants, "LIMIT_S", 3.0)
     found = mutants_of(PRODUCT, "knightcube/product.py")
     [endless] = [mutant for mutant in found if mutant.text == "(number >= 0)"]
@@ -180,7 +185,7 @@ def test_equivalent_mutants_have_reasons() -> None:
 
 def test_slice_of_product_code(tmp_path: Path) -> None:
     """Any test of the functions kills two mutants of the repository that return None."""
-    drawn = draw(ROOT, 400, 1, ["knightcube/astro/quaternion.py"])
+    drawn = draw(ROOT, 400, 1, ["knightcube/astro/inertia.py"])
     found = [one for one in drawn if one.text == "return None"][:2]
     assert len(found) == 2
     assert [verdict.result for verdict in mutants.judge(ROOT, found, {})] == ["killed", "killed"]
