@@ -13,7 +13,8 @@ are processor times of one core. For photographs, the time is the median of some
 that is not counted, for all programs. The other star identification
 programs extract the stars themselves, with their default filters and without filters. `ratios` compares the
 time of each photograph with known field with that of each other program: the median of the ratios for each
-frame size.
+frame size. `dim frames` are frames of a calibrated camera with such short exposures that few stars are
+detected.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,9 +32,11 @@ import numpy as np
 
 from ground.campaigns.runner import show
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.quaternion import attitude_matrix
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.vision.camera.images import read_image
-from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.solve import SolveSettings
+from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, PeerPython, Peers, peer_answers
 from tests.studies.command import Json, command, scratch
@@ -56,6 +60,7 @@ _SEED = 16_018
 _STREAKS_PX = (0.0, 10.0, 20.0, 40.0, 80.0)
 _OBLIQUE, _ACROSS = (30.0, 90.0), (90.0, 90.0)
 _EXPOSURE = 0.1
+_SHORT_EXPOSURES, _BEYOND = (0.003, 0.002, 0.0012, 0.0008), 6.0
 
 
 _REDUCED, _ASPECT_ERROR = (646, 486), 0.02
@@ -132,6 +137,35 @@ def row_of(length: float, theta_deg: tuple[float, float], frames: int) -> dict[s
         "median_ms": float(np.median(columns["ms"])),
         "p95_ms": float(np.percentile(columns["ms"], 95.0)),
         "tracking_ms": float(np.median(columns["tracking_ms"])),
+    }
+
+
+def dim_row_of(exposure: float, frames: int) -> dict[str, Any]:
+    """Return the statistics of `frames` random frames of a calibrated camera with a short exposure, s.
+
+    An attitude is wrong if its error exceeds 6 standard deviations.
+    """
+    right, faint, wrong, ratios, times = 0, 0, 0, [], []
+    for frame in range(frames):
+        scene = sky_frame(np.random.default_rng([_SEED, frame]), 0.0, exposure)
+        begin = time.process_time()
+        found = solve_frame(scene.pixels, NARROW.pinhole, (1.0, 1.0), exposure, sky(), SolveSettings())
+        times.append(1e3 * (time.process_time() - begin))
+        if found.fix is not None:
+            error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(scene.attitude)))
+            square = float(error @ np.linalg.solve(found.fix.covariance, error))
+            right, wrong = right + (square <= _BEYOND**2), wrong + (square > _BEYOND**2)
+            faint += found.faint
+            ratios.append(square / 3.0)
+    return {
+        "exposure_ms": 1e3 * exposure,
+        "frames": frames,
+        "right": right,
+        "of_these_faint": faint,
+        "wrong": wrong,
+        "nees": _or_nan(np.mean, np.array(ratios)),
+        "median_ms": float(np.median(times)),
+        "p95_ms": float(np.percentile(times, 95.0)),
     }
 
 
@@ -260,5 +294,6 @@ def main(
     small = f"{_REDUCED[0]} x {_REDUCED[1]}"
     facts = _counted([one for one in pictures if one.size != small])
     facts["reduced"] = _counted([one for one in pictures if one.size == small])
-    show(facts | {"frames": rows, "peers": others, "ratios": ratios}, json)
+    dim = [dim_row_of(exposure, frames) for exposure in _SHORT_EXPOSURES]
+    show(facts | {"frames": rows, "dim frames": dim, "peers": others, "ratios": ratios}, json)
     return 0
