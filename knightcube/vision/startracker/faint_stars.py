@@ -44,7 +44,7 @@ _MOST_UNLIKE = 1.5
 _APART_TOLERANCE = 1.0
 # Ratio of the highest to the lowest image scale above which there are too many candidates, and the largest
 # number of candidates; further pairs of points are left out.
-_WIDEST_SCALE, _MOST_CANDIDATES = 1.15, 2_000_000
+_WIDEST_SCALE, _MOST_CANDIDATES = 1.15, 600_000
 # Number of candidates that are computed at a time, and number of steps in which their scales are fitted.
 _TOGETHER, _SCALE_STEPS = 20_000, 3
 # Number of the brightest neighbours of a guide star that are predicted for every candidate, and number of
@@ -238,11 +238,12 @@ class _Search:
     def pairs(self) -> Iterator[tuple[IntArray, IntArray]]:
         """Yield pairs of points (2,), the brightest first, and the similar pairs of guide stars (c, 2)."""
         total, diagonal = 0, math.hypot(self.light.camera.columns, self.light.camera.rows)
+        inside = self.light.camera.contains(self.points, -1.0)
         magnitude, seen = self.sky.stars.magnitude, self.field.magnitude
         for other in range(1, min(_BRIGHTEST, len(self.points))):
             for one in range(other):
                 apart = math.dist(self.points[one], self.points[other])
-                if apart < _LEAST_APART * diagonal:
+                if not (inside[one] and inside[other] and apart > _LEAST_APART * diagonal):
                     continue
                 pair: IntArray = np.array([one, other])
                 limits = _chord(_stretched(self.field.direction[pair], np.array(self.field.scale)))
