@@ -30,6 +30,7 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, brightest_fit, refit
 from knightcube.vision.streaks.normal_equations import (
+    ALONE,
     WIDTH,
     StarEquations,
     estimates_of,
@@ -440,7 +441,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     # The cause of the rejection of some stars may also affect the accepted stars to a smaller degree.
     agreed = int(np.count_nonzero(scene.trusted))
     judged = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
-    spread = max(result.misfit, lens.spread, 1.0) * max(judged / max(agreed, 1), 1.0)
+    spread = max(result.misfit, lens.spread, _misfit_of_motion(last), 1.0) * max(judged / max(agreed, 1), 1.0)
     if agreed <= _UNCHECKED[0]:
         spread *= _UNCHECKED[1]
     residuals = residuals_of_fit(camera, whole)
@@ -550,6 +551,22 @@ def _lens_effect(
     return _LensEffect(
         corrected.step[:3], added, stated, before if seen else spread, corrected.error, counted, seen
     )
+
+
+def _misfit_of_motion(last: StreakFit) -> float:
+    """Return the chi-square per degree of freedom of the stars, weighted by their information on the rate.
+
+    A single bright star can determine a component of the rate. Its residuals then show the error of this
+    component, which the median over all stars and the scatter of the stars do not. The largest of the values
+    for the three components of the rate is returned.
+    """
+    trusted = np.flatnonzero(last.scene.trusted)
+    equations = star_equations(last.evaluation, last.solution.eliminated)
+    _, deviation = estimates_of(equations, last.scene)
+    weight = deviation[trusted, :3] ** -2
+    freedom = np.maximum(last.evaluation.pixels[trusted] - ALONE - 1.0, 1.0)
+    each = last.evaluation.chi2[trusted] / freedom
+    return float(np.max(each @ weight / weight.sum(axis=0)))
 
 
 # Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.

@@ -27,7 +27,7 @@ from knightcube.vision.streaks.geometry import (
     sensitivities,
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, brightest_fit
-from knightcube.vision.streaks.normal_equations import SHARED, StarEquations
+from knightcube.vision.streaks.normal_equations import ALONE, SHARED, StarEquations
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from knightcube.vision.streaks.uncertainty import (
     Displacement,
@@ -578,3 +578,19 @@ def test_the_scatter_of_equally_accurate_stars_is_their_sample_variance() -> Non
     assert disagreement(np.append(change, [[90.0, 90.0]], axis=0), faint) == pytest.approx(expected, rel=1e-2)
     assert disagreement(change[:2], deviation[:2]) == 1.0
     assert disagreement(change[:3], deviation[:3]) != 1.0
+
+
+def test_the_misfit_of_the_star_that_determines_the_rate_counts_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The misfits are weighted by the stars' information on the worst component of the rate.
+
+    A star that does not affect the motion does not count.
+    """
+    information = np.array([[90.0, 1.0, 1.0, 1.0], [5.0, 1.0, 1.0, 1.0], [5.0, 2.0, 2.0, 9.0], [1e4] * 4])
+    monkeypatch.setattr(uncertainty, "star_equations", lambda *_: None)
+    monkeypatch.setattr(uncertainty, "estimates_of", lambda *_: (information, information**-0.5))
+    trusted = SimpleNamespace(trusted=np.array([True, True, True, False]))
+    pixels = np.array([105.0, 205.0, 305.0, 5.0])
+    evaluation = SimpleNamespace(pixels=pixels, chi2=np.array([4.0, 1.0, 2.0, 1e3]) * (pixels - ALONE - 1.0))
+    solution = SimpleNamespace(eliminated=None)
+    fit = SimpleNamespace(scene=trusted, evaluation=evaluation, solution=solution)
+    assert uncertainty._misfit_of_motion(cast("StreakFit", fit)) == pytest.approx(3.6 + 0.05 + 0.1)
