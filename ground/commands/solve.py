@@ -167,6 +167,7 @@ def facts(solution: StarSolution, seconds: float) -> dict[str, Any]:
         "field_of_view_sigma_deg": math.degrees(solution.field_of_view_sigma),
         "focal_length_px": solution.frame.camera.focal_length,
         "log10_false_alarm": chance if math.isfinite(chance) else None,
+        "by_light_of_faint_stars": solution.frame.faint,
         "stars": [
             {
                 "hip": hip,
@@ -212,7 +213,8 @@ def _text(solution: StarSolution, seconds: float) -> str:
         f'field of view:    {solution.field_of_view_deg:.4f} deg across, {per_pixel:.2f}" per pixel',
         f"stars:            {len(stars)} of {len(frame.points)} {frame.kind.value} matched,"
         f" residual {rms:.2f} px rms per axis",
-        f"by chance:        10^{solution.log10_false_alarm:.0f}",
+        f"by chance:        10^{solution.log10_false_alarm:.0f}"
+        + (", by the light of faint stars" if frame.faint else ""),
     ]
     if solution.mirrored:
         lines.append("mirrored:         yes; the attitude belongs to the picture after mirroring")
