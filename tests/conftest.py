@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import importlib
 import os
 import resource
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -65,6 +67,31 @@ def session_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pytest_xdist_auto_num_workers() -> int:
     """Return the number of workers for `-n auto`, one more than the cores, because many tests wait."""
     return len(os.sched_getaffinity(0)) + 1
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Let one worker process run all files whose tests compile functions.
+
+    Numba compiles its own functions, such as that of `np.empty`, again in each process that compiles a
+    function that calls them, which takes some seconds.
+    """
+    if config.getoption("dist") != "loadfile":
+        return None
+    scheduling = importlib.import_module("xdist.scheduler").LoadFileScheduling(config, log)
+    file_of = scheduling._split_scope
+    compiling = {
+        path.relative_to(config.rootpath).as_posix()
+        for path in Path(__file__).parent.rglob("test_*.py")
+        if "compiled_forms" in path.read_text(encoding="utf-8")
+    }
+
+    def scope_of(nodeid: str) -> str:
+        file = str(file_of(nodeid))
+        return "compiling" if file in compiling else file
+
+    scheduling._split_scope = scope_of
+    return scheduling
 
 
 @pytest.hookimpl(hookwrapper=True)
