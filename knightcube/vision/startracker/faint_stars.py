@@ -10,8 +10,8 @@ stars of the predicted brightness, divided by its probability if the positions a
 the light at random positions is that of all pixels of the frame, so that other points of light, such as hot
 pixels and stars that are not in the catalogue, are included. At random positions, the likelihood ratio
 exceeds r with a probability of at most 1/r (Markov's inequality). The expected number of chance matches is
-the sum of these probabilities over the candidates. Candidates that need few brighter stars than the two
-points, and pairs of bright points, get larger shares of the accepted number of chance matches.
+the sum of these probabilities over the candidates. A candidate gets a larger share of the accepted number of
+chance matches if few stars in the frame are brighter than its two guide stars, or if its points are bright.
 """
 
 from __future__ import annotations
@@ -33,26 +33,28 @@ from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.survey import Surface
 from knightcube.vision.startracker.verification import expected_stars
 
-# Average number of guide stars per field of which pairs are formed.
+# Pairs are formed only from the brightest guide stars, on average this many in a field of view.
 _PER_FIELD = 20.0
 # Number of the brightest points of which pairs are formed, and the minimum distance of the points of a pair
 # as a fraction of the frame's diagonal.
 _BRIGHTEST, _LEAST_APART = 5, 0.1
-# Largest difference (mag) between the brightness ratios of two points and of two guide stars.
+# Largest difference (mag) between the magnitude difference of two points and that of two guide stars.
 _MOST_UNLIKE = 1.5
 # Tolerance (px) of the distance of two points, because of their errors and of a distortion of the lens.
 _APART_TOLERANCE = 1.0
-# Ratio of the highest to the lowest image scale above which there are too many candidates, and the largest
-# number of candidates; further pairs of points are left out.
+# Largest ratio of the highest to the lowest image scale for which a search is made. Largest number of
+# candidates of a frame; pairs of points that would exceed it are not searched.
 _WIDEST_SCALE, _MOST_CANDIDATES = 1.15, 600_000
-# Number of candidates that are computed at a time, and number of steps in which their scales are fitted.
+# Number of candidates in one batch, and number of further iterations that determine their image scales.
 _TOGETHER, _SCALE_STEPS = 20_000, 3
 # Number of the brightest neighbours of a guide star that are predicted for every candidate, and number of
 # stars that are predicted for the `_FINALISTS` candidates with the highest likelihood ratios.
 _NEIGHBOURS, _PREDICTED_STARS, _FINALISTS = 48, 60, 40
-# Width (px) of the Gaussian with which the frame is smoothed, and factor that makes rounding negligible.
+# Standard deviation (px) of the Gaussian that smooths the frame, and factor on the pixel values before the
+# smoothing, so that the variance of rounding, which the background's noise includes, is negligible.
 _SMOOTHING, _FINER = 1.0, 100.0
-# Limits of the light of one pixel, in standard deviations of the noise, and the number of bins between them.
+# Lowest and highest signal of a pixel, in standard deviations of the noise; values beyond them are set to the
+# limit. Number of bins between the two.
 _LEAST_LIGHT, _MOST_LIGHT, _LEVELS = -3.0, 13.0, 240
 # Logarithms of the predicted signal-to-noise ratios; fainter stars are left out.
 _LN_PREDICTED = np.linspace(math.log(0.5), math.log(20.0), 38)
@@ -64,7 +66,7 @@ _DIMMER = np.array([0, 4, 8, 12])
 # not seen.
 _BRIGHTNESS_ERROR, _UNSEEN = 0.35, 0.1
 # Distance (px) from the frame's edge and from the points of the pair within which a star is left out, and
-# distance within which two predicted stars may share their light.
+# distance within which the same pixels may be counted for two predicted stars.
 _EDGE, _BESIDE, _OVERLAPPING = 4, 10, 5.0
 # Standard deviation (px) of a predicted position, and side (px) of the square whose highest light is used.
 _PLACE_SIGMA, _SQUARE = 0.5, 3
@@ -77,8 +79,9 @@ class FrameLight:
     Attributes:
         camera: ideal camera of `columns` x `rows` pixels in whose image the positions are given.
         signal: smoothed frame above the background, in standard deviations of its noise (rows, columns).
-        level: index of the bin of the highest signal within 1 px (rows, columns), uint8; `_LEVELS` outside
-            the frame and at its edge.
+        level: index of the bin of the highest signal in the 3 x 3 pixels around each pixel (rows, columns),
+            uint8. Pixels near the frame's edge, and pixels of the ideal image that the frame does not cover,
+            have the value `_LEVELS` and are not used.
         log_ratio: logarithm of the likelihood ratio of a star to no star (r, `_LEVELS` + 1), for a star whose
             predicted signal-to-noise ratio has the logarithm in `_LN_PREDICTED` (r,), and for each bin.
     """
@@ -103,7 +106,8 @@ class FrameLight:
         level = np.full(pixels.shape, _LEVELS, dtype=np.uint8)
         inner = slice(_EDGE, -_EDGE), slice(_EDGE, -_EDGE)
         level[inner] = np.clip((highest[inner] - _LEAST_LIGHT) * step, 0, _LEVELS - 1)
-        # A count of one more in each bin limits the evidence of a light that is not seen elsewhere.
+        # One is added to the count of each bin. Otherwise a signal that occurs nowhere else in the frame
+        # would have an unlimited likelihood ratio.
         count = np.bincount(level[inner].ravel(), minlength=_LEVELS) + 1.0
         ideal = camera.ideal
         if not isinstance(camera, Pinhole):
@@ -116,7 +120,7 @@ class FrameLight:
         return cls(ideal, signal, level, _log_ratios(count / count.sum()))
 
     def without(self, points: FloatArray) -> npt.NDArray[np.uint8]:
-        """Return the levels (rows, columns) with `_LEVELS` around points (n, 2), px."""
+        """Return `level` (rows, columns) without the pixels around points (n, 2), px, which are not used."""
         level = self.level.copy()
         for x, y in np.rint(points).astype(np.int64).tolist():
             level[max(y - _BESIDE, 0) : y + _BESIDE + 1, max(x - _BESIDE, 0) : x + _BESIDE + 1] = _LEVELS
@@ -148,7 +152,8 @@ class LightMatch:
 
     Attributes:
         matrix: attitude matrix (3, 3), ICRS to camera axes.
-        scale: factor by which the observed tangents must be multiplied for the true focal length.
+        scale: factor by which the observed tangents x/z and y/z must be multiplied, because the true focal
+            length differs from the assumed one.
         log10_chance: log10 of an upper bound on the expected number of chance matches.
     """
 
@@ -164,7 +169,8 @@ class _GuidePairs:
     Attributes:
         chord: chords (p,) between the stars of a pair, ascending.
         stars: indices (p, 2) of the two stars.
-        neighbours: indices (n, `_NEIGHBOURS`) of each star's neighbours, the brightest first; -1 for none.
+        neighbours: indices (n, `_NEIGHBOURS`) of the brightest stars that form a pair with each star, the
+            brightest first; -1 for none.
     """
 
     chord: npt.NDArray[np.float32]
@@ -212,7 +218,10 @@ def match_by_light(field: StarField, sky: SkyIndex, light: FrameLight, limit: fl
 
 
 def _log10_share(order: int) -> float:
-    """Return log10 of the factor for one of a series of alternatives, with `order` others before it."""
+    """Return log10 of the reciprocal share of the accepted chance matches for one of many alternatives.
+
+    The alternatives are numbered by their `order` from 0. Their shares sum to one.
+    """
     return math.log10(math.pi**2 / 6.0 * (order + 1.0) ** 2)
 
 
@@ -279,7 +288,7 @@ class _Search:
         promising = np.flatnonzero(ratio > 0.0)
         if not len(promising):
             return None
-        # The accepted number of chance matches is divided among the numbers of brighter stars.
+        # Each number of brighter stars, 0, 1, 2, ..., has its share of the accepted chance matches.
         ranks, count = brighter[promising], np.bincount(brighter)
         chance = np.log10(count[ranks]) + np.array([_log10_share(rank) for rank in ranks.tolist()])
         first = np.argsort(chance - ratio[promising] / math.log(10.0), kind="stable")[:_FINALISTS]
@@ -304,7 +313,7 @@ class _Search:
         place = _places(matrix, scale, self.sky.stars.direction[stars], self.light.camera.focal_length, level)
         faintest = float(magnitude[two].mean()) + bright
         ratio = _star_ratios(faintest - magnitude[stars], place, level, self.light.log_ratio)
-        # Of two stars that share their light, only the brighter one is used.
+        # Of two stars for which the same pixels may be counted, only the brighter one is used.
         close = np.linalg.norm(place[:, None] - place, axis=-1) < _OVERLAPPING
         ratio[np.any(close & np.tri(len(stars), k=-1, dtype=bool), axis=1)] = 0.0
         # A detected point has a more accurate position than the square whose highest light is used.
@@ -329,13 +338,13 @@ def _evidence_numpy(
     level: npt.NDArray[np.uint8],
     log_ratio: FloatArray,
 ) -> tuple[FloatArray, IntArray]:
-    """Return the logarithms of the likelihood ratios (c,) of candidates, and their numbers of brighter stars.
+    """Return the logarithms of the likelihood ratios (c,) of candidates, and numbers of brighter stars (c,).
 
     A candidate is a pair of the guide stars with the directions `guide` (n, 3) and indices `stars` (c, 2),
     for the two points with the directions `seen` (2, 3). The image scale is between `lowest` and `highest`.
-    Only the `neighbours` (n, k) of the first guide star are predicted. The mean magnitude of the two points
-    above a signal-to-noise ratio of one is `bright`. Brighter stars are those in the frame that are brighter
-    than the fainter of the two.
+    Only the `neighbours` (n, k) of the first guide star are predicted. On average, the two points are
+    `bright`, mag, brighter than a point with a signal-to-noise ratio of one. The brighter stars are the
+    predicted stars in the frame that are brighter than the fainter of the two guide stars.
     """
     ratios, brighter = np.zeros(len(stars)), np.zeros(len(stars), dtype=np.int64)
     for begin in range(0, len(stars), _TOGETHER):
@@ -404,9 +413,10 @@ def _evidence(
 def _pair_attitude(
     seen: FloatArray, lowest: float, highest: float, pair: FloatArray, wanted: FloatArray, matrix: FloatArray
 ) -> float:
-    """Write the attitude for which two directions (2, 3) are the first columns of `wanted`; return the scale.
+    """Write the attitude matrix of a candidate to `matrix` (3, 3), and return its image scale.
 
-    The matrices `pair` and `wanted` (3, 3) are overwritten.
+    The attitude rotates the two guide stars, the first two columns of `wanted` (3, 3), to the directions
+    `seen` (2, 3) of the points. The matrices `pair` and `wanted` are overwritten.
     """
     scale, chord = 1.0, 0.0
     for axis in range(3):
@@ -439,7 +449,7 @@ def _level_at(star: FloatArray, matrix: FloatArray, focal_length: float, level: 
 
 @loop_helper
 def _stretch_pair(seen: FloatArray, scale: float, pair: FloatArray) -> float:
-    """Write two unit vectors with tangents multiplied by `scale` to two columns; return their chord."""
+    """Write two unit vectors with x/z and y/z multiplied by `scale` to two columns; return their chord."""
     for k in range(2):
         x, y, z = seen[k, 0] * scale, seen[k, 1] * scale, seen[k, 2]
         norm = math.sqrt(x * x + y * y + z * z)
@@ -450,7 +460,7 @@ def _stretch_pair(seen: FloatArray, scale: float, pair: FloatArray) -> float:
 
 @loop_helper
 def _into_axes(pair: FloatArray) -> None:
-    """Replace the columns of a matrix, the first two unit vectors, by the axes that `_axes` returns."""
+    """Replace the columns of a matrix by the axes that `_axes` returns for its first two columns."""
     for k in range(3):
         middle, across = pair[k, 0] + pair[k, 1], pair[k, 0] - pair[k, 1]
         pair[k, 0], pair[k, 1] = middle, across
@@ -504,7 +514,7 @@ def _star_ratios(
 ) -> FloatArray:
     """Return the logarithms of the likelihood ratios (..., d) of stars for each of `_DIMMER`.
 
-    The stars (...) are `above`, mag, the magnitude at which the signal-to-noise ratio is one. Stars that are
+    The stars (...) are `above`, mag, brighter than a star with a signal-to-noise ratio of one. Stars that are
     too faint have zero.
     """
     step = np.rint((0.4 * math.log(10.0) * above - _LN_PREDICTED[0]) / _LN_STEP).astype(np.int64)
@@ -520,7 +530,7 @@ def _mean_ratio(ratio: FloatArray) -> FloatArray:
 
 
 def _stretched(seen: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return two unit vectors (2, 3) with their tangents multiplied by the scales (c,), as (c, 2, 3)."""
+    """Return two unit vectors (2, 3) with x/z and y/z multiplied by the scales (c,), as (c, 2, 3)."""
     longer = seen * np.stack([scale, scale, np.ones_like(scale)], axis=-1)[:, None]
     return np.asarray(longer / np.linalg.norm(longer, axis=-1, keepdims=True))
 
@@ -531,7 +541,10 @@ def _chord(pair: FloatArray) -> FloatArray:
 
 
 def _axes(pair: FloatArray) -> FloatArray:
-    """Return matrices (c, 3, 3) whose columns are axes fixed to pairs of unit vectors (c, 2, 3)."""
+    """Return matrices (c, 3, 3) of three orthonormal axes (columns) that rotate with a pair of unit vectors.
+
+    The pairs are (c, 2, 3). The first axis is in the middle of a pair, and the second along its difference.
+    """
     middle, across = pair[:, 0] + pair[:, 1], pair[:, 0] - pair[:, 1]
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
