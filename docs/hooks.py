@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,6 +13,12 @@ _WEIGHTS = {"reference/": 1e-3, "decisions/": 0.1, "sources/": 0.1, "architectur
 
 A word in a title weighs 1,000 times as much as a word in the text.
 """
+
+
+def on_startup(*, command: str, **_: Any) -> None:
+    """Build without garbage collection, which would take a tenth of the time and free little memory."""
+    if command == "build":
+        gc.disable()
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
