@@ -363,7 +363,7 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     In a frame with many stars, a streak may be a blend of several stars. A motion is doubtful if some streaks
     have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no streak has
     both ends in the frame, or if most streaks with both ends in the frame contradict the motion. A motion is
-    rejected if too many streak ends are wrong.
+    rejected if too many streak ends are wrong, or if most short streaks continue as faint trails.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -371,11 +371,12 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
         return StreakVerdict.REJECTED
     deciding = scene.select(scene.trusted)
-    uneven = abs(scene.motion.relative_acceleration) > _UNEVEN
-    if uneven and trailing_fraction(camera, deciding) > _MOST_TRAILING:
-        return StreakVerdict.REJECTED
     ends, lit = true_ends(camera, deciding), unbroken(camera, deciding)
     known = np.isfinite(ends)
+    # The ends of short streaks cannot be confirmed, but the pixels beyond them must be dark.
+    uneven = abs(scene.motion.relative_acceleration) > _UNEVEN
+    if (uneven or not known.any()) and trailing_fraction(camera, deciding) > _MOST_TRAILING:
+        return StreakVerdict.REJECTED
     both = known.all(axis=1)
     right = float(np.mean(ends[known])) if known.any() else 1.0
     if both.any() and float(np.mean(ends[both])) < _TRUE_ENDS[1]:

@@ -101,6 +101,11 @@ def test_chains_and_trails_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(estimate, "trailing_fraction", lambda *_, share=share: share)
         assert check_streaks(_problem(), growing, _NOBODY) is verdict
         assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.CONFIRMED
+    # The ends of short streaks are not confirmed, so that trails reject any motion of short streaks.
+    monkeypatch.setattr(estimate, "true_ends", lambda *_: np.full((8, 2), np.nan))
+    assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.REJECTED
+    monkeypatch.setattr(estimate, "trailing_fraction", lambda *_: 0.45)
+    assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.CONFIRMED
 
 
 def test_a_motion_is_doubtful_if_most_flux_of_complete_streaks_contradicts_it() -> None:
