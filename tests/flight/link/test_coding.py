@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,6 +189,7 @@ def test_a_stream_of_start_sequences_ends_neither_time_nor_memory() -> None:
     assert len(stream._data) < 2000
 
 
+_LENGTHS = (63, 300)
 _PROBE = """
 import java.util.HexFormat;
 import org.yamcs.tctm.ccsds.Randomizer;
@@ -198,26 +198,37 @@ import org.yamcs.tctm.ccsds.error.BchCltuGenerator;
 public class Probe {
     public static void main(String[] texts) throws Exception {
         HexFormat hex = HexFormat.of();
-        byte[] frame = hex.parseHex(texts[0]);
-        System.out.println(hex.formatHex(new BchCltuGenerator().makeCltu(frame.clone(), false)));
-        System.out.println(hex.formatHex(new BchCltuGenerator().makeCltu(frame.clone(), true)));
-        Randomizer.randomizeTm(frame);
-        System.out.println(hex.formatHex(frame));
+        for (String text : texts) {
+            byte[] frame = hex.parseHex(text);
+            System.out.println(hex.formatHex(new BchCltuGenerator().makeCltu(frame.clone(), false)));
+            System.out.println(hex.formatHex(new BchCltuGenerator().makeCltu(frame.clone(), true)));
+            Randomizer.randomizeTm(frame);
+            System.out.println(hex.formatHex(frame));
+        }
     }
 }
 """
 
 
-@pytest.mark.skipif(bool(missing()), reason=missing() or "-")
-@pytest.mark.parametrize("length", [63, 300])
-def test_yamcs_makes_the_same_cltus_and_random_sequence(tmp_path: Path, length: int) -> None:
-    frame, source = telecommand(length, 5), tmp_path / "Probe.java"
+@pytest.fixture(scope="module")
+def of_yamcs(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Return two CLTUs and the randomised frame from Yamcs, for a frame of each length."""
+    source = tmp_path_factory.mktemp("probe") / "Probe.java"
     source.write_text(_PROBE, encoding="utf-8")
-    told = subprocess.run(
-        ["java", "-cp", class_path(), str(source), frame.hex()], capture_output=True, text=True, check=True
+    frames = [telecommand(length, 5).hex() for length in _LENGTHS]
+    java = ["java", "-XX:TieredStopAtLevel=1", "-XX:+UseSerialGC", "-cp", class_path()]
+    return subprocess.run(
+        [*java, str(source), *frames], capture_output=True, text=True, check=True
     ).stdout.split()
+
+
+@pytest.mark.skipif(bool(missing()), reason=missing() or "-")
+@pytest.mark.parametrize("length", _LENGTHS)
+def test_yamcs_makes_the_same_cltus_and_random_sequence(length: int, of_yamcs: list[str]) -> None:
+    frame, first = telecommand(length, 5), 3 * _LENGTHS.index(length)
     cltus = [CommandCode(kind).encode(frame) for kind in ("plain", "randomised")]
-    assert told == [one.hex() for one in (*cltus, randomised(frame, "short"))]
+    assert of_yamcs[first : first + 3] == [one.hex() for one in (*cltus, randomised(frame, "short"))]
+    assert len(of_yamcs) == 3 * len(_LENGTHS)
 
 
 def test_kiss_escapes_as_its_specification_and_skips_other_frames() -> None:
