@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
@@ -75,6 +74,8 @@ def assert_forms_agree(
 def _compiled(hot: HotFunction[Any, Any], args: tuple[Any, ...]) -> list[Any]:
     """Return the results of the compiled implementation, and add the processor time to `compiling_s`."""
     global compiling_s  # noqa: PLW0603
+    import pytest  # noqa: PLC0415 - the programs that `test_compiled.py` starts do not need it
+
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     begun = time.process_time()
     results = _called(_compiled_form(hot), args)
