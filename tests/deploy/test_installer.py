@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from knightcube.vision.startracker.index import build
 from sim_hal.faults.host import corrupted
-from tests.deploy.scripts import DEPLOY, ROOT, TESTBED, changed_testbed
+from tests.deploy.scripts import DEPLOY, ROOT, TESTBED, changed_testbed, script
 from tests.support.flights import CONFIG
 
 pytestmark = pytest.mark.skipif(
@@ -193,6 +194,18 @@ def test_the_sky_index_is_made_where_the_configuration_wants_one_however_it_is_w
     shutil.copy(changed_testbed(tmp_path, camera=camera), image.config)
     _, output = image.call("--accept", "--dry-run")
     assert ("sky_index.py" in output) == wanted
+
+
+def test_the_sky_index_is_built_if_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program, built = script("sky_index"), tmp_path / "index"
+    monkeypatch.setattr(build, "PATH", built)
+    monkeypatch.setattr(build, "ensure_default_index", lambda: built.write_bytes(b"index"))
+    camera = "{device: {driver: v4l2, pixel_format: Y16}, star_tracker: {}}"
+    program.main([str(changed_testbed(tmp_path, camera=camera))])
+    assert built.read_bytes() == b"index"
+    built.write_bytes(b"older")
+    program.main([str(tmp_path / "flight.yaml")])
+    assert built.read_bytes() == b"older"
 
 
 def test_a_dry_run_prints_every_step_and_touches_nothing() -> None:
