@@ -82,7 +82,7 @@ house: $(TOOLS) ## sizes of files, classes and functions
 
 # Two workers more than cores, because many tests wait for other processes.
 unit: $(TOOLS)  ## the tests, on all cores
-	$(RUN) -m pytest -n $(shell expr $$(nproc) + 2) -rs --dist loadfile --no-loadscope-reorder
+	$(RUN) -m pytest -n $(shell expr $$(nproc) + 1) -rs --dist loadfile --no-loadscope-reorder
 
 fast: $(TOOLS)  ## the tests that are not slow, on all cores
 	$(TESTS) --dist worksteal -m "not slow"
