@@ -372,6 +372,12 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient iterations in the computation of the covariance.
 _CONJUGATE = 12
+# Error of the rotation, as a fraction of the fitted angular acceleration times the square of the exposure
+# time. It is the rms error of a parabola that is fitted to the rotation angle of a body at which a torque
+# begins at a random time of the exposure, divided by the rms fitted acceleration.
+_TORQUE_STEP = 0.031
+# Largest such error (px). Streaks with larger errors, of changes by 3 px or more, mostly fail other checks.
+_MOST_OF_STEP = 0.1
 # Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
 _UNCHECKED = (2, 4.0)
 # Relative difference between fitted and configured PSF variance that is neglected if the fitted PSF is
@@ -461,6 +467,11 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
     covariance = covariance + spread * vibration
+    if last.free[3]:
+        # The torque may have changed at once, for instance that of a coil, instead of being constant.
+        error, most = _TORQUE_STEP * scene.motion.acceleration, _MOST_OF_STEP / camera.pinhole.focal_length
+        error *= most / max(float(np.linalg.norm(error)), most)
+        covariance = covariance + np.outer(error, error)
     if scene.profile != GAUSSIAN:
         unmodelled = max(unmodelled, _LEARNED_SHARE**2 * float(np.trace(covariance)))
     fits = result.misfit < settings.worst_misfit

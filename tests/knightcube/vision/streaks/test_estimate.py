@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import CameraKnowledge, Lens
 from knightcube.vision.streaks.camera_motion import CameraMotion
@@ -204,6 +210,31 @@ def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() 
     assert found.covariance is not None
     assert found.misfit < 1.3
     assert _squared(found.rate - turn, found.covariance) < 16.3
+
+
+def test_a_torque_that_begins_within_the_exposure_is_in_the_covariance() -> None:
+    """The rate changes from a random time on, across its direction, which is not linear in time."""
+    squares = []
+    for seed in range(12, 24):
+        generator = np.random.default_rng([31, seed])
+        begin = generator.uniform(-0.5, 0.5)
+        turn = turn_of(np.radians(generator.uniform(40.0, 90.0)), 20.0, generator.uniform(0.0, 6.28))
+        side = np.cross(turn, generator.standard_normal(3))
+        growth = 0.1 * np.linalg.norm(turn) / np.linalg.norm(side) * side
+
+        def turns(times: FloatArray) -> FloatArray:
+            share = times[:, None] / 0.5
+            return share * turn + 0.5 * np.maximum(share - begin, 0.0) ** 2 * growth  # noqa: B023
+
+        scene = row_scene(CAMERA, turns, 0.5, generator)
+        start, end = from_rotation_vector(turns(np.array([-0.25, 0.25])))
+        rate = to_rotation_vector(multiply(end, conjugate(start))) / 0.5
+        found = estimate_motion(scene.pixels, CAMERA.pinhole, 0.5, _SETTINGS, rate, 1e-3)
+        if found.rate_model == "accelerating" and found.rate is not None and found.covariance is not None:
+            squares.append(_squared(found.rate - rate, found.covariance))
+    assert len(squares) >= 6
+    assert np.mean(squares) < 6.0
+    assert max(squares) < 16.3
 
 
 def test_a_wrong_course_is_ignored() -> None:
