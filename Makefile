@@ -80,9 +80,8 @@ docs: $(TOOLS)  ## the documentation site, strict, into build/site
 house: $(TOOLS) ## sizes of files, classes and functions
 	$(RUN) -m tests.studies.house
 
-# Two workers more than cores, because many tests wait for other processes.
 unit: $(TOOLS)  ## the tests, on all cores
-	$(RUN) -m pytest -n $(shell expr $$(nproc) + 1) -rs --dist loadfile --no-loadscope-reorder
+	$(TESTS) -rs --dist loadfile --no-loadscope-reorder
 
 fast: $(TOOLS)  ## the tests that are not slow, on all cores
 	$(TESTS) --dist worksteal -m "not slow"

@@ -31,7 +31,7 @@ from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.startracker.attitude_fit import StarField
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.survey import Surface
-from knightcube.vision.startracker.verification import expected_stars
+from knightcube.vision.startracker.verification import expected_stars, log10_choice
 
 # Pairs are formed only from the brightest guide stars, on average this many in a field of view.
 _PER_FIELD = 20.0
@@ -74,7 +74,7 @@ _PLACE_SIGMA, _SQUARE = 0.5, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameLight:
-    """The light of a frame at single positions, and what it tells about a star there.
+    """The light of a frame at single positions, and its likelihood ratios for a star at these positions.
 
     Attributes:
         camera: ideal camera of `columns` x `rows` pixels in whose image the positions are given.
@@ -211,18 +211,10 @@ def match_by_light(field: StarField, sky: SkyIndex, light: FrameLight, limit: fl
     for order, (pair, stars) in enumerate(search.pairs()):
         found = search.best(pair, stars)
         if found is not None:
-            chance = found.log10_chance + _log10_share(order)
+            chance = found.log10_chance + log10_choice(order)
             if chance < limit:
                 return LightMatch(found.matrix, found.scale, chance)
     return None
-
-
-def _log10_share(order: int) -> float:
-    """Return log10 of the reciprocal share of the accepted chance matches for one of many alternatives.
-
-    The alternatives are numbered by their `order` from 0. Their shares sum to one.
-    """
-    return math.log10(math.pi**2 / 6.0 * (order + 1.0) ** 2)
 
 
 class _Search:
@@ -290,7 +282,7 @@ class _Search:
             return None
         # Each number of brighter stars, 0, 1, 2, ..., has its share of the accepted chance matches.
         ranks, count = brighter[promising], np.bincount(brighter)
-        chance = np.log10(count[ranks]) + np.array([_log10_share(rank) for rank in ranks.tolist()])
+        chance = np.log10(count[ranks]) + np.array([log10_choice(rank) for rank in ranks.tolist()])
         first = np.argsort(chance - ratio[promising] / math.log(10.0), kind="stable")[:_FINALISTS]
         chosen = stars[promising[first]]
         matrices, scales = _attitudes(given[0], guide[chosen], *self.field.scale)
@@ -313,7 +305,7 @@ class _Search:
         place = _places(matrix, scale, self.sky.stars.direction[stars], self.light.camera.focal_length, level)
         faintest = float(magnitude[two].mean()) + bright
         ratio = _star_ratios(faintest - magnitude[stars], place, level, self.light.log_ratio)
-        # Of two stars for which the same pixels may be counted, only the brighter one is used.
+        # A star is not used if the same pixels may be counted for a brighter star.
         close = np.linalg.norm(place[:, None] - place, axis=-1) < _OVERLAPPING
         ratio[np.any(close & np.tri(len(stars), k=-1, dtype=bool), axis=1)] = 0.0
         # A detected point has a more accurate position than the square whose highest light is used.

@@ -77,12 +77,12 @@ class Chance:
         for matched in range(len(pairs), self.least - 1, -1):
             expected = pairs[matched - 1][0] + 1
             bright = max(star for _, star in pairs[:matched]) + 1
-            limited = self._of_places(gate, matched, expected, bright) + _limit_choice(bright - matched)
+            limited = self._of_places(gate, matched, expected, bright) + log10_choice(bright - matched)
             value = min(
                 self._of_places(gate, matched, expected, self.observed) - math.log10(_ALL_OBSERVED),
                 limited - math.log10(1.0 - _ALL_OBSERVED),
             )
-            value += math.log10(self.choices) + _limit_choice(expected - matched)
+            value += math.log10(self.choices) + log10_choice(expected - matched)
             if self.enough < value < self.enough + 8.0 and matched <= _MOST_ORDERED:
                 value += min(0.0, math.log10(2.0 * order_probability([star for _, star in pairs[:matched]])))
             best = min(best, value)
@@ -114,9 +114,12 @@ class Chance:
         return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
 
 
-def _limit_choice(unmatched: int) -> float:
-    """Return log10 of the factor for a brightness limit above which `unmatched` stars have no match."""
-    return math.log10(math.pi**2 / 6.0 * (unmatched + 1.0) ** 2)
+def log10_choice(order: int) -> float:
+    """Return log10 of the Bonferroni factor for one of a series of alternatives, `order` = 0, 1, 2, ...
+
+    The reciprocal factors of all alternatives sum to one.
+    """
+    return math.log10(math.pi**2 / 6.0 * (order + 1.0) ** 2)
 
 
 def order_probability(sequence: Sequence[int]) -> float:
