@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from knightcube.astro.almanac import propagate_orbit as propagate_orbit
     from knightcube.astro.almanac import sun_direction as sun_direction
     from knightcube.astro.almanac import sunlit_fraction as sunlit_fraction
+    from knightcube.astro.earth.geomagnetism import GeomagneticError as GeomagneticError
+    from knightcube.astro.earth.orbit_knowledge import OrbitError as OrbitError
     from knightcube.errors import InputError as InputError
+    from knightcube.errors import KnightCubeError as KnightCubeError
     from knightcube.errors import PlanningError as PlanningError
     from knightcube.errors import UsageError as UsageError
     from knightcube.gnc.guidance.plant import SingleAxisPlant as SingleAxisPlant
@@ -36,11 +39,13 @@ if TYPE_CHECKING:
     from knightcube.gnc.guidance.vmc import plan_step as plan_step
     from knightcube.vision.camera.images import read_image as read_image
     from knightcube.vision.camera.lens import Lens as Lens
+    from knightcube.vision.camera.lens import LensError as LensError
     from knightcube.vision.camera.lens import Pinhole as Pinhole
     from knightcube.vision.horizon.nadir import find_nadir as find_nadir
     from knightcube.vision.horizon.settings import HorizonKnowledge as HorizonKnowledge
     from knightcube.vision.lens_calibration import LensCalibration as LensCalibration
     from knightcube.vision.lens_calibration import calibrate_lens as calibrate_lens
+    from knightcube.vision.lens_knowledge import CalibrationError as CalibrationError
     from knightcube.vision.objects.detect import detect_objects as detect_objects
     from knightcube.vision.star_tracker import MatchedStars as MatchedStars
     from knightcube.vision.star_tracker import StarSolution as StarSolution
@@ -49,12 +54,17 @@ if TYPE_CHECKING:
     from knightcube.vision.sun import find_sun as find_sun
 
 _MODULE_OF = {
+    "CalibrationError": "knightcube.vision.lens_knowledge",
+    "GeomagneticError": "knightcube.astro.earth.geomagnetism",
     "Goal": "knightcube.gnc.guidance.pointing_target",
     "HorizonKnowledge": "knightcube.vision.horizon.settings",
     "InputError": "knightcube.errors",
+    "KnightCubeError": "knightcube.errors",
     "Lens": "knightcube.vision.camera.lens",
     "LensCalibration": "knightcube.vision.lens_calibration",
+    "LensError": "knightcube.vision.camera.lens",
     "MatchedStars": "knightcube.vision.star_tracker",
+    "OrbitError": "knightcube.astro.earth.orbit_knowledge",
     "Pinhole": "knightcube.vision.camera.lens",
     "PlanningError": "knightcube.errors",
     "PointingTarget": "knightcube.gnc.guidance.pointing_target",

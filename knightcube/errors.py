@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 
-class FlightError(Exception):
-    """Base class of all errors of the library and the flight application."""
+class KnightCubeError(Exception):
+    """Base class of all errors that the library and the flight application define.
+
+    The message of an error states the value and the remedy.
+    """
 
 
-class UsageError(FlightError):
-    """Error made by the user, such as a file that is not an image.
+FlightError = KnightCubeError
+"""Name of the base class in the flight application."""
+
+
+class UsageError(KnightCubeError):
+    """Error made by the user, such as a file that is not an image or an argument that is out of range.
 
     The message states the error and its remedy in one line. A command prints the message without a traceback
     and ends with status 2.
@@ -29,10 +36,11 @@ class InputError(UsageError):
         self.problem = problem
 
 
-class PlanningError(FlightError):
-    """Error raised if a planner finds no path from start to goal within its limits.
+class PlanningError(UsageError):
+    """Error raised if a planner finds no path, or if one of its arguments is out of range.
 
-    The message states why the planner finds no path.
+    The message states the reason and the remedy. If the arguments are valid and no path is found, a command
+    ends with status 1.
     """
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.lens import (
     FOURTH_AS,
     SHAPE_TERMS,
@@ -57,8 +57,11 @@ MIN_SIGMA_PX = 0.02
 """Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 
 
-class CalibrationError(FlightError):
-    """Error raised for frames that do not determine a lens."""
+class CalibrationError(KnightCubeError):
+    """Error raised for frames that do not determine a lens.
+
+    The message of the function `calibrate_lens` states the reason for each image.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import importlib
 import inspect
 import re
@@ -48,6 +49,19 @@ def test_every_public_name_is_documented_with_its_public_methods(name: str) -> N
     for member, method in vars(value).items() if inspect.isclass(value) else ():
         if callable(method) and not member.startswith("_"):
             assert inspect.getdoc(method)
+
+
+@pytest.mark.parametrize("name", knightcube.__all__)
+def test_every_error_in_a_public_docstring_can_be_caught_by_its_public_name(name: str) -> None:
+    """Each error that a public docstring names is exported, and the base class catches all of them."""
+    value, parts = getattr(knightcube, name), [getattr(knightcube, name)]
+    if inspect.isclass(value):
+        parts += [part for member, part in vars(value).items() if callable(part) and member[0] != "_"]
+    texts = [inspect.getdoc(part) or "" for part in parts]
+    named = {error for text in texts for error in re.findall(r"\b[A-Z]\w*Error\b", text)}
+    assert named <= {*knightcube.__all__, *dir(builtins)}
+    if inspect.isclass(value) and issubclass(value, Exception):
+        assert issubclass(value, knightcube.KnightCubeError)
 
 
 NADIR = NadirMeasurement(np.array([0.6, 0.0, 0.8]), 1e-6 * np.eye(3), 5e5, 1e3, 0.1, used=90)

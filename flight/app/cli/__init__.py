@@ -19,7 +19,7 @@ from typing import Any
 
 from flight import __version__
 from hal.interfaces.errors import DeviceError
-from knightcube.errors import FlightError, UsageError, shown
+from knightcube.errors import FlightError, PlanningError, UsageError, shown
 
 _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
@@ -106,10 +106,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _obey(words)
-    except UsageError as error:
-        return _complain(str(error), 2)
     except (FlightError, DeviceError) as error:
-        return _complain(str(error), 1)
+        # That a planner finds no path is a failure of the command and not a usage error.
+        misused = isinstance(error, UsageError) and not isinstance(error, PlanningError)
+        return _complain(str(error), 2 if misused else 1)
     except KeyboardInterrupt:
         return _complain("interrupted", 130)  # the exit status that shells use for SIGINT
     except OSError as error:  # such as an invalid file name or a folder without permission

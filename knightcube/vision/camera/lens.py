@@ -25,7 +25,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.compiled import compiled_form_of
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +108,11 @@ _MOST_TANGENTIAL, _TANGENTIAL_STEPS = 0.5, 40
 """Largest derivative of the tangential distortion at a corner, and maximum number of inversion iterations."""
 
 
-class LensError(FlightError):
-    """Error raised for a lens with invalid detector size, focal length or distortion parameters."""
+class LensError(KnightCubeError):
+    """Error raised for a lens with invalid detector size, focal length or distortion parameters.
+
+    The constructors `Lens` and `Pinhole` raise it, with the value and its range.
+    """
 
 
 class CameraModel(Protocol):

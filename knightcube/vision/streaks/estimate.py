@@ -669,7 +669,7 @@ def estimate_rate(
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         settings: gain, saturation, point spread and line time of the camera, and limits of the fit.
 
-    Raises FlightError for an invalid image, exposure or prior.
+    Raises KnightCubeError for an invalid image, exposure or prior.
     """
     settings = settings or LikelihoodSettings()
     if isinstance(camera, Lens):
@@ -697,8 +697,8 @@ def estimate_motion(
     checksum `previous_checksum` of the previous frame. The `prior_course` is the rotation as a function of
     time during the exposure, as estimated by the navigation filter; None if unknown.
 
-    Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the attributes
-    `status` and `reason` of the result state the cause.
+    Raises KnightCubeError for an invalid frame, exposure or prior. If the frame yields no rate, the
+    attributes `status` and `reason` of the result state the cause.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     # The actual saturation level of a frame may be lower than the configured one, but never higher.
