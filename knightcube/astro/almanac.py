@@ -1,7 +1,7 @@
 """Sun direction, geomagnetic field, eclipse and orbit of a satellite as functions of time and position.
 
-Times are `datetime` objects (UTC without a time zone). Positions and velocities are geocentric, in ICRS axes,
-m and m/s, unless stated otherwise.
+Times are `datetime` objects, in UTC unless they have a time zone. Positions and velocities are geocentric, in
+ICRS axes, m and m/s, unless stated otherwise. Invalid times, positions and velocities raise UsageError.
 """
 
 from __future__ import annotations
@@ -13,13 +13,40 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, finite_array
 from knightcube.astro.earth import geomagnetism
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
-from knightcube.astro.earth.orbit_knowledge import TwoLineElements, propagated
+from knightcube.astro.earth.orbit_knowledge import LOWEST_RADIUS, elements_of, propagated
 from knightcube.astro.earth.orientation import julian_epoch, terrestrial_time
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, Shadow, earth_from_sun, julian_date, sunlit_share
 from knightcube.errors import UsageError
+
+_LOWEST_HEIGHT = -12e3
+"""Smallest height (m) above the ellipsoid, which is below every point of the Earth's surface."""
+
+
+def _position(position: ArrayLike) -> FloatArray:
+    """Return geocentric positions (..., 3), m, as an array of floats.
+
+    Raises UsageError for another shape, for positions that are not finite, and for positions deep within the
+    Earth, which are usually in km.
+    """
+    at = finite_array("position", position)
+    if at.shape[-1:] != (3,):
+        raise UsageError(f"position has the shape {at.shape}: give three components, m")
+    lowest = float(np.linalg.norm(at, axis=-1).min(initial=math.inf))
+    if lowest < LOWEST_RADIUS:
+        cure = ": give metres, not kilometres" if 1e3 * lowest >= LOWEST_RADIUS else ""
+        raise UsageError(
+            f"position lies {lowest:g} m from the Earth's centre, and no satellite is below "
+            f"{LOWEST_RADIUS:.0f} m{cure or ': give a geocentric position, m'}"
+        )
+    return at
+
+
+def _single_position(position: ArrayLike) -> FloatArray:
+    """Return a geocentric position (3,), m. Raises UsageError for other shapes and as `_position`."""
+    return _position(finite_array("position", position, (3,)))
 
 
 def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
@@ -28,15 +55,16 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
     The model is the World Magnetic Model 2025 (WMM2025) up to degree 12. A call takes 0.2 ms.
 
     Args:
-        time: UTC without a time zone, in the years 2025 to 2030.
+        time: UTC, or a datetime with a time zone, in the years 2025 to 2030.
         position: (3,) geocentric position in ICRS axes, m.
 
     Raises:
         GeomagneticError: if the time is outside the years of the model.
+        UsageError: if the position is not finite or lies deep within the Earth, for example in km.
     """
-    date = julian_date(time)
+    at, date = _single_position(position), julian_date(time)
     geomagnetism.check_year(float(julian_epoch(date)))
-    return geomagnetism.field(date, np.asarray(position, dtype=float))
+    return geomagnetism.field(date, at)
 
 
 def magnetic_field_on_ground(
@@ -45,16 +73,21 @@ def magnetic_field_on_ground(
     """Return the north, east and down components (3,) of the geomagnetic field, T, at geodetic coordinates.
 
     Args:
-        time: UTC without a time zone, in the years 2025 to 2030.
+        time: UTC, or a datetime with a time zone, in the years 2025 to 2030.
         latitude: geodetic latitude, rad.
         longitude: longitude, positive towards the east, rad.
         height: height above the WGS 84 ellipsoid, m.
 
     Raises:
-        GeomagneticError: for a time outside the years of the model, or an invalid position.
+        GeomagneticError: for a time outside the years of the model, or a position that is not finite, beyond
+            a pole or more than 12 km below the ellipsoid.
     """
     year = float(julian_epoch(julian_date(time)))
     geomagnetism.check_year(year)
+    if height < _LOWEST_HEIGHT:
+        raise geomagnetism.GeomagneticError(
+            f"height {height:g} m: must be above {_LOWEST_HEIGHT:g} m, which is below every ocean"
+        )
     return geomagnetism.field_on_ground_axes(year, latitude, longitude, height)
 
 
@@ -80,12 +113,18 @@ def sun_direction(
     The Sun's position is computed by VSOP2000. Parallax and aberration due to the observer are included.
 
     Args:
-        time: UTC without a time zone.
-        position: (3,) geocentric position of the observer in ICRS axes, m.
+        time: UTC, or a datetime with a time zone.
+        position: (3,) geocentric position of the observer in ICRS axes, m; by default the Earth's centre.
         velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
+
+    Raises:
+        UsageError: if position or velocity is not finite, or if the position is neither the Earth's centre
+            nor above the depths of the Earth, for example in km.
     """
-    observer, motion = (np.asarray(vector, dtype=float) for vector in (position, velocity))
-    return apparent_sun(julian_date(time), observer, motion)[0]
+    observer = finite_array("position", position, (3,))
+    if observer.any():
+        _position(observer)
+    return apparent_sun(julian_date(time), observer, finite_array("velocity", velocity, (3,)))[0]
 
 
 def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conical") -> FloatArray:
@@ -94,15 +133,17 @@ def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conic
     The Earth is modelled as a sphere with its equatorial radius and without an atmosphere.
 
     Args:
-        time: UTC without a time zone.
+        time: UTC, or a datetime with a time zone.
         position: (..., 3) geocentric positions in ICRS axes, m.
         shadow: shadow model, either "conical" with penumbra, or "cylindrical" with the values 0 and 1 only.
 
     Raises:
+        UsageError: if a position is not finite or lies deep within the Earth, for example in km.
         ValueError: for an unknown shadow model.
     """
+    at = _position(position)
     sun = -earth_from_sun(float(terrestrial_time(julian_date(time))))[0]
-    return sunlit_share(np.asarray(position, dtype=float), sun, shadow)
+    return sunlit_share(at, sun, shadow)
 
 
 def orbit_state(
@@ -168,34 +209,54 @@ def propagate_orbit(
         position: (3,) initial position in ICRS axes, m.
         velocity: (3,) initial velocity in ICRS axes, m/s.
         seconds: (n,) times relative to the initial state, in increasing or decreasing order, s.
+
+    Raises:
+        UsageError: if a value is not finite, or if the orbit intersects the Earth, for example in km.
     """
-    state, elapsed, states = (
-        np.concatenate([np.asarray(position), np.asarray(velocity)]).astype(float),
-        0.0,
-        [],
-    )
-    for time in np.atleast_1d(np.asarray(seconds, dtype=float)).tolist():
+    at, motion = _single_position(position), finite_array("velocity", velocity, (3,))
+    lowest = _perigee(at, motion)
+    if lowest < LOWEST_RADIUS:
+        raise UsageError(
+            f"the velocity {motion.tolist()} m/s gives a perigee {lowest:.0f} m from the Earth's centre: it "
+            f"must be above {LOWEST_RADIUS:.0f} m: give the velocity in m/s, in axes that do not rotate"
+        )
+    state, elapsed, states = np.concatenate([at, motion]), 0.0, []
+    for time in np.atleast_1d(finite_array("seconds", seconds)).tolist():
         state, elapsed = propagated(state, time - elapsed), time
         states.append(state)
     found = np.array(states).reshape(-1, 6)
     return found[:, :3], found[:, 3:]
 
 
+def _perigee(position: FloatArray, velocity: FloatArray) -> float:
+    """Return the smallest distance (m) from the Earth's centre on the conic section through a state."""
+    momentum = np.cross(position, velocity)
+    latus_rectum = float(momentum @ momentum) / GRAVITATIONAL_PARAMETER
+    distance = float(np.linalg.norm(position))
+    energy = 0.5 * float(velocity @ velocity) - GRAVITATIONAL_PARAMETER / distance
+    square = 1.0 + 2.0 * energy * latus_rectum / GRAVITATIONAL_PARAMETER
+    return latus_rectum / (1.0 + math.sqrt(max(square, 0.0)))
+
+
 def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> tuple[FloatArray, FloatArray]:
     """Return positions (n, 3), m, and velocities (n, 3), m/s, in ICRS axes from a two-line element set.
 
     The propagator is SGP4. The position error of SGP4 is one to three kilometres near the epoch of the
-    elements, and grows by one to three kilometres per day.
+    elements. It grows by one to three kilometres per day, and with the square of the time by the unknown
+    drag. Elements are therefore useful for some days before and after their epoch. They are accepted up to a
+    standard deviation of 1,000 km, which is reached after about 5 days at a height of 300 km, two weeks at
+    400 km and two months at 800 km.
 
     Args:
         elements: the two lines of the element set.
-        times: times in UTC without a time zone.
+        times: times in UTC, or with a time zone.
 
     Raises:
         UsageError: if the lines are not a two-line element set or do not describe an orbit.
-        OrbitError: if SGP4 fails at one of the times, for example because the orbit has decayed.
+        OrbitError: if a time is too far from the epoch of the elements, or if SGP4 fails at a time, for
+            example because the orbit has decayed.
     """
-    satellite = TwoLineElements(*elements)
-    states = [satellite.at(julian_date(time)) for time in times]
+    satellite = elements_of(elements)
+    states = [satellite.known_at(julian_date(time)) for time in times]
     position = np.array([state.position for state in states]).reshape(-1, 3)
     return position, np.array([state.velocity for state in states]).reshape(-1, 3)

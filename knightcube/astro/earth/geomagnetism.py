@@ -23,7 +23,7 @@ from knightcube.astro.earth.orientation import (
     julian_epoch,
     north_east_down,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
 DEGREE = 12
@@ -40,14 +40,20 @@ LONGEST_EXTRAPOLATION = 20.0
 """Time (years) after which the extrapolated field no longer changes."""
 
 
-class GeomagneticError(FlightError):
-    """Raised for a time or position outside the validity of the field model."""
+class GeomagneticError(KnightCubeError):
+    """Error raised for a time or position outside the validity of the magnetic field model.
+
+    The message states the time or the position, and the valid range.
+    """
 
 
 def check_year(year: float) -> None:
     """Raise GeomagneticError for a decimal year outside the validity of the model."""
     if not FIRST_YEAR <= year <= LAST_YEAR:
-        raise GeomagneticError(f"year {year:.2f}: WMM2025 is valid from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
+        raise GeomagneticError(
+            f"year {year:.2f}: WMM2025 is valid from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}, and the magnetic "
+            "field is known only in these years"
+        )
 
 
 def extrapolation_sigma(julian_date: float) -> float:
@@ -64,7 +70,8 @@ def field_on_ground_axes(year: float, latitude: float, longitude: float, height:
     """
     if not (abs(latitude) <= 0.5 * math.pi and math.isfinite(longitude) and math.isfinite(height)):
         raise GeomagneticError(
-            f"invalid position: latitude {latitude}, longitude {longitude} rad, height {height} m"
+            f"invalid position: latitude {latitude:g}, longitude {longitude:g} rad, height {height:g} m: "
+            "give finite values and a latitude of at most pi/2 rad"
         )
     # pygeomag expects longitudes from -180 to 180 deg and heights in km.
     east = math.degrees(math.remainder(longitude, 2.0 * math.pi))

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from functools import lru_cache
 
 import numpy as np
@@ -23,10 +25,11 @@ from knightcube.astro.earth.orientation import (
     celestial_to_terrestrial,
     mean_equator_to_celestial,
 )
-from knightcube.astro.earth.sun import DAY
-from knightcube.errors import FlightError, UsageError
+from knightcube.astro.earth.sun import DAY, J2000
+from knightcube.errors import KnightCubeError, UsageError
 
 _LONGEST_STEP = 30.0
+_J2000 = datetime(2000, 1, 1, 12)
 _SGP4_EPOCH, _MINUTES_PER_DAY = 2_433_281.5, 1440.0
 """Julian date from which SGP4 counts days, and number of minutes in a day."""
 _DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
@@ -34,10 +37,15 @@ _DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
 _DRAG_TIME, _DECAYING = 0.25, 1e7
 """Time (days) over which the along-track shift by B* is computed, and shift (m/day^2) for a decaying
 orbit."""
+LARGEST_SIGMA = 1e6
+"""Largest standard deviation (m) of a position per axis that the library returns from two-line elements."""
 
 
-class OrbitError(FlightError):
-    """Raised if the orbit is unknown at a time, because the last fix is too old or the orbit has decayed."""
+class OrbitError(KnightCubeError):
+    """Error raised if the orbit is unknown at a time.
+
+    The reason is that the last fix or the two-line elements are too old, or that the orbit has decayed.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +136,17 @@ def _measured(fix: GpsFix) -> FloatArray:
     return np.concatenate([fix.position @ to_ground, with_ground @ to_ground])
 
 
+def elements_of(lines: Sequence[str]) -> TwoLineElements:
+    """Return the two-line elements in the argument `elements` of a public function.
+
+    Raises UsageError for another number of lines, and for invalid lines as `TwoLineElements`.
+    """
+    if isinstance(lines, str) or len(lines) != 2 or not all(isinstance(line, str) for line in lines):
+        raise UsageError(f"elements is {lines!r}: give the two lines of the element set as a tuple of texts")
+    first, second = lines
+    return TwoLineElements(first, second)
+
+
 class TwoLineElements:
     """Two-line element set, with a standard deviation that grows with the time since its epoch.
 
@@ -171,12 +190,36 @@ class TwoLineElements:
         if code:
             raise OrbitError(f"SGP4 at {julian_date}: {SGP4_ERRORS[code]}")
         to_icrs = mean_equator_to_celestial(julian_date)
-        age = abs(julian_date - self.epoch)
-        sigma = math.hypot(self._sigma + self._growth * age, self._drag_growth * age**2)
         self._newest = OrbitState(
-            julian_date, 1e3 * (to_icrs @ np.array(position)), 1e3 * (to_icrs @ np.array(velocity)), sigma
+            julian_date,
+            1e3 * (to_icrs @ np.array(position)),
+            1e3 * (to_icrs @ np.array(velocity)),
+            self._sigma_at(julian_date),
         )
         return self._newest
+
+    def _sigma_at(self, julian_date: float) -> float:
+        """Return the standard deviation of the position per axis, m, at a Julian date UTC."""
+        age = abs(julian_date - self.epoch)
+        return math.hypot(self._sigma + self._growth * age, self._drag_growth * age**2)
+
+    def known_at(self, julian_date: float) -> OrbitState:
+        """Return the orbit state at a Julian date UTC.
+
+        Raises OrbitError if SGP4 fails, or if the standard deviation of the position exceeds `LARGEST_SIGMA`
+        because the date is too far from the epoch of the elements.
+        """
+        if not self._sigma_at(julian_date) <= LARGEST_SIGMA:
+            begin, end = (_J2000 + timedelta(days=date - J2000) for date in (self.epoch, julian_date))
+            raise OrbitError(
+                f"the elements of {begin:%Y-%m-%d} do not give the orbit on {end:%Y-%m-%d}: the standard "
+                f"deviation of the position exceeds {1e-3 * LARGEST_SIGMA:.0f} km "
+                f"{abs(julian_date - self.epoch):.0f} days from the epoch: take elements of about this day"
+            )
+        state = self.at(julian_date)
+        if not LOWEST_RADIUS <= float(np.linalg.norm(state.position)) < math.inf:
+            raise OrbitError(f"SGP4 at {julian_date}: the position {state.position} m is not in orbit")
+        return state
 
 
 def _drag_growth(satellite: Satrec) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.errors import UsageError
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light, m/s."""
@@ -34,7 +35,12 @@ DAY = 86_400.0
 
 
 def julian_date(utc: datetime) -> float:
-    """Return the Julian date UTC, days, of a `datetime`, which is in UTC unless it has a time zone."""
+    """Return the Julian date UTC, days, of a `datetime`, which is in UTC unless it has a time zone.
+
+    Raises UsageError for another type.
+    """
+    if not isinstance(utc, datetime):
+        raise UsageError(f"the time is {utc!r}: give a datetime, such as datetime(2026, 11, 26, 12)")
     instant = utc.replace(tzinfo=UTC) if utc.tzinfo is None else utc
     return J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import erfa
 import numpy as np
@@ -19,8 +20,10 @@ from knightcube.astro.almanac import (
     sun_direction,
     sunlit_fraction,
 )
+from knightcube.astro.arrays import finite_array, unit_vector
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.geomagnetism import GeomagneticError
+from knightcube.astro.earth.orbit_knowledge import LARGEST_SIGMA, OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, julian_date
 from knightcube.errors import UsageError
@@ -115,6 +118,86 @@ def test_kepler_elements_give_energy_momentum_and_apsides() -> None:
 def test_elements_of_no_orbit_are_refused(wrong: dict[str, float], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         orbit_state(**{"semi_major_axis": 7e6, "inclination": 1.0, **wrong})
+
+
+PLACE, MOTION = np.array([7e6, 0.0, 0.0]), np.array([0.0, 7.5e3, 0.0])
+NONE = [float("nan")] * 3
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        (lambda: magnetic_field(TIME, NONE), "position is .* give finite"),
+        (lambda: magnetic_field(TIME, [0.0, 0.0, 0.0]), "position lies 0 m from the Earth's centre"),
+        (lambda: magnetic_field(TIME, 1e-3 * PLACE), "lies 7000 m .*: give metres, not kilometres"),
+        (lambda: magnetic_field(TIME, [PLACE, PLACE]), r"shape \(2, 3\): give numbers of the shape \(3,\)"),
+        (lambda: magnetic_field("2026-11-26", PLACE), "'2026-11-26': give a datetime"),  # type: ignore[arg-type]
+        (lambda: sunlit_fraction(TIME, NONE), "position is .* give finite"),
+        (lambda: sunlit_fraction(TIME, [0.0, 0.0, 0.0]), "position lies 0 m"),
+        (lambda: sunlit_fraction(TIME, [PLACE, 1e-3 * PLACE]), "lies 7000 m .*: give metres"),
+        (lambda: sunlit_fraction(TIME, [7e6, 0.0]), r"shape \(2,\): give three components"),
+        (lambda: sun_direction(TIME, NONE), "position is .* give finite"),
+        (lambda: sun_direction(TIME, 1e-3 * PLACE), "give metres"),
+        (lambda: sun_direction(TIME, PLACE, NONE), "velocity is .* give finite"),
+        (lambda: propagate_orbit(NONE, MOTION, [1.0]), "position is .* give finite"),
+        (lambda: propagate_orbit(PLACE, NONE, [1.0]), "velocity is .* give finite"),
+        (lambda: propagate_orbit(1e-3 * PLACE, 1e-3 * MOTION, [1.0]), "give metres"),
+        (lambda: propagate_orbit(PLACE, 1e-3 * MOTION, [1.0]), "perigee 3 m from .* velocity in m/s"),
+        (lambda: propagate_orbit(PLACE, MOTION, [float("nan")]), "seconds is .* give finite"),
+        (lambda: propagate_orbit("here", MOTION, [1.0]), "position is 'here': give finite numbers"),
+        (lambda: propagate_elements(FIRST, [TIME]), "elements is '1 25544U.* give the two lines"),  # type: ignore[arg-type]
+        (lambda: unit_vector("axis", [0.0, 0.0, 0.0]), "axis is .* whose length is not zero"),
+    ],
+)
+def test_wrong_positions_velocities_and_times_are_refused(call: Any, reason: str) -> None:
+    """Values that are not finite or have another unit raise UsageError instead of giving a wrong result."""
+    with pytest.raises(UsageError, match=reason):
+        call()
+
+
+def test_positions_on_the_ground_and_far_away_are_accepted() -> None:
+    """The lower limit of positions is below every point of the Earth's surface, and no limit is above."""
+    pole = [0.0, 0.0, 6_356_752.0]
+    assert 5e-5 < np.linalg.norm(magnetic_field(TIME, pole)) < 7e-5
+    assert sunlit_fraction(TIME, np.zeros((0, 3))).shape == (0,)
+    assert sunlit_fraction(TIME, 4e8 * sun_direction(TIME)) == 1.0
+    away, _ = propagate_orbit(PLACE, [0.0, 12e3, 0.0], [1e4])  # a hyperbola, whose perigee is its start
+    assert np.linalg.norm(away[0]) > 5e7
+
+
+def test_directions_are_normalised_and_unit_vectors_stay_unchanged() -> None:
+    unit = np.array([0.36, 0.48, 0.8])
+    np.testing.assert_array_equal(unit_vector("axis", unit), unit)
+    np.testing.assert_allclose(unit_vector("axis", 3.0 * unit), unit, rtol=1e-15)
+    assert finite_array("size", 2).shape == ()
+
+
+def test_a_field_on_the_ground_needs_a_latitude_in_rad_and_a_height_above_the_depths_of_the_sea() -> None:
+    for wrong in ({"latitude": 45.0}, {"latitude": 0.5, "height": float("nan")}, {"latitude": float("nan")}):
+        with pytest.raises(GeomagneticError, match=r"invalid position.* a latitude of at most pi/2 rad"):
+            magnetic_field_on_ground(TIME, longitude=0.0, **wrong)
+    with pytest.raises(GeomagneticError, match=r"height -7e\+06 m: must be above -12000 m"):
+        magnetic_field_on_ground(TIME, latitude=0.5, longitude=0.0, height=-7e6)
+    assert np.isfinite(magnetic_field_on_ground(TIME, latitude=0.2, longitude=2.5, height=-1.1e4)).all()
+
+
+@pytest.mark.parametrize("year", [1990, 2024, 2026, 2060])
+def test_elements_far_from_their_epoch_give_no_orbit(year: int) -> None:
+    """The elements of a low orbit do not give the position months before or after their epoch."""
+    reason = f"the elements of 2025-11-16 do not give the orbit on {year}-12-01: .* exceeds 1000 km"
+    with pytest.raises(OrbitError, match=reason):
+        propagate_elements((FIRST, SECOND), [datetime(year, 12, 1)])
+
+
+def test_elements_are_accepted_until_their_standard_deviation_reaches_its_limit() -> None:
+    """The elements of a height of 420 km are accepted for two weeks before and after their epoch."""
+    epoch, elements = datetime(2025, 11, 16, 12), TwoLineElements(FIRST, SECOND)
+    days = next(d for d in range(1, 99) if elements.at(elements.epoch + d).sigma > LARGEST_SIGMA)
+    assert 10 < days < 20
+    times = [epoch + timedelta(days=sign * (days - 1)) for sign in (-1, 1)]
+    assert propagate_elements((FIRST, SECOND), times)[0].shape == (2, 3)
+    with pytest.raises(OrbitError, match=f"{days} days from the epoch: take elements of about this day"):
+        propagate_elements((FIRST, SECOND), [epoch + timedelta(days=days)])
 
 
 def test_a_propagated_orbit_precesses_by_the_oblateness_and_returns() -> None:
