@@ -86,7 +86,7 @@ from flight.loop.navigation import (
 from flight.loop.state import Learned, StateKeeper, open_state, service_folder, state_folder
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.schema import reader as configuration
-from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
+from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings, stated_accuracy
 from flight.schema.document import ConfigError, imported, merged_text, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.system import SystemClock, worker_cores
@@ -97,7 +97,7 @@ from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
 from knightcube.vision.camera import images
 from knightcube.vision.camera.images import KeptFrames
-from knightcube.vision.camera.lens import CameraKnowledge, Exposures
+from knightcube.vision.camera.lens import Exposures
 from knightcube.vision.frame_job import StreakEstimator, TrackerSettings
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
@@ -365,7 +365,7 @@ def lens_knowledge(
         return None  # the camera is exact
     known = LensKnowledge.of(
         camera_model(camera),
-        CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time),
+        stated_accuracy(camera),
         scale_error=scale_error,
         line_time=camera.line_time,
         psf_sigma=camera.psf_sigma,
@@ -443,9 +443,9 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     velocity = None if section.velocity is None else np.array(section.velocity)
     # Images of a flight camera are not mirrored, and the focal length is configured.
     identification = IdentificationSettings(mirror=False, hint_error=1.0)
-    accuracy = camera.accuracy
-    lens = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion)
-    solve = SolveSettings(detection=detection, identification=identification, velocity=velocity, lens=lens)
+    solve = SolveSettings(
+        detection=detection, identification=identification, velocity=velocity, lens=stated_accuracy(camera)
+    )
     return TrackerSettings(solve, scale, index)
 
 

@@ -12,7 +12,7 @@ import importlib
 import math
 import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -632,18 +632,21 @@ def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
     return mask
 
 
+def stated_accuracy(camera: Camera) -> CameraKnowledge:
+    """Return the standard deviations of the camera parameters that the configuration states."""
+    accuracy = camera.accuracy
+    return CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time)
+
+
 def camera_knowledge(camera: Camera) -> CameraKnowledge:
     """Return the uncertainty of the pinhole model with which the streak fit represents the camera.
 
     The streak fit has no lens model, so the difference between a calibrated lens and the pinhole adds to the
     uncertainty.
     """
-    accuracy = camera.accuracy
-    line_time = accuracy.line_time
-    if line_time is None and camera.line_time is not None:
-        line_time = 0.0
-    knowledge = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, line_time)
-    lens = camera_model(camera)
+    knowledge, lens = stated_accuracy(camera), camera_model(camera)
+    if knowledge.line_time is None and camera.line_time is not None:
+        knowledge = replace(knowledge, line_time=0.0)
     return knowledge_of_pinhole(knowledge, lens) if isinstance(lens, Lens) else knowledge
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.devices import camera_model, likelihood_settings
+from flight.schema.devices import camera_model, likelihood_settings, stated_accuracy
 from ground.commands.options import (
     add_field,
     add_output,
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     if options.wcs is not None and options.wcs.exists():
         raise UsageError(f"{options.wcs}: exists already: name another file")
     pixels = read_picture(options)
-    tracker, exposure = _tracker(options, pixels)
+    tracker, exposure, axis_sigma = _tracker(options, pixels)
     begin = time.perf_counter()
     solution = tracker.solve(pixels, exposure=exposure, utc=options.date, rate=options.prior)
     seconds = time.perf_counter() - begin
@@ -106,7 +106,8 @@ def run(options: argparse.Namespace) -> int:
     reversed_rows = options.raw is None and rows_reversed(options.image)
     values = {"attitude_method": options.attitude, "centroid_method": options.centroid}
     values |= facts(solution, seconds) | sky_facts(sky_map, bodies, reversed_rows)
-    print_result(options, values, _text(solution, seconds) + sky_text(sky_map, bodies))
+    text = _text(solution, seconds, axis_sigma) + sky_text(sky_map, bodies)
+    print_result(options, values | {"optical_axis_sigma_px": axis_sigma}, text)
     if options.wcs is not None and sky_map is not None:
         write_new(options.wcs, header_text(sky_map, reversed_rows))
     if options.overlay is not None:
@@ -116,9 +117,14 @@ def run(options: argparse.Namespace) -> int:
     return 0 if solution else 1
 
 
-def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, float | None]:
-    """Return the star tracker that the options describe, and the exposure time, s."""
+def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, float | None, float | None]:
+    """Return the star tracker that the options describe, and the exposure time, s.
+
+    The third returned value is the standard deviation (px) of the optical axis of a calibrated camera; None
+    without a calibrated camera.
+    """
     fov, error, exposure, lens, settings = options.fov, options.fov_error, options.exposure, None, None
+    accuracy = None
     if options.camera is not None:
         camera = configuration.load_camera(options.camera)
         if pixels.shape != (camera.rows, camera.columns):
@@ -129,8 +135,11 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
         if camera.lens is None and error is None:
             # The field of view has a tolerance unless the lens is calibrated.
             error = FOV_TOLERANCE * math.degrees(field_of_view(lens))
+        accuracy = stated_accuracy(camera) if error is None else None
         settings = SolveSettings(
-            detection=DetectionSettings(saturation=camera.saturation), likelihood=likelihood_settings(camera)
+            detection=DetectionSettings(saturation=camera.saturation),
+            likelihood=likelihood_settings(camera),
+            lens=accuracy,
         )
     settings = settings or SolveSettings()
     if options.method != DEFAULT_METHOD:
@@ -140,7 +149,8 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
     if options.attitude != IMAGE:
         settings = replace(settings, attitude=SOLVERS[options.attitude])
     settings = replace(settings, detection=replace(settings.detection, method=options.centroid))
-    return StarTracker(fov, error, camera=lens, settings=settings, index=options.index), exposure
+    tracker = StarTracker(fov, error, camera=lens, settings=settings, index=options.index)
+    return tracker, exposure, None if accuracy is None else accuracy.centre
 
 
 def facts(solution: StarSolution, seconds: float) -> dict[str, Any]:
@@ -196,7 +206,7 @@ def _motion_facts(solution: StarSolution) -> dict[str, Any] | None:
     return turn | {"rate_rad_s": motion.rate.tolist(), "rate_covariance_rad2_s2": motion.covariance.tolist()}
 
 
-def _text(solution: StarSolution, seconds: float) -> str:
+def _text(solution: StarSolution, seconds: float, axis_sigma: float | None = None) -> str:
     lines = [f"status:           {solution.status}"]
     if not solution:
         lines.append(f"reason:           {solution.reason}")
@@ -216,6 +226,11 @@ def _text(solution: StarSolution, seconds: float) -> str:
         f"by chance:        10^{solution.log10_false_alarm:.0f}"
         + (", by the light of faint stars" if frame.faint else ""),
     ]
+    if axis_sigma:
+        lines.append(
+            f'optical axis:     1 sigma {axis_sigma * per_pixel:.2f}" ({axis_sigma:.2f} px), constant until '
+            "the lens moves, in addition to the 1 sigma of the attitude"
+        )
     if solution.mirrored:
         lines.append("mirrored:         yes; the attitude belongs to the picture after mirroring")
     named = [PROPER_NAMES.get(hip) or f"HIP {hip}" for hip in stars.hip[:8].tolist()]

@@ -41,6 +41,8 @@ _SQUARES, _LEAST_COARSE_PX = (3, 5), 330
 """Bin sizes (px) with which an unsolved image is binned, and minimum side length (px) of the binned image."""
 FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, as a fraction of the field of view."""
+_LEAST_FOV_ERROR = 0.001
+"""Minimum uncertainty of a field of view without a calibrated lens, as a fraction of the field of view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +172,8 @@ class StarTracker:
         fov_deg: field of view between the outer edges of the first and last column, from 1 to 120 deg. If
             `fov_deg` is None, fields from 4 to 60 deg are tried.
         fov_error_deg: largest error of the field of view, deg. If `fov_error_deg` is None, the error is 5 %
-            of `fov_deg`, or zero for a given `camera`.
+            of `fov_deg`, or zero for a given `camera`. An error of `fov_deg` below 0.1 % is taken as 0.1 %,
+            because the lens is not calibrated.
         camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`) instead of `fov_deg`.
         settings: settings of detection, identification and attitude estimation. None: the defaults.
         index: a sky index, or the path of a sky index file. None: the default index.
@@ -300,7 +303,7 @@ class StarTracker:
                 "image",
                 f"{shape[1]} x {shape[0]} pixels, but the camera has {camera.columns} x {camera.rows}",
             )
-        if self._fov_error_deg is None:
+        if not self._fov_error_deg:
             return camera, (1.0, 1.0)
         return camera, camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)[1]
 
@@ -357,13 +360,13 @@ def camera_of_field(
 
     The scale is the ratio of the true tangents of field angles to those of the returned camera. If the field
     of view `fov_deg`, deg across the columns, is None, the range `UNKNOWN_FOV_DEG` is used. If the largest
-    error `error_deg`, deg, is None, 5 % of the field of view is used. Raises InputError unless the field of
-    view is 1 to 120 deg.
+    error `error_deg`, deg, is None, 5 % of the field of view is used. An error below 0.1 % of the field of
+    view is taken as 0.1 %. Raises InputError unless the field of view is 1 to 120 deg.
     """
     _check_field_of_view(fov_deg, error_deg)
     lowest, highest = UNKNOWN_FOV_DEG
     if fov_deg is not None:
-        error = FOV_TOLERANCE * fov_deg if error_deg is None else error_deg
+        error = FOV_TOLERANCE * fov_deg if error_deg is None else max(error_deg, _LEAST_FOV_ERROR * fov_deg)
         lowest, highest = max(fov_deg - error, 0.5), min(fov_deg + error, 125.0)
     tangents = [math.tan(0.5 * math.radians(angle)) for angle in (lowest, highest)]
     middle = math.sqrt(tangents[0] * tangents[1])

@@ -55,7 +55,12 @@ def test_the_lens_found_is_the_one_that_took_the_pictures(
         assert abs(facts[name] - value) < 5.0 * facts["sigma"][name], name
     assert facts["rms_px_after"] < 0.3
     solved = command("solve", pictures[0], "--camera", out, "--json")
-    assert json.loads(solved.stdout)["field_of_view_deg"] == pytest.approx(12.0, abs=0.005)
+    solution = json.loads(solved.stdout)
+    assert solution["field_of_view_deg"] == pytest.approx(12.0, abs=0.005)
+    # The attitude refers to the calibrated axis, whose uncertainty is stated separately.
+    assert solution["optical_axis_sigma_px"] == pytest.approx(facts["accuracy"]["centre"], rel=0.01)
+    lines = command("solve", pictures[0], "--camera", out).stdout.splitlines()
+    assert sum(line.startswith("optical axis:") for line in lines) == 1
 
 
 def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path], tmp_path: Path) -> None:
