@@ -614,9 +614,9 @@ def _rejection(
         (double > _MOST_DOUBLE, "most streaks are double: the body vibrated, or the point spread is a ring"),
         (
             known.model_error > settings.worst_uncertainty,
-            f"the rate is uncertain by {100.0 * known.model_error:.1f} %: "
-            "the streaks disagree, lens or shutter are inaccurate, or "
-            f"the point spread is {result.psf_sigma / settings.psf_sigma:.2f} times as "
+            f"the rate is uncertain by {100.0 * known.model_error:.1f} %, more than "
+            f"{100.0 * settings.worst_uncertainty:g} %: the streaks disagree, lens or shutter differ from "
+            f"the configuration, or the point spread is {result.psf_sigma / settings.psf_sigma:.2f} times as "
             "wide as configured",
         ),
     )

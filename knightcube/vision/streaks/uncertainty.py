@@ -415,8 +415,8 @@ class RotationUncertainty:
     Attributes:
         rotation: rotation vector (3,), corrected for significant calibration errors, rad.
         covariance: covariance (3, 3) of `rotation`, rad^2.
-        model_error: uncertainty from model errors, as a fraction of the rotation. If the type of shutter is
-            unspecified, the uncertainty of the line time is included only in `covariance`.
+        model_error: uncertainty from model errors, as a fraction of the rotation, without the calibration
+            errors of the camera, which are included only in `covariance`.
         common_motion: deviation from the smooth motion that is common to all streaks, such as vibration; 0 if
             `covariance` includes an unresolved vibration.
         aside: displacement of streaks across their paths that would explain the residuals, px, or 0 if the
@@ -463,8 +463,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     covariance = noise * spread * (1.0 + last.last_step**2)
     # An error common to all streak ends changes the rotation angle; the axis is assumed to be as uncertain.
     longer = ends**2 * float(rotation @ rotation)
-    common = float(np.trace(lens.described)) + longer
-    unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
+    unmodelled = longer + max(0.0, float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
     covariance = covariance + spread * vibration
     if last.free[3]:

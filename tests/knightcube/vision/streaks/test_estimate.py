@@ -529,13 +529,31 @@ def test_a_calibrated_lens_widens_the_covariance_by_what_the_pinhole_lacks() -> 
     pinhole = CAMERA.pinhole
     centre = (pinhole.centre[0] + 20.0, pinhole.centre[1])
     lens = Lens(pinhole.columns, pinhole.rows, pinhole.focal_length, centre)
-    settings = LikelihoodSettings(saturation=SATURATION, worst_uncertainty=1.0)
+    settings = LikelihoodSettings(saturation=SATURATION)
     sizes = []
     for camera in (pinhole, lens):
         found = estimate_rate(scene.pixels, camera, scene.exposure, prior_rate=scene.rate, settings=settings)
         assert found.covariance is not None
         sizes.append(float(np.trace(found.covariance)))
     assert sizes[1] > sizes[0]
+
+
+@pytest.mark.parametrize("error", [-0.03, 0.02])
+def test_a_stated_error_of_the_focal_length_is_part_of_the_covariance(error: float) -> None:
+    """A rate is not refused for an uncertainty that the covariance includes."""
+    scene = real_sky(60, 1.1, 60.0, 0.5)
+    pinhole = replace(CAMERA.pinhole, focal_length=CAMERA.pinhole.focal_length * (1.0 + error))
+    settings = LikelihoodSettings(saturation=SATURATION, knowledge=CameraKnowledge(focal_length=0.03))
+    found = estimate_rate(scene.pixels, pinhole, scene.exposure, prior_rate=scene.rate, settings=settings)
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert _squared(found.rate - scene.rate, found.covariance) < 16.3
+    assert float(np.sqrt(np.trace(found.covariance))) < 0.05 * float(np.linalg.norm(scene.rate))
+    # If the focal length is assumed to be exact, the claim is wrong.
+    certain = estimate_rate(scene.pixels, pinhole, scene.exposure, prior_rate=scene.rate)
+    assert certain.rate is not None
+    assert certain.covariance is not None
+    assert _squared(certain.rate - scene.rate, certain.covariance) > 16.3
 
 
 def test_the_knowledge_of_a_pinhole_adds_the_offset_and_the_distortion_of_the_lens() -> None:
