@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.integrate import solve_ivp
 from knightcube import Goal, PointingTarget, SingleAxisPlant, plan_slew, plan_step
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import PlanningError, UsageError
+from knightcube.gnc.guidance.plant import FARTHEST
 
 PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, stiffness=1e-5, damping=2e-6)
 NADIR, SUN = PointingTarget(Goal.NADIR), PointingTarget(Goal.SUN)
@@ -61,6 +63,59 @@ def test_a_step_minimises_the_selected_energy_and_a_time_cost_shortens_it() -> N
     assert fast.horizon < slow.horizon
     with pytest.raises(PlanningError, match="horizon"):
         plan_step(PLANT, start_angle=0.0, end_angle=0.5, horizon=-1.0)
+
+
+STEP: dict[str, Any] = {"plant": PLANT, "start_angle": 0.0, "end_angle": 0.5, "horizon": 12.0}
+FREE = SingleAxisPlant(2.5e-3, 5e-4, 30.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (
+            {"end_angle": 2.0 * np.pi - 1.0},
+            r"end_angle is 5.28319 rad: must be -1.4955 to 1.4955 rad.* not wrap",
+        ),
+        ({"end_angle": 45.0}, "end_angle is 45 rad: .*; 45 deg would be 0.7854 rad"),
+        ({"end_angle": -6.0}, "end_angle is -6 rad: must be"),
+        ({"end_angle": 2.0}, "end_angle is 2 rad: must be"),
+        ({"start_angle": 7.0}, "start_angle is 7 rad: must be"),
+        ({"start_angle": float("nan")}, "start_angle is nan rad: must be"),
+        ({"minimise": "time"}, "minimise is 'time': give 'heat' or 'supply'"),
+        ({"nodes": 24.5}, "nodes is 24.5: it must be an integer from 8 to 40"),
+        (
+            {"plant": replace(FREE, current_limit=1e-9)},
+            "at least about 0.00193 A: use a larger current",
+        ),
+        ({"plant": replace(PLANT, current_limit=1e-3)}, "0.0195 A would hold the end angle, which exceeds"),
+        (
+            {"plant": replace(PLANT, current_limit=0.04), "max_stretch": 1.0},
+            "a longer horizon or a larger current",
+        ),
+    ],
+)
+def test_an_impossible_step_is_refused_with_the_reason(wrong: dict[str, Any], reason: str) -> None:
+    """Angles beyond the range of the coil are refused, because sin(angle/2) would give another angle."""
+    with pytest.raises(PlanningError, match=reason) as refused:
+        plan_step(**STEP | wrong)
+    assert "q2" not in str(refused.value)
+
+
+@pytest.mark.parametrize("end_rate", [0.0, -0.02])
+def test_the_current_that_a_refusal_asks_for_is_needed_and_nearly_sufficient(end_rate: float) -> None:
+    """The current in the error message is a lower bound, from which a small step is possible at 2 % more."""
+    step: dict[str, Any] = {"start_angle": -0.05, "end_angle": 0.05, "horizon": 12.0, "max_stretch": 1.0}
+    with pytest.raises(PlanningError) as refused:
+        plan_step(replace(FREE, current_limit=1e-4), **step, end_rate=end_rate)
+    least = float(str(refused.value).partition("at least about ")[2].split()[0])
+    with pytest.raises(PlanningError):
+        plan_step(replace(FREE, current_limit=0.98 * least), **step, end_rate=end_rate)
+    assert plan_step(replace(FREE, current_limit=1.02 * least), **step, end_rate=end_rate).horizon == 12.0
+
+
+def test_steps_between_the_ends_of_the_range_are_planned() -> None:
+    found = plan_step(PLANT, start_angle=-FARTHEST, end_angle=FARTHEST, horizon=60.0)
+    assert found.path.motion(np.array([0.0, found.horizon]))[0] == pytest.approx([-FARTHEST, FARTHEST])
 
 
 def test_a_slew_leads_from_nadir_to_the_sun_within_the_limits() -> None:

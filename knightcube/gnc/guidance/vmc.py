@@ -28,15 +28,18 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.plant import (
+    FARTHEST,
     Q2_LIMIT,
     SQUARE_Q2_WITHOUT_AUTHORITY,
     CubicPrey,
     PathCost,
     PolynomialPath,
     SingleAxisPlant,
+    angle_of,
     lgl_rule,
     q2_of,
     q2_rate_of,
+    rate_of,
 )
 from knightcube.gnc.guidance.vmc_program import (
     LIMIT_TOLERANCE,
@@ -363,9 +366,9 @@ def plan(
         )
     if trial is None:
         raise PlanningError(
-            f"no path was found from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at "
-            f"{end_rate:.4f} rad/s in {horizon:g} to {longest:g} s, with currents up to "
-            f"{plant.current_limit:.4g} A and |q2| <= {q2_limit:g}: use a longer horizon"
+            f"no path was found from {angle_of(start_q2):.4f} rad at {start_rate:.4f} rad/s to "
+            f"{angle_of(end_q2):.4f} rad at {end_rate:.4f} rad/s in {horizon:g} to {longest:g} s, with up to "
+            f"{angle_of(q2_limit):.4f} rad and {_remedy(plant, boundary, horizon, longest)}"
         )
     asked = horizon if time_cost is None else trial.horizon
     found = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
@@ -380,6 +383,39 @@ def plan(
         return found
     finer = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
     return min(finer, found, key=lambda one: (one.horizon, one.spent(cost)))
+
+
+_TRIED = 64
+"""Number of durations for which the error message computes the smallest current."""
+
+
+def _remedy(plant: SingleAxisPlant, ends: BoundaryStates, horizon: float, longest: float) -> str:
+    """Return the current limit, and the remedy if no path of `horizon` to `longest` s is found.
+
+    Without a thread, the current limit must permit the bang-bang path between the states at the angle zero,
+    where the torque is largest. If the acceleration is a in one part of the time T and -a in the other part,
+    it changes the rate by v and moves the body by s more than the mean of both rates does, with
+    a T^2 / 4 = |s| + v^2 / (4 a).
+    """
+    start, end = angle_of(ends.start), angle_of(ends.end)
+    rates = rate_of(ends.start, ends.start_slope), rate_of(ends.end, ends.end_slope)
+    limit, hold = f"{plant.current_limit:.4g} A", abs(plant.current(end, 0.0, 0.0))
+    if hold > plant.current_limit and not rates[1]:
+        return (
+            f"{limit}: {hold:.3g} A would hold the end angle, which exceeds the limit: use a larger current "
+            "limit or another end angle"
+        )
+    times = np.geomspace(horizon, longest, _TRIED)
+    moved = np.abs(end - start - 0.5 * sum(rates) * times)
+    changed = rates[1] - rates[0] - plant.disturbance * times
+    needed = 2.0 / times**2 * (moved + np.sqrt(moved**2 + 0.25 * (changed * times) ** 2))
+    current = float(needed.min()) * plant.inertia / plant.torque_constant
+    if current > plant.current_limit and not (plant.stiffness or plant.damping):
+        return (
+            f"{limit}: every path of these durations needs at least about {current:.3g} A: use a larger "
+            "current limit, a longer horizon or a smaller step"
+        )
+    return f"{limit}: use a longer horizon or a larger current limit"
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
@@ -471,8 +507,10 @@ def _check(
         raise PlanningError(f"max_stretch is {max_stretch}: it must be 1 to 1000")
     if not (math.isfinite(reference) and abs(reference) > 1.0):
         raise PlanningError(f"reference is {reference}: it must lie beyond the range of q2, |q_r| > 1")
-    if not NODES_RANGE[0] <= nodes <= NODES_RANGE[1]:
-        raise PlanningError(f"nodes is {nodes}: it must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")
+    if not (isinstance(nodes, (int, np.integer)) and NODES_RANGE[0] <= nodes <= NODES_RANGE[1]):
+        raise PlanningError(
+            f"nodes is {nodes}: it must be an integer from {NODES_RANGE[0]} to {NODES_RANGE[1]}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -519,6 +557,18 @@ def run(job: PlanJob) -> StepPlan:
     )
 
 
+def _q2_at(name: str, angle: float) -> float:
+    """Return q2 at an angle (rad), the argument `name`. Raises PlanningError for an angle out of range."""
+    if not abs(angle) <= FARTHEST:
+        in_degrees = abs(angle) > 2.0 * math.pi and abs(math.radians(angle)) <= FARTHEST
+        raise PlanningError(
+            f"{name} is {angle:.6g} rad: must be {-FARTHEST:.4f} to {FARTHEST:.4f} rad, beyond which the "
+            "coil has almost no torque, and angles do not wrap"
+            + (f"; {angle:g} deg would be {math.radians(angle):.4f} rad" if in_degrees else "")
+        )
+    return q2_of(angle)
+
+
 def plan_step(
     plant: SingleAxisPlant,
     *,
@@ -535,17 +585,19 @@ def plan_step(
     """Return the minimum-energy path of a body about one axis that one torque coil rotates.
 
     The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP,
-    under the current limit of the plant and |angle| <= 1.496 rad at every time, beyond which the coil has
-    almost no torque. If no path of the requested duration satisfies the limits, the duration is extended to
-    the shortest feasible duration, and the status of the plan is "stretched". A plan takes about 2 ms.
+    under the current limit of the plant and |angle| <= 1.4955 rad at every time, beyond which the coil has
+    almost no torque. Angles outside this range are refused, and are not reduced by full rotations. If no path
+    of the requested duration satisfies the limits, the duration is extended to the shortest feasible
+    duration, and the status of the plan is "stretched". A plan takes about 2 ms.
 
     The method `plan.path.motion(times)` returns angle, rate and acceleration at times (n,), s after the
     start. The method `plant.currents` returns the coil currents for this motion.
 
     Args:
         plant: model with inertia, torque constant, coil and thread.
-        start_angle: angle at the start, rad, measured from the direction of the largest torque.
-        end_angle: angle at the end, rad.
+        start_angle: angle at the start, -1.4955 to 1.4955 rad, measured from the direction of the largest
+            torque.
+        end_angle: angle at the end, -1.4955 to 1.4955 rad.
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
@@ -555,13 +607,17 @@ def plan_step(
         max_stretch: largest ratio of the duration to `horizon`.
 
     Raises:
-        PlanningError: if an argument is not finite or out of range, or if no path is found.
+        PlanningError: if an argument is not finite or out of range, or if no path is found. The message
+            gives the reason, for example the current that every path needs at least.
     """
+    costs = [cost.value for cost in PathCost]
+    if minimise not in costs:
+        raise PlanningError(f"minimise is {minimise!r}: give {' or '.join(map(repr, costs))}")
     return plan(
         plant,
-        q2_of(start_angle),
+        _q2_at("start_angle", start_angle),
         start_rate,
-        q2_of(end_angle),
+        _q2_at("end_angle", end_angle),
         end_rate,
         horizon,
         nodes=nodes,

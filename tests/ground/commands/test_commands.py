@@ -164,6 +164,9 @@ def test_plan_refuses_what_no_coil_can_reach(capsys: pytest.CaptureFixture[str])
     status, _, error = obeyed(capsys, "plan", "--from", "0.9", "--to", "0.0")
     assert status == 2
     assert error == "knightcube: --from 0.9: must be -0.68 to 0.68\n"
+    status, _, error = obeyed(capsys, "plan", "--from", "0.4", "--to", "-0.4", "--horizon", "0.1")
+    assert status == 1, "valid arguments without a path are a failure and not a usage error"
+    assert "every path of these durations needs at least about 65.9 A" in error
 
 
 def test_export_writes_a_table_for_each_kind_of_packet(
