@@ -10,13 +10,23 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from knightcube import Goal, PointingTarget, SingleAxisPlant, plan_slew, plan_step
+from knightcube import (
+    GeomagneticError,
+    Goal,
+    OrbitError,
+    PointingTarget,
+    SingleAxisPlant,
+    plan_slew,
+    plan_step,
+)
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import PlanningError, UsageError
 from knightcube.gnc.guidance.plant import FARTHEST
 
 PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, stiffness=1e-5, damping=2e-6)
 NADIR, SUN = PointingTarget(Goal.NADIR), PointingTarget(Goal.SUN)
+NAN = float("nan")
 AT = datetime(2026, 3, 20, 12, 0, tzinfo=UTC)
 SLEW: dict[str, Any] = {
     "inertia": np.diag([1.10e-3, 1.05e-3, 0.99e-3]),
@@ -153,10 +163,105 @@ def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
     ("wrong", "reason"),
     [
         ({"goal": PointingTarget(Goal.OBJECT)}, "known only in flight"),
+        ({"start": "sun"}, "start is 'sun': give a PointingTarget"),
         ({"cones": {"venus": 0.1}}, "unknown exclusion cone 'venus'"),
+        ({"cones": {"sun": -1.0}}, r"cones\['sun'\] is -1.0 rad: must be 0 to below pi"),
+        ({"cones": {"moon": 15.0}}, r"cones\['moon'\] is 15.0 rad: .* math.radians converts degrees"),
+        ({"cones": {"moon": NAN}}, r"cones\['moon'\] is nan rad"),
         ({"window": -1.0}, "window"),
+        ({"window": NAN}, "window is nan s: must be 0 to 20000 s"),
+        ({"duration": NAN}, "duration is nan s, .* must satisfy 1 <= duration <= longest <= 20000 s"),
+        ({"duration": 1e12}, "duration is 1000000000000.0 s"),
+        ({"longest": 300.0}, "duration is 600.0 s, longest 300.0 s: must satisfy"),
+        ({"nodes": 24.5}, "nodes is 24.5: must be an integer from 8 to 96"),
+        (
+            {"inertia": [[1e-3, 1e-4, 0.0], [0.0, 1e-3, 0.0], [0.0, 0.0, 1e-3]]},
+            "inertia is not symmetric",
+        ),
+        ({"inertia": np.diag([1e-3, 1e-3, 0.1])}, "inertia has .* the largest must not exceed the sum"),
+        ({"inertia": 1e-3}, r"inertia has the shape \(\): give numbers of the shape \(3, 3\) or \(3,\)"),
+        ({"inertia": [1e-3, NAN, 1e-3]}, "inertia is .*nan.* give finite numbers"),
+        ({"dipole_limit": 0.1}, r"dipole_limit has the shape \(\): give numbers of the shape \(3,\)"),
+        ({"dipole_limit": [0.1, 0.0, 0.1]}, r"dipole limits are \[0.1, 0.0, 0.1\] A m\^2: all must be above"),
+        ({"heat": 50.0}, r"heat has the shape \(\)"),
+        ({"heat": [50.0, -50.0, 50.0]}, r"heat is \[50.0, -50.0, 50.0\]: the heating power of every"),
+        ({"heat": [[50.0, 9.0, 0.0], [0.0, 50.0, 0.0], [0.0, 0.0, 50.0]]}, "heat is .* must be symmetric"),
+        ({"pointing_axis": (0.0, 0.0, 0.0)}, "pointing_axis is .* whose length is not zero"),
+        ({"across_axis": (0.0, NAN, 0.0)}, "across_axis is .*nan.* give finite numbers"),
+        ({"across_axis": (0.0, 0.0, 3.0)}, "across_axis is .* must not be parallel to pointing_axis"),
+        ({"camera_axis": (0.0, 1.0)}, r"camera_axis has the shape \(2,\)"),
+        ({"elements": SLEW["elements"][0]}, "elements is '1 99999U.* give the two lines"),
+        ({"time": "2026-03-20"}, "the time is '2026-03-20': give a datetime"),
     ],
 )
 def test_an_impossible_slew_is_refused_with_the_reason(wrong: dict[str, Any], reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
         plan_slew(**SLEW | wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "reason"),
+    [
+        (
+            {"time": datetime(1999, 1, 1)},
+            GeomagneticError,
+            "year 1999.00: WMM2025 is valid from 2025",
+        ),
+        ({"time": datetime(2060, 1, 1)}, GeomagneticError, "year 2060.00"),
+        ({"time": datetime(2029, 12, 31, 22), "window": 2e4}, GeomagneticError, "year 2030.00"),
+        (
+            {"time": datetime(2028, 1, 1)},
+            OrbitError,
+            "of 2026-03-20 do not give the orbit on 2028-01-01",
+        ),
+        (
+            {"time": datetime(2025, 1, 1)},
+            OrbitError,
+            "of 2026-03-20 do not give the orbit on 2025-01-01",
+        ),
+    ],
+)
+def test_a_slew_at_a_time_without_known_field_or_orbit_is_refused(
+    wrong: dict[str, Any], error: type[Exception], reason: str
+) -> None:
+    with pytest.raises(error, match=reason):
+        plan_slew(**SLEW | wrong)
+
+
+def test_a_slew_depends_on_the_directions_of_the_axes_and_not_on_their_lengths() -> None:
+    """Axes of any length, and principal moments instead of a tensor, give the same plan."""
+    axes: dict[str, Any] = {"pointing_axis": [0.0, 0.6, 0.8], "across_axis": [1.0, 0.0, 0.0]}
+    cones: dict[str, Any] = {"camera_axis": [0.0, 0.0, 1.0], "cones": {"moon": 0.2}}
+    unit = plan_slew(**SLEW, **axes, **cones)
+    scaled = plan_slew(
+        **SLEW | {"inertia": [1.10e-3, 1.05e-3, 0.99e-3]},
+        pointing_axis=(0.0, 3.0, 4.0),
+        across_axis=(2.0, 0.0, 0.0),
+        camera_axis=(0.0, 0.0, 0.5),
+        cones={"moon": 0.2},
+    )
+    assert scaled.plan.energy == pytest.approx(unit.plan.energy, rel=1e-9)
+    assert scaled.plan.clearance == pytest.approx(unit.plan.clearance, abs=1e-9)
+
+
+def test_dipoles_are_linear_between_the_times_of_a_slew() -> None:
+    """A motion that is integrated with linear dipoles ends within 0.01 deg of the slew's end."""
+    found = plan_slew(**SLEW)
+    path, along = found.plan.path, found.task.along
+    inertia = np.diag(SLEW["inertia"])
+
+    def flow(time: float, state: FloatArray) -> FloatArray:
+        q, w = state[:4], state[4:]
+        around = along(np.array([time]))
+        down, gradient = around.gradient()
+        turned = attitude_matrix(q / np.linalg.norm(q))
+        dipole = np.array([np.interp(time, path.times, part) for part in path.dipole.T])
+        e = turned @ down[0]
+        torque = np.cross(dipole, turned @ around.field[0]) + gradient[0] * np.cross(e, inertia * e)
+        torque -= np.cross(w, inertia * w)
+        vector = 0.5 * (q[3] * w + np.cross(q[:3], w))
+        return np.concatenate([vector, [-0.5 * q[:3] @ w], torque / inertia])
+
+    begin = np.concatenate([path.quaternion[0], path.rate[0]])
+    end = solve_ivp(flow, (0.0, path.horizon), begin, rtol=1e-9, atol=1e-12, max_step=5.0).y[:4, -1]
+    assert np.degrees(2.0 * np.arccos(abs(end @ path.quaternion[-1]))) < 0.01

@@ -83,6 +83,11 @@ class PointingTarget:
 
     def __post_init__(self) -> None:
         """Raise UsageError for arguments that do not define an attitude."""
+        if not isinstance(self.goal, Goal):
+            raise UsageError(
+                f"the goal of a pointing target is {self.goal!r}: give one of "
+                + ", ".join(f"Goal.{goal.name}" for goal in Goal)
+            )
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))

@@ -28,14 +28,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, finite_array, unit_vector
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
-from knightcube.astro.earth.orbit_knowledge import TwoLineElements
-from knightcube.astro.earth.sun import julian_date
+from knightcube.astro.earth.geomagnetism import check_year
+from knightcube.astro.earth.orbit_knowledge import elements_of
+from knightcube.astro.earth.orientation import julian_epoch
+from knightcube.astro.earth.sun import DAY, julian_date
+from knightcube.astro.inertia import inertia_problem
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import PlanningError, UsageError
 from knightcube.gnc.guidance.attitude_law import (
     DIFFERENCE,
+    MINIMUM_SINE,
     Attitudes,
     BodyAxes,
     directions_of,
@@ -44,7 +48,9 @@ from knightcube.gnc.guidance.attitude_law import (
 )
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.slew_model import (
+    HORIZON_RANGE,
     NODES,
+    NODES_RANGE,
     AttitudeEnd,
     BoresightEnd,
     End,
@@ -58,6 +64,7 @@ from knightcube.gnc.guidance.slew_model import (
     blocking_cone,
     check,
     cones,
+    heat_matrix,
 )
 from knightcube.gnc.guidance.slew_program import Iterate, SlewProgram, Trajectory
 from knightcube.gnc.guidance.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSearch, SolvedPath
@@ -401,9 +408,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
     before `first`, and end at least `LEAD` s after the end of the longest slew. Raises PlanningError with the
     last reason if no slew is found, and UsageError for a window out of range.
     """
-    low, high = WINDOW_RANGE
-    if not low <= order.window <= high:
-        raise UsageError(f"the window is {order.window:g} s: must be {low:g} to {high:g} s")
+    _check_window(order.window)
     begins = first + order.window * np.linspace(0.0, 1.0, _BEGINS + 1 if order.window else 1)
     coarse = replace(order, nodes=min(order.nodes, _COARSE))
     compared: list[tuple[tuple[float, float], float]] = []
@@ -480,6 +485,81 @@ def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArr
     return found.quaternion[0], found.rate[0]
 
 
+def _craft(inertia: ArrayLike, dipole_limit: ArrayLike, heat: ArrayLike) -> SlewCraft:
+    """Return the model of the satellite. Raises UsageError or PlanningError for impossible values."""
+    tensor = heat_matrix(finite_array("inertia", inertia, (3, 3), (3,)))
+    problem = inertia_problem(tensor)
+    if problem:
+        raise UsageError(f"inertia {problem}")
+    weights = finite_array("heat", heat, (3, 3), (3,))
+    if not np.allclose(weights, weights.T, rtol=1e-6, atol=0.0):
+        raise UsageError(f"heat is {weights.tolist()}: must be symmetric, give the diagonal (3,) of coils")
+    if np.linalg.eigvalsh(heat_matrix(weights)).min() <= 0.0:
+        raise PlanningError(f"heat is {weights.tolist()}: the heating power of every dipole must be positive")
+    return SlewCraft(tensor, finite_array("dipole_limit", dipole_limit, (3,)), weights)
+
+
+def _axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
+    """Return the body axes of the pointing targets. Raises UsageError if they do not determine a roll."""
+    axes = BodyAxes(unit_vector("pointing_axis", pointing_axis), unit_vector("across_axis", across_axis))
+    if float(np.linalg.norm(np.cross(axes.pointing, axes.across))) < MINIMUM_SINE:
+        raise UsageError(
+            f"across_axis is {axes.across.tolist()}: must not be parallel to pointing_axis, because a roll "
+            "is measured from it"
+        )
+    return axes
+
+
+def _check_order(order: SlewOrder) -> None:
+    """Raise UsageError or PlanningError, with the name of the argument of `plan_slew`, for invalid values."""
+    for name, target in (("start", order.start), ("goal", order.goal)):
+        if not isinstance(target, PointingTarget):
+            raise UsageError(f"{name} is {target!r}: give a PointingTarget, such as PointingTarget(Goal.SUN)")
+        if target.goal is Goal.OBJECT:
+            raise UsageError(
+                "the direction of an object is known only in flight: no slew to it can be planned"
+            )
+    for name, angle in order.angles.items():
+        if name not in ("sun", "earth", "moon"):
+            raise UsageError(f"unknown exclusion cone {name!r}: give sun, earth or moon")
+        if not 0.0 <= angle < math.pi:
+            raise UsageError(
+                f"cones[{name!r}] is {angle} rad: must be 0 to below pi; math.radians converts degrees"
+            )
+    low, high = HORIZON_RANGE
+    if not low <= order.horizon <= order.longest <= high:
+        raise PlanningError(
+            f"duration is {order.horizon} s, longest {order.longest} s: must satisfy {low:g} <= duration <= "
+            f"longest <= {high:g} s"
+        )
+    if not (isinstance(order.nodes, (int, np.integer)) and NODES_RANGE[0] <= order.nodes <= NODES_RANGE[1]):
+        raise PlanningError(
+            f"nodes is {order.nodes}: must be an integer from {NODES_RANGE[0]} to {NODES_RANGE[1]}"
+        )
+    _check_window(order.window)
+
+
+def _check_window(window: float) -> None:
+    """Raise UsageError for a time window (s) out of range."""
+    low, high = WINDOW_RANGE
+    if not low <= window <= high:
+        raise UsageError(f"the window is {window:g} s: must be {low:g} to {high:g} s")
+
+
+def _ephemeris(elements: tuple[str, str], time: datetime, duration: float) -> Ephemeris:
+    """Return the ephemeris from `LEAD` s before a time to `LEAD` s after slews that last until `duration` s.
+
+    Raises UsageError for invalid elements, OrbitError for elements of another time, and GeomagneticError
+    outside the years of the magnetic field model.
+    """
+    dates, satellite = julian_date(time) + np.array([0.0, duration / DAY]), elements_of(elements)
+    for year in julian_epoch(dates).tolist():
+        check_year(year)
+    for date in dates.tolist():
+        satellite.known_at(date)
+    return predict(satellite.at(julian_date(time - timedelta(seconds=LEAD))), duration + 3.0 * LEAD)
+
+
 def plan_slew(
     *,
     inertia: ArrayLike,
@@ -507,15 +587,15 @@ def plan_slew(
     torque. The orbit is predicted by SGP4. A plan takes about a second.
 
     In the result, `plan.path` contains attitude, rate and dipole at the times `plan.path.times`, s after the
-    start of the slew. The energy `plan.energy` is the heat of the coils, J. The slew starts `begin` s after
-    `time`.
+    start of the slew. The dipole is linear between these times. The energy `plan.energy` is the heat of the
+    coils, J. The slew starts `begin` s after `time`.
 
     Args:
-        inertia: inertia tensor (3, 3) in body axes, kg m^2.
+        inertia: symmetric inertia tensor (3, 3) in body axes, kg m^2, or the principal moments (3,).
         dipole_limit: dipole limits (3,) of the coils along the body axes, A m^2.
         heat: heating power of the coils per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
-        elements: two lines of the two-line element set of the orbit.
-        time: UTC at the start of the slew or of the window, as a datetime without a time zone.
+        elements: two lines of the two-line element set of the orbit, with an epoch near `time`.
+        time: UTC at the start of the slew or of the window, or a datetime with a time zone.
         start: pointing target that is held until the slew begins, with a roll of zero if its roll is free.
         goal: pointing target at the end; if its roll is free, only the direction is an end condition.
         duration: requested duration of the slew, s.
@@ -525,30 +605,23 @@ def plan_slew(
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
             energy plus `time_cost` times the duration. If the time cost is infinite, the shortest slew is
             planned; if it is None, the duration is fixed.
-        pointing_axis: unit vector (3,) of the body axis that points to the targets.
-        across_axis: unit vector (3,) of the body axis, normal to `pointing_axis`, from which a roll is
-            measured.
-        camera_axis: unit vector (3,) of the body axis outside the cones, or None for `pointing_axis`.
+        pointing_axis: body axis (3,) that points to the targets. All three axes may have any length.
+        across_axis: body axis (3,) from which a roll is measured; its part along `pointing_axis` is ignored.
+        camera_axis: body axis (3,) outside the cones, or None for `pointing_axis`.
         cones: half angles of the exclusion cones of Sun and Moon, and angle from the Earth's limb, rad.
         nodes: number of collocation intervals, 8 to 96.
 
     Raises:
-        UsageError: for elements, targets, cones or a window that are out of range.
-        PlanningError: if a value is out of range, or if no slew is found; the message gives the reason.
+        UsageError: if an argument is invalid; the message gives the argument, its value and the remedy.
+        PlanningError: if no slew is found, or a time or limit is out of range. It is a UsageError.
+        OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
+        GeomagneticError: if the slew is outside the years 2025 to 2030 of the magnetic field model.
     """
-    unknown = set(cones or {}) - {"sun", "earth", "moon"}
-    if unknown:
-        raise UsageError(f"unknown exclusion cone {unknown.pop()!r}: give sun, earth or moon")
-    if Goal.OBJECT in (start.goal, goal.goal):
-        raise UsageError("the direction of an object is known only in flight: no slew to it can be planned")
-    pointing = np.array(pointing_axis, dtype=float)
-    satellite = SlewCraft(
-        np.array(inertia, dtype=float), np.array(dipole_limit, dtype=float), np.array(heat, dtype=float)
-    )
+    axes = _axes(pointing_axis, across_axis)
     order = SlewOrder(
-        satellite,
-        BodyAxes(pointing, np.array(across_axis, dtype=float)),
-        pointing if camera_axis is None else np.array(camera_axis, dtype=float),
+        _craft(inertia, dipole_limit, heat),
+        axes,
+        axes.pointing if camera_axis is None else unit_vector("camera_axis", camera_axis),
         start,
         goal,
         duration,
@@ -558,6 +631,6 @@ def plan_slew(
         {str(name): angle for name, angle in (cones or {}).items()},
         nodes,
     )
-    state = TwoLineElements(*elements).at(julian_date(time - timedelta(seconds=LEAD)))
-    made = plan_order(order, predict(state, window + order.longest + 3.0 * LEAD), LEAD)
+    _check_order(order)
+    made = plan_order(order, _ephemeris(elements, time, window + order.longest), LEAD)
     return replace(made, begin=made.begin - LEAD)

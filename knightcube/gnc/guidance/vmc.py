@@ -569,6 +569,14 @@ def _q2_at(name: str, angle: float) -> float:
     return q2_of(angle)
 
 
+def _cost(minimise: str) -> PathCost:
+    """Return the kind of energy called `minimise`. Raises PlanningError for an unknown name."""
+    names = [cost.value for cost in PathCost]
+    if minimise not in names:
+        raise PlanningError(f"minimise is {minimise!r}: give {' or '.join(map(repr, names))}")
+    return PathCost(minimise)
+
+
 def plan_step(
     plant: SingleAxisPlant,
     *,
@@ -586,17 +594,15 @@ def plan_step(
 
     The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP,
     under the current limit of the plant and |angle| <= 1.4955 rad at every time, beyond which the coil has
-    almost no torque. Angles outside this range are refused, and are not reduced by full rotations. If no path
-    of the requested duration satisfies the limits, the duration is extended to the shortest feasible
-    duration, and the status of the plan is "stretched". A plan takes about 2 ms.
+    almost no torque. Angles do not wrap. If no path of the requested duration satisfies the limits, the
+    duration is extended to the shortest feasible duration ("stretched"). A plan takes about 2 ms.
 
     The method `plan.path.motion(times)` returns angle, rate and acceleration at times (n,), s after the
     start. The method `plant.currents` returns the coil currents for this motion.
 
     Args:
         plant: model with inertia, torque constant, coil and thread.
-        start_angle: angle at the start, -1.4955 to 1.4955 rad, measured from the direction of the largest
-            torque.
+        start_angle: angle at the start, -1.4955 to 1.4955 rad; at zero, the torque is largest.
         end_angle: angle at the end, -1.4955 to 1.4955 rad.
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
@@ -607,12 +613,8 @@ def plan_step(
         max_stretch: largest ratio of the duration to `horizon`.
 
     Raises:
-        PlanningError: if an argument is not finite or out of range, or if no path is found. The message
-            gives the reason, for example the current that every path needs at least.
+        PlanningError: if an argument is not finite or out of range, or if no path is found.
     """
-    costs = [cost.value for cost in PathCost]
-    if minimise not in costs:
-        raise PlanningError(f"minimise is {minimise!r}: give {' or '.join(map(repr, costs))}")
     return plan(
         plant,
         _q2_at("start_angle", start_angle),
@@ -623,5 +625,5 @@ def plan_step(
         nodes=nodes,
         max_stretch=max_stretch,
         time_cost=time_cost,
-        cost=PathCost(minimise),
+        cost=_cost(minimise),
     )

@@ -54,6 +54,7 @@ def test_a_roll_is_shown_in_degrees() -> None:
     [
         (Goal.NADIR, (1.0,), None, "nadir takes 0 numbers, not 1"),
         (Goal.INERTIAL, (0.0, 0.0, 1.0), None, "inertial takes 4 numbers, not 3"),
+        ("sun", (), None, "'sun': give one of Goal.NADIR, Goal.VELOCITY"),
         (Goal.GROUND, (0.1,), None, "ground takes 2 numbers, not 1"),
         (Goal.OBJECT, (0.1,), None, "object takes 0 or 2 numbers, not 1"),
         (Goal.GROUND, (math.nan, 0.0), None, "must be finite"),
