@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from knightcube.astro.almanac import sunlit_fraction as sunlit_fraction
     from knightcube.astro.earth.geomagnetism import GeomagneticError as GeomagneticError
     from knightcube.astro.earth.orbit_knowledge import OrbitError as OrbitError
+    from knightcube.errors import ArgumentError as ArgumentError
     from knightcube.errors import InputError as InputError
     from knightcube.errors import KnightCubeError as KnightCubeError
     from knightcube.errors import PlanningError as PlanningError
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from knightcube.vision.sun import find_sun as find_sun
 
 _MODULE_OF = {
+    "ArgumentError": "knightcube.errors",
     "CalibrationError": "knightcube.vision.lens_knowledge",
     "GeomagneticError": "knightcube.astro.earth.geomagnetism",
     "Goal": "knightcube.gnc.guidance.pointing_target",

@@ -36,6 +36,13 @@ class InputError(UsageError):
         self.problem = problem
 
 
+class ArgumentError(InputError, ValueError):
+    """Error raised for an argument of a library function that cannot be used.
+
+    The attribute `where` is the name of the argument. The error is also a ValueError.
+    """
+
+
 class PlanningError(UsageError):
     """Error raised if a planner finds no path, or if one of its arguments is out of range.
 

@@ -1,7 +1,7 @@
 """Sun direction, geomagnetic field, eclipse and orbit of a satellite as functions of time and position.
 
 Times are `datetime` objects, in UTC unless they have a time zone. Positions and velocities are geocentric, in
-ICRS axes, m and m/s, unless stated otherwise. Invalid times, positions and velocities raise UsageError.
+ICRS axes, m and m/s, unless stated otherwise. Invalid times, positions and velocities raise ArgumentError.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orbit_knowledge import LOWEST_RADIUS, elements_of, propagated
 from knightcube.astro.earth.orientation import julian_epoch, terrestrial_time
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, Shadow, earth_from_sun, julian_date, sunlit_share
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 
 _LOWEST_HEIGHT = -12e3
 """Smallest height (m) above the ellipsoid, which is below every point of the Earth's surface."""
@@ -28,24 +28,25 @@ _LOWEST_HEIGHT = -12e3
 def _position(position: ArrayLike) -> FloatArray:
     """Return geocentric positions (..., 3), m, as an array of floats.
 
-    Raises UsageError for another shape, for positions that are not finite, and for positions deep within the
-    Earth, which are usually in km.
+    Raises ArgumentError for another shape, for positions that are not finite, and for positions deep within
+    the Earth, which are usually in km.
     """
     at = finite_array("position", position)
     if at.shape[-1:] != (3,):
-        raise UsageError(f"position has the shape {at.shape}: give three components, m")
+        raise ArgumentError("position", f"an array of shape {at.shape}: give three components, m")
     lowest = float(np.linalg.norm(at, axis=-1).min(initial=math.inf))
     if lowest < LOWEST_RADIUS:
         cure = ": give metres, not kilometres" if 1e3 * lowest >= LOWEST_RADIUS else ""
-        raise UsageError(
-            f"position lies {lowest:g} m from the Earth's centre, and no satellite is below "
-            f"{LOWEST_RADIUS:.0f} m{cure or ': give a geocentric position, m'}"
+        raise ArgumentError(
+            "position",
+            f"{lowest:g} m from the Earth's centre, and no satellite is below {LOWEST_RADIUS:.0f} m"
+            + (cure or ": give a geocentric position, m"),
         )
     return at
 
 
 def _single_position(position: ArrayLike) -> FloatArray:
-    """Return a geocentric position (3,), m. Raises UsageError for other shapes and as `_position`."""
+    """Return a geocentric position (3,), m. Raises ArgumentError for other shapes and as `_position`."""
     return _position(finite_array("position", position, (3,)))
 
 
@@ -60,7 +61,7 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
 
     Raises:
         GeomagneticError: if the time is outside the years of the model.
-        UsageError: if the position is not finite or lies deep within the Earth, for example in km.
+        ArgumentError: if the position is not finite or lies deep within the Earth, for example in km.
     """
     at, date = _single_position(position), julian_date(time)
     geomagnetism.check_year(float(julian_epoch(date)))
@@ -118,8 +119,8 @@ def sun_direction(
         velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
 
     Raises:
-        UsageError: if position or velocity is not finite, or if the position is neither the Earth's centre
-            nor above the depths of the Earth, for example in km.
+        ArgumentError: if position or velocity is not finite, or if the position lies deep within the Earth,
+            for example in km, except at its centre.
     """
     observer = finite_array("position", position, (3,))
     if observer.any():
@@ -138,8 +139,8 @@ def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conic
         shadow: shadow model, either "conical" with penumbra, or "cylindrical" with the values 0 and 1 only.
 
     Raises:
-        UsageError: if a position is not finite or lies deep within the Earth, for example in km.
-        ValueError: for an unknown shadow model.
+        ArgumentError: if a position is not finite or lies deep within the Earth, for example in km, and for
+            an unknown shadow model.
     """
     at = _position(position)
     sun = -earth_from_sun(float(terrestrial_time(julian_date(time))))[0]
@@ -211,14 +212,15 @@ def propagate_orbit(
         seconds: (n,) times relative to the initial state, in increasing or decreasing order, s.
 
     Raises:
-        UsageError: if a value is not finite, or if the orbit intersects the Earth, for example in km.
+        ArgumentError: if a value is not finite, or if the orbit intersects the Earth, for example in km.
     """
     at, motion = _single_position(position), finite_array("velocity", velocity, (3,))
     lowest = _perigee(at, motion)
     if lowest < LOWEST_RADIUS:
-        raise UsageError(
-            f"the velocity {motion.tolist()} m/s gives a perigee {lowest:.0f} m from the Earth's centre: it "
-            f"must be above {LOWEST_RADIUS:.0f} m: give the velocity in m/s, in axes that do not rotate"
+        raise ArgumentError(
+            "velocity",
+            f"{motion.tolist()} m/s gives a perigee {lowest:.0f} m from the Earth's centre, and no satellite "
+            f"is below {LOWEST_RADIUS:.0f} m: give the velocity in m/s, in axes that do not rotate",
         )
     state, elapsed, states = np.concatenate([at, motion]), 0.0, []
     for time in np.atleast_1d(finite_array("seconds", seconds)).tolist():

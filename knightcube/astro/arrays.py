@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError
 
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
@@ -25,18 +25,18 @@ Record = TypeVar("Record")
 def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:
     """Return the argument `name` of a public function as an array of finite numbers.
 
-    Raises UsageError, with name and value, for a value that is not finite or not numeric, and for an array
-    whose shape is not one of `shapes`; without `shapes`, every shape is permitted.
+    Raises ArgumentError for a value that is not finite or not numeric, and for an array whose shape is not
+    one of `shapes`; without `shapes`, every shape is permitted.
     """
     try:
         found = np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise UsageError(f"{name} is {value!r}: give finite numbers") from None
+        raise ArgumentError(name, f"{value!r}: give finite numbers") from None
     if shapes and found.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
-        raise UsageError(f"{name} has the shape {found.shape}: give numbers of the shape {wanted}")
+        raise ArgumentError(name, f"an array of shape {found.shape}: give finite numbers of shape {wanted}")
     if not np.isfinite(found).all():
-        raise UsageError(f"{name} is {found.tolist()}: give finite numbers")
+        raise ArgumentError(name, f"{found.tolist()}: give finite numbers")
     return found
 
 
@@ -47,12 +47,12 @@ _UNIT = 1e-12
 def unit_vector(name: str, value: npt.ArrayLike) -> FloatArray:
     """Return the direction `name` of a public function as a unit vector (3,).
 
-    A vector of another length is normalised. Raises UsageError unless the vector is finite and not zero.
+    A vector of another length is normalised. Raises ArgumentError unless the vector is finite and not zero.
     """
     vector = finite_array(name, value, (3,))
     length = math.hypot(*vector.tolist())
     if not 0.0 < length < math.inf:
-        raise UsageError(f"{name} is {vector.tolist()}: give a direction, whose length is not zero")
+        raise ArgumentError(name, f"{vector.tolist()}: give a direction, whose length is not zero")
     return vector if abs(length - 1.0) <= _UNIT else np.asarray(vector / length)
 
 

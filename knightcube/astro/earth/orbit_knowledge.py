@@ -26,7 +26,7 @@ from knightcube.astro.earth.orientation import (
     mean_equator_to_celestial,
 )
 from knightcube.astro.earth.sun import DAY, J2000
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import ArgumentError, KnightCubeError, UsageError
 
 _LONGEST_STEP = 30.0
 _J2000 = datetime(2000, 1, 1, 12)
@@ -139,10 +139,10 @@ def _measured(fix: GpsFix) -> FloatArray:
 def elements_of(lines: Sequence[str]) -> TwoLineElements:
     """Return the two-line elements in the argument `elements` of a public function.
 
-    Raises UsageError for another number of lines, and for invalid lines as `TwoLineElements`.
+    Raises ArgumentError for another number of lines, and UsageError for invalid lines as `TwoLineElements`.
     """
     if isinstance(lines, str) or len(lines) != 2 or not all(isinstance(line, str) for line in lines):
-        raise UsageError(f"elements is {lines!r}: give the two lines of the element set as a tuple of texts")
+        raise ArgumentError("elements", f"{lines!r}: give the two lines of the element set as texts")
     first, second = lines
     return TwoLineElements(first, second)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light, m/s."""
@@ -37,10 +37,10 @@ DAY = 86_400.0
 def julian_date(utc: datetime) -> float:
     """Return the Julian date UTC, days, of a `datetime`, which is in UTC unless it has a time zone.
 
-    Raises UsageError for another type.
+    Raises ArgumentError for another type.
     """
     if not isinstance(utc, datetime):
-        raise UsageError(f"the time is {utc!r}: give a datetime, such as datetime(2026, 11, 26, 12)")
+        raise ArgumentError("time", f"{utc!r}: give a datetime, such as datetime(2026, 11, 26, 12)")
     instant = utc.replace(tzinfo=UTC) if utc.tzinfo is None else utc
     return J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
 
@@ -77,7 +77,7 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
 
     The positions of the observer and of the Sun (..., 3), m, are geocentric. The "conical" shadow model
     computes the overlap of the discs of Sun and Earth (Montenbruck & Gill 2000, section 3.4.2). The
-    "cylindrical" model returns 0 or 1 (Sease, eq. 2.15, corrected).
+    "cylindrical" model returns 0 or 1 (Sease, eq. 2.15, corrected). Raises ArgumentError for another model.
     """
     position, sun = np.asarray(position, dtype=float), np.asarray(sun, dtype=float)
     distance = np.linalg.norm(position, axis=-1)
@@ -87,7 +87,7 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
         tangent = np.sqrt(np.maximum(0.0, distance**2 - EARTH_RADIUS**2)) / distance
         return np.where(cosine <= -tangent, 0.0, 1.0)
     if shadow != "conical":
-        raise ValueError(f"shadow = {shadow!r}: give conical or cylindrical")
+        raise ArgumentError("shadow", f"{shadow!r}: give conical or cylindrical")
     to_sun = sun - position
     sun_distance = np.linalg.norm(to_sun, axis=-1)
     sun_disc = np.arcsin(SUN_RADIUS / sun_distance)

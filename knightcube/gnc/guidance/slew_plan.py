@@ -36,7 +36,7 @@ from knightcube.astro.earth.orientation import julian_epoch
 from knightcube.astro.earth.sun import DAY, julian_date
 from knightcube.astro.inertia import inertia_problem
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.errors import PlanningError, UsageError
+from knightcube.errors import ArgumentError, PlanningError, UsageError
 from knightcube.gnc.guidance.attitude_law import (
     DIFFERENCE,
     MINIMUM_SINE,
@@ -486,26 +486,26 @@ def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArr
 
 
 def _craft(inertia: ArrayLike, dipole_limit: ArrayLike, heat: ArrayLike) -> SlewCraft:
-    """Return the model of the satellite. Raises UsageError or PlanningError for impossible values."""
+    """Return the model of the satellite. Raises ArgumentError or PlanningError for impossible values."""
     tensor = heat_matrix(finite_array("inertia", inertia, (3, 3), (3,)))
     problem = inertia_problem(tensor)
     if problem:
-        raise UsageError(f"inertia {problem}")
+        raise ArgumentError("inertia", problem)
     weights = finite_array("heat", heat, (3, 3), (3,))
     if not np.allclose(weights, weights.T, rtol=1e-6, atol=0.0):
-        raise UsageError(f"heat is {weights.tolist()}: must be symmetric, give the diagonal (3,) of coils")
+        raise ArgumentError("heat", f"{weights.tolist()}: must be symmetric, or give its diagonal (3,)")
     if np.linalg.eigvalsh(heat_matrix(weights)).min() <= 0.0:
         raise PlanningError(f"heat is {weights.tolist()}: the heating power of every dipole must be positive")
     return SlewCraft(tensor, finite_array("dipole_limit", dipole_limit, (3,)), weights)
 
 
 def _axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
-    """Return the body axes of the pointing targets. Raises UsageError if they do not determine a roll."""
+    """Return the body axes of the pointing targets. Raises ArgumentError if they determine no roll."""
     axes = BodyAxes(unit_vector("pointing_axis", pointing_axis), unit_vector("across_axis", across_axis))
     if float(np.linalg.norm(np.cross(axes.pointing, axes.across))) < MINIMUM_SINE:
-        raise UsageError(
-            f"across_axis is {axes.across.tolist()}: must not be parallel to pointing_axis, because a roll "
-            "is measured from it"
+        raise ArgumentError(
+            "across_axis",
+            f"{axes.across.tolist()}: must not be parallel to pointing_axis, because it is the zero of the roll",
         )
     return axes
 
@@ -514,17 +514,17 @@ def _check_order(order: SlewOrder) -> None:
     """Raise UsageError or PlanningError, with the name of the argument of `plan_slew`, for invalid values."""
     for name, target in (("start", order.start), ("goal", order.goal)):
         if not isinstance(target, PointingTarget):
-            raise UsageError(f"{name} is {target!r}: give a PointingTarget, such as PointingTarget(Goal.SUN)")
+            raise ArgumentError(name, f"{target!r}: give a PointingTarget, such as PointingTarget(Goal.SUN)")
         if target.goal is Goal.OBJECT:
             raise UsageError(
                 "the direction of an object is known only in flight: no slew to it can be planned"
             )
     for name, angle in order.angles.items():
         if name not in ("sun", "earth", "moon"):
-            raise UsageError(f"unknown exclusion cone {name!r}: give sun, earth or moon")
+            raise ArgumentError("cones", f"unknown exclusion cone {name!r}: give sun, earth or moon")
         if not 0.0 <= angle < math.pi:
-            raise UsageError(
-                f"cones[{name!r}] is {angle} rad: must be 0 to below pi; math.radians converts degrees"
+            raise ArgumentError(
+                f"cones[{name!r}]", f"{angle} rad: must be 0 to below pi; math.radians converts degrees"
             )
     low, high = HORIZON_RANGE
     if not low <= order.horizon <= order.longest <= high:
@@ -613,7 +613,7 @@ def plan_slew(
 
     Raises:
         UsageError: if an argument is invalid; the message gives the argument, its value and the remedy.
-        PlanningError: if no slew is found, or a time or limit is out of range. It is a UsageError.
+        PlanningError: if no slew is found, or if a duration or limit is out of range. It is a UsageError.
         OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
         GeomagneticError: if the slew is outside the years 2025 to 2030 of the magnetic field model.
     """

@@ -13,7 +13,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 
 LEAST_ALTITUDE = 50e3
 """Lowest altitude (m) from which the limb is visible; a lower camera is inside the atmosphere."""
@@ -69,12 +69,12 @@ class HorizonKnowledge:
         for name in ("position", "sun", "pole"):
             value = getattr(self, name)
             if value is not None and (np.shape(value) != (3,) or not np.all(np.isfinite(value))):
-                raise ValueError(f"{name} = {value}: give (3,) finite numbers")
+                raise ArgumentError(name, f"{value}: give (3,) finite numbers")
         if self.position is not None and np.linalg.norm(self.position) < SEMI_MAJOR_AXIS + LEAST_ALTITUDE:
-            raise ValueError(f"position = {self.position}: inside the Earth, give metres from its centre")
+            raise ArgumentError("position", f"{self.position}: inside the Earth, give metres from its centre")
         if self.altitude is not None and not LEAST_ALTITUDE <= self.altitude < np.inf:
-            raise ValueError(
-                f"altitude = {self.altitude}: give metres above the Earth, {LEAST_ALTITUDE:g} at least"
+            raise ArgumentError(
+                "altitude", f"{self.altitude}: give metres above the Earth, {LEAST_ALTITUDE:g} at least"
             )
 
 

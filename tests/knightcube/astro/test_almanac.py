@@ -26,7 +26,7 @@ from knightcube.astro.earth.geomagnetism import GeomagneticError
 from knightcube.astro.earth.orbit_knowledge import LARGEST_SIGMA, OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, julian_date
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from sim_hal.worlds.orbit import sun_position
 
 TIME = datetime(2026, 11, 26, 12, 0, tzinfo=UTC)
@@ -85,7 +85,7 @@ def test_the_earth_hides_the_sun_behind_it_and_not_before_it() -> None:
     at_edge = 7e6 * (EARTH_RADIUS / 7e6 * side - edge * towards)
     assert 0.2 < sunlit_fraction(TIME, at_edge) < 0.8
     assert sunlit_fraction(TIME, at_edge, "cylindrical") in (0.0, 1.0)
-    with pytest.raises(ValueError, match="conical or cylindrical"):
+    with pytest.raises(ArgumentError, match="conical or cylindrical"):
         sunlit_fraction(TIME, at_edge, "round")  # type: ignore[arg-type]
 
 
@@ -127,31 +127,34 @@ NONE = [float("nan")] * 3
 @pytest.mark.parametrize(
     ("call", "reason"),
     [
-        (lambda: magnetic_field(TIME, NONE), "position is .* give finite"),
-        (lambda: magnetic_field(TIME, [0.0, 0.0, 0.0]), "position lies 0 m from the Earth's centre"),
-        (lambda: magnetic_field(TIME, 1e-3 * PLACE), "lies 7000 m .*: give metres, not kilometres"),
-        (lambda: magnetic_field(TIME, [PLACE, PLACE]), r"shape \(2, 3\): give numbers of the shape \(3,\)"),
+        (lambda: magnetic_field(TIME, NONE), "position: .* give finite"),
+        (lambda: magnetic_field(TIME, [0.0, 0.0, 0.0]), "position: 0 m from the Earth's centre"),
+        (lambda: magnetic_field(TIME, 1e-3 * PLACE), "7000 m .*: give metres, not kilometres"),
+        (
+            lambda: magnetic_field(TIME, [PLACE, PLACE]),
+            r"shape \(2, 3\): give finite numbers of shape",
+        ),
         (lambda: magnetic_field("2026-11-26", PLACE), "'2026-11-26': give a datetime"),  # type: ignore[arg-type]
-        (lambda: sunlit_fraction(TIME, NONE), "position is .* give finite"),
-        (lambda: sunlit_fraction(TIME, [0.0, 0.0, 0.0]), "position lies 0 m"),
-        (lambda: sunlit_fraction(TIME, [PLACE, 1e-3 * PLACE]), "lies 7000 m .*: give metres"),
+        (lambda: sunlit_fraction(TIME, NONE), "position: .* give finite"),
+        (lambda: sunlit_fraction(TIME, [0.0, 0.0, 0.0]), "position: 0 m"),
+        (lambda: sunlit_fraction(TIME, [PLACE, 1e-3 * PLACE]), "7000 m .*: give metres"),
         (lambda: sunlit_fraction(TIME, [7e6, 0.0]), r"shape \(2,\): give three components"),
-        (lambda: sun_direction(TIME, NONE), "position is .* give finite"),
+        (lambda: sun_direction(TIME, NONE), "position: .* give finite"),
         (lambda: sun_direction(TIME, 1e-3 * PLACE), "give metres"),
-        (lambda: sun_direction(TIME, PLACE, NONE), "velocity is .* give finite"),
-        (lambda: propagate_orbit(NONE, MOTION, [1.0]), "position is .* give finite"),
-        (lambda: propagate_orbit(PLACE, NONE, [1.0]), "velocity is .* give finite"),
+        (lambda: sun_direction(TIME, PLACE, NONE), "velocity: .* give finite"),
+        (lambda: propagate_orbit(NONE, MOTION, [1.0]), "position: .* give finite"),
+        (lambda: propagate_orbit(PLACE, NONE, [1.0]), "velocity: .* give finite"),
         (lambda: propagate_orbit(1e-3 * PLACE, 1e-3 * MOTION, [1.0]), "give metres"),
         (lambda: propagate_orbit(PLACE, 1e-3 * MOTION, [1.0]), "perigee 3 m from .* velocity in m/s"),
-        (lambda: propagate_orbit(PLACE, MOTION, [float("nan")]), "seconds is .* give finite"),
-        (lambda: propagate_orbit("here", MOTION, [1.0]), "position is 'here': give finite numbers"),
-        (lambda: propagate_elements(FIRST, [TIME]), "elements is '1 25544U.* give the two lines"),  # type: ignore[arg-type]
-        (lambda: unit_vector("axis", [0.0, 0.0, 0.0]), "axis is .* whose length is not zero"),
+        (lambda: propagate_orbit(PLACE, MOTION, [float("nan")]), "seconds: .* give finite"),
+        (lambda: propagate_orbit("here", MOTION, [1.0]), "position: 'here': give finite numbers"),
+        (lambda: propagate_elements(FIRST, [TIME]), "elements: '1 25544U.* give the two lines"),  # type: ignore[arg-type]
+        (lambda: unit_vector("axis", [0.0, 0.0, 0.0]), "axis: .* whose length is not zero"),
     ],
 )
 def test_wrong_positions_velocities_and_times_are_refused(call: Any, reason: str) -> None:
-    """Values that are not finite or have another unit raise UsageError instead of giving a wrong result."""
-    with pytest.raises(UsageError, match=reason):
+    """Values that are not finite or have another unit raise an error instead of giving a wrong result."""
+    with pytest.raises(ArgumentError, match=reason):
         call()
 
 
