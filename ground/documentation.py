@@ -1,6 +1,6 @@
 """Packet definition tables as Markdown for people and as JSON for ground stations.
 
-`python -m ground.documentation [--telecommands | --json]`
+`python -m ground.documentation [--telecommands | --events | --json]`
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from flight.link.commands import DUMP_PARAMETERS, LOAD_PARAMETERS, POINT, SLEW
 from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
-from flight.link.events import EVENTS, ORBITAL, TESTBED, Mode
+from flight.link.events import EVENTS, ORBITAL, TESTBED, Mode, Reaction, Severity
 from flight.link.process.directives import LAYOUTS as DIRECTIVE_LAYOUTS
 from flight.link.process.directives import SCHEDULE
 from flight.link.telemetry.definitions import Field, Packet
@@ -67,6 +67,29 @@ Every telecommand is a CCSDS space packet (133.0-B-2) with big-endian numbers:
 | 15 | | the fields below |
 | last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
 """
+_FOREWORD_OF_EVENTS = """\
+# Events and alarms
+
+This page is made from `flight/link/events.py` and `flight/loop/facts.py`.
+The command is `python -m ground.documentation --events > docs/events.md`.
+
+An event has a name, a severity, and a text with values, which `knightcube watch` shows.
+The text names the device and the reason; search for the name of the event on this page.
+An alarm is a monitored condition that is active now; the last table names the event that each alarm reports.
+In a remedy, `clear`, `mode` and `safe` are [commands](fly/commands.md) to the flight.
+The words `bringup`, `identify` and `calibrate` are [commands of the ground](fly/command-line.md).
+The remedy "none" means that the flight deals with the cause by itself.
+"""
+_REACTIONS = {
+    Reaction.NOTE: "",
+    Reaction.COILS_OFF: "coils at zero",
+    Reaction.ISOLATE: "isolates the coil",
+    Reaction.HOLD: "mode HOLD",
+    Reaction.DETUMBLE: "mode DETUMBLE",
+    Reaction.SAFE: "mode SAFE",
+    Reaction.RESTART: "restarts",
+    Reaction.RETURN: "leaves SAFE",
+}
 
 
 def database() -> dict[str, Any]:
@@ -97,6 +120,36 @@ def markdown_of_telecommands() -> str:
     """Return the table of the telecommands to the flight process and to the link process, as Markdown."""
     sections = (_section(layout) for layout in (*COMMAND_LAYOUTS.values(), *DIRECTIVE_LAYOUTS.values()))
     return _FOREWORD_OF_TELECOMMANDS + _TYPES + "".join(sections)
+
+
+def markdown_of_events() -> str:
+    """Return the table of all events and the table of all alarms as Markdown."""
+    lines = [_FOREWORD_OF_EVENTS]
+    for severity, title in ((Severity.FAULT, "Faults"), (Severity.WARNING, "Warnings")):
+        lines += [
+            f"## {title}",
+            "",
+            "| event | meaning | reaction of the flight | remedy |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| `{kind.name}` | {kind.meaning} | {_REACTIONS[kind.reaction]} | {kind.remedy} |"
+            for kind in sorted(EVENTS, key=lambda kind: kind.name)
+            if kind.severity is severity
+        ]
+        lines.append("")
+    lines += ["## Information", "", "| event | meaning |", "|---|---|"]
+    lines += [
+        f"| `{kind.name}` | {kind.meaning} |"
+        for kind in sorted(EVENTS, key=lambda kind: kind.name)
+        if kind.severity is Severity.INFORMATION
+    ]
+    lines += ["", "## Alarms", "", "| alarm | event | ends |", "|---|---|---|"]
+    for fact in sorted(FACTS, key=lambda fact: fact.name):
+        ends = "by itself" if fact.ends is None else f"with `{fact.ends.name}`"
+        ends = f"by the command `clear {fact.begins.name}`" if fact.latching else ends
+        lines.append(f"| `{fact.name}` | `{fact.begins.name}` | {ends} |")
+    return "\n".join(lines) + "\n"
 
 
 def _packet(layout: Layout) -> dict[str, Any]:
@@ -177,9 +230,12 @@ def main() -> None:
         "--json", action="store_true", help="print the telemetry database (JSON) instead of Markdown pages"
     )
     kinds.add_argument("--telecommands", action="store_true", help="print the telecommands")
+    kinds.add_argument("--events", action="store_true", help="print the events with meanings and remedies")
     arguments = parser.parse_args()
     if arguments.json:
         sys.stdout.write(json.dumps(database(), indent=2) + "\n")
+    elif arguments.events:
+        sys.stdout.write(markdown_of_events())
     else:
         sys.stdout.write(markdown_of_telecommands() if arguments.telecommands else markdown())
 

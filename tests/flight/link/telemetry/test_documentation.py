@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from flight.link.events import EVENTS, Severity
 from flight.link.telemetry.definitions import CONTROL, PACKETS
 from flight.link.telemetry.packets import Packer
-from ground.documentation import database, main, markdown, markdown_of_telecommands
+from flight.loop.facts import FACTS
+from ground.documentation import database, main, markdown, markdown_of_events, markdown_of_telecommands
 from tests.flight.link.published import COMMANDS, DIRECTIVES
 from tests.flight.link.telemetry.samples import plain_contents
 
@@ -30,6 +32,16 @@ def test_the_telecommands_in_the_repository_are_in_step_with_their_tables() -> N
         section = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
         assert f"0x{apid:03X}" in section
         assert ("Hazard" in section) == hazard
+
+
+def test_the_page_of_events_names_every_event_and_alarm_with_a_remedy() -> None:
+    cure = "run: python -m ground.documentation --events > docs/events.md"
+    text = (ROOT / "docs" / "events.md").read_text(encoding="utf-8")
+    assert text == markdown_of_events(), cure
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    named = {kind.name for kind in EVENTS} | {fact.name for fact in FACTS}
+    assert {row[0] for row in rows} == {f"| `{name}`" for name in named}
+    assert all((kind.remedy != "") == (kind.severity > Severity.INFORMATION) for kind in EVENTS)
 
 
 def test_every_field_of_every_packet_is_documented() -> None:
