@@ -33,6 +33,8 @@ LISTED_EVENTS = 12
 _KEPT_EVENTS = 200
 _MAX_TIME = 1e15  # mission time (s) above which a packet is assumed to be damaged
 _TIMEOUT_S = 2.0  # longest time (s) to wait for the answer to a ping
+_FROM_START_S = 0.1  # mission time (s) up to which the first packet of a complete log arrives
+_REPEATED = frozenset({"run", "parameters"})  # packets of the start that a flight sends again later
 
 
 class PacketSource(Protocol):
@@ -161,7 +163,9 @@ class FlightState:
         mode: label of the flight's mode, or an empty text until the mode is known.
         ended: reason for the end of the flight, or an empty text before the end.
         events: newest events.
-        faults: number of events whose severity is fault.
+        faults: number of received events whose severity is fault.
+        since: mission time of the first packet, s, or None before the first packet. No packet contains the
+            number of faults since the start, so faults before this time are not counted.
         newest: newest packets by name.
     """
 
@@ -170,6 +174,7 @@ class FlightState:
     ended: str = ""
     events: deque[LoggedEvent] = field(default_factory=lambda: deque(maxlen=_KEPT_EVENTS))
     faults: int = 0
+    since: float | None = None
     newest: dict[str, Any] = field(default_factory=dict)
 
     def update(self, packets: Mapping[str, PacketArray]) -> list[LoggedEvent]:
@@ -183,6 +188,9 @@ class FlightState:
             )
             for row in packets["event"]
         ]
+        times = [rows["time_ns"][0] for name, rows in packets.items() if len(rows) and name not in _REPEATED]
+        if self.since is None and times:
+            self.since = float(min(times)) * 1e-9
         for name, rows in packets.items():
             if len(rows):
                 self.newest[name] = rows[-1]
@@ -207,6 +215,13 @@ class FlightState:
         """Names of the conditions that are active in the newest packet `health`."""
         held = int(self.value("health", "facts") or 0)
         return tuple(name for bit, name in FACTS if held >> bit & 1)
+
+    @property
+    def counted_faults(self) -> str:
+        """Number of received faults, and the beginning of the count if it is later than the start."""
+        if self.since is None or self.since <= _FROM_START_S:
+            return f"faults {self.faults}"
+        return f"faults received {self.faults} since {self.since:.1f} s"
 
     @property
     def error_deg(self) -> float | None:
@@ -273,8 +288,8 @@ def state_line(state: FlightState) -> str:
     if (slips := state.value("health", "slips")) is not None:
         parts.append(f"slips {int(slips)}")
         parts.append(f"alarms {', '.join(state.alarms) or 'none'}")
-    if state.faults:
-        parts.append(f"faults {state.faults}")
+    if state.faults or (slips is not None and (state.since or 0.0) > _FROM_START_S):
+        parts.append(state.counted_faults)
     return "  ".join(part for part in parts if part)
 
 
@@ -362,7 +377,7 @@ def _panel_lines(state: FlightState) -> Iterator[tuple[str, _Line]]:
             ],
         )
         processor = _figure(100.0 * health["cpu_share"], 0)
-        yield "loop", [(f"slips {int(health['slips'])}  processor {processor} %  faults {state.faults}", "")]
+        yield "loop", [(f"slips {int(health['slips'])}  processor {processor} %  {state.counted_faults}", "")]
 
 
 def _figure(value: float, digits: int) -> str:

@@ -258,7 +258,10 @@ class RunLabel:
 
 @dataclass(frozen=True, slots=True)
 class FlightProgress:
-    """Progress of a flight: times (s), coil currents (n,), A, and a text about target and attitude."""
+    """Progress of a flight: times (s), coil currents (n,), A, and a text about target and attitude.
+
+    The number `slips` counts skipped control cycles, as in the packet `health`.
+    """
 
     mission_time: float
     duration: float
@@ -533,7 +536,7 @@ class FlightLoop:
             self._body.view.progress(output),
             tuple(output.steered.currents.tolist()) if output is not None else (),
             state.name.lower(),
-            sum(group.slips for group in self._groups),
+            self._groups[0].slips,
             self._services.events.count,
         )
         self._show(progress)

@@ -227,6 +227,7 @@ def _facts(state: FlightState) -> dict[str, Any]:
         "streams": streams,
         "alarms": list(state.alarms),
         "faults": state.faults,
+        "faults_since_s": state.since,
         "events": [
             {"time_s": event.time, "severity": event.severity, "name": event.name, "text": event.text}
             for event in state.events
