@@ -29,7 +29,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.vision.camera.lens import Lens
 from sim_hal.clock import FaultTimeline, TimedSimulation
 from sim_hal.description_errors import NO_ERRORS, description_errors
-from sim_hal.emulation import ORBIT_STREAM, EmulatedWires, Emulation, emulated
+from sim_hal.emulation import NO_EMULATOR, ORBIT_STREAM, EmulatedWires, Emulation, emulated
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.settings import Simulation, SkySection
@@ -176,7 +176,7 @@ def _power(given: Emulation, camera: EmulatedCamera | None) -> EmulatedPower | N
     for (key, monitor), rail in zip(section.monitors().items(), power.rails, strict=False):
         driver = driver_of("power_monitor", monitor, f"{key}.driver")
         if driver.emulate is None:
-            raise ConfigError(f"{key}.driver", f"is {monitor.driver!r}, which registers no emulator")
+            raise ConfigError(f"{key}.driver", f"is {monitor.driver!r}, {NO_EMULATOR}")
         rail.monitor = driver.emulate(replace(given, supply=rail.measure), monitor)
         rail.bus = given.wires.i2c(monitor.bus)
     return power

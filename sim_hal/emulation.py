@@ -145,6 +145,13 @@ class Emulation:
         return self.wires.connect(self.kind, device, baud_rate)
 
 
+NO_EMULATOR = (
+    "which registers no emulator: give its Driver the argument `emulate` (docs/extending/device.md), or omit "
+    "the section `simulation` to fly the real device"
+)
+"""Problem of a driver that is used in a simulation but has no emulator."""
+
+
 def emulated(emulation: Emulation) -> object | None:
     """Return the emulated device of the section `emulation.kind`, or None if it is not configured.
 
@@ -155,7 +162,7 @@ def emulated(emulation: Emulation) -> object | None:
         return None
     driver = driver_of(emulation.kind, section)
     if driver.emulate is None:
-        raise ConfigError(f"{emulation.kind}.driver", f"is {section.driver!r}, which registers no emulator")
+        raise ConfigError(f"{emulation.kind}.driver", f"is {section.driver!r}, {NO_EMULATOR}")
     device: object = driver.emulate(emulation, section)
     return device
 

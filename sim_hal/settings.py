@@ -119,7 +119,7 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
 class Release(Section, frozen=True, kw_only=True):
     """The testbed's quaternion component q2 and rate (rad/s) about the thread at mission time zero."""
 
-    q2: Annotated[float, Meta(ge=-0.7, le=0.7)]
+    q2: Annotated[float, Meta(ge=-0.7, le=0.7), Meta(description="quaternion component q2 at the start")]
     rate: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
 
 
@@ -204,8 +204,8 @@ class SkySection(Section, frozen=True, kw_only=True):
 class Tumble(Section, frozen=True, kw_only=True):
     """A sinusoidal variation of an object's brightness by +-`amplitude` magnitudes every `period` s."""
 
-    period: Positive
-    amplitude: Annotated[float, Meta(ge=0.0, le=5.0)]
+    period: Annotated[Positive, Meta(description="period of the brightness, s")]
+    amplitude: Annotated[float, Meta(ge=0.0, le=5.0), Meta(description="amplitude, magnitudes")]
     phase_deg: float = 0.0
 
 
@@ -216,8 +216,8 @@ class LineOfSight(Section, frozen=True, kw_only=True):
     `acceleration_deg` (deg/s^2) is the acceleration along the great circle.
     """
 
-    right_ascension_deg: Annotated[float, Meta(ge=-360.0, le=360.0)]
-    declination_deg: Annotated[float, Meta(ge=-90.0, le=90.0)]
+    right_ascension_deg: Annotated[float, Meta(ge=-360.0, le=360.0), Meta(description="right ascension, deg")]
+    declination_deg: Annotated[float, Meta(ge=-90.0, le=90.0), Meta(description="declination, deg")]
     rate_deg: Annotated[float, Meta(ge=0.0, le=20.0)] = 0.0
     towards_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] = 0.0
     acceleration_deg: Annotated[float, Meta(ge=-5.0, le=5.0)] = 0.0
@@ -227,8 +227,8 @@ class LineOfSight(Section, frozen=True, kw_only=True):
 class ObjectState(Section, frozen=True, kw_only=True):
     """Geocentric position (3,), m, and velocity (3,), m/s, ICRS, of an object at `simulation.utc`."""
 
-    position: Vector
-    velocity: Vector
+    position: Annotated[Vector, Meta(description="geocentric position, ICRS, m")]
+    velocity: Annotated[Vector, Meta(description="geocentric velocity, ICRS, m/s")]
 
 
 class SkyObject(Section, frozen=True, kw_only=True):
@@ -237,7 +237,7 @@ class SkyObject(Section, frozen=True, kw_only=True):
     `magnitude` is the Johnson V magnitude; for an object in orbit, it applies to full sunlight.
     """
 
-    magnitude: Annotated[float, Meta(ge=-10.0, le=20.0)]
+    magnitude: Annotated[float, Meta(ge=-10.0, le=20.0), Meta(description="Johnson V magnitude")]
     line_of_sight: LineOfSight | None = None
     state: ObjectState | None = None
     tumble: Tumble | None = None
@@ -266,8 +266,8 @@ class SolarPanel(Section, frozen=True, kw_only=True):
     `peak` (W) is the electrical power in sunlight at normal incidence and one astronomical unit.
     """
 
-    normal: Vector
-    peak: Positive
+    normal: Annotated[Vector, Meta(description="outward normal in body axes, three numbers")]
+    peak: Annotated[Positive, Meta(description="power in sunlight at normal incidence, W")]
 
 
 class PowerTruth(Section, frozen=True, kw_only=True):
@@ -292,7 +292,7 @@ class FaultEntry(Section, frozen=True, kw_only=True):
     The module `sim_hal.faults.schedule` parses the text `fault`.
     """
 
-    fault: str
+    fault: Annotated[str, Meta(description="fault, such as imu: silent")]
     at: NotNegative | None = None
     span: Positive | None = msgspec.field(default=None, name="for")
 

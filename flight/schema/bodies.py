@@ -30,10 +30,12 @@ from knightcube.gnc.guidance.pointing_target import PointingTarget
 class Plant(Section, frozen=True, kw_only=True):
     """The flight application's model of body and actuator (Sease thesis, tables 5.1, 5.3 and 5.4)."""
 
-    inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
-    coil_turns: Annotated[int, Meta(gt=0, le=100_000)]
-    coil_area: Annotated[float, Meta(gt=0.0, le=100.0)]
-    field: Annotated[float, Meta(gt=0.0, le=1.0)]
+    inertia: Annotated[
+        float, Meta(gt=0.0, le=1e3), Meta(description="moment of inertia about the thread, kg m^2")
+    ]
+    coil_turns: Annotated[int, Meta(gt=0, le=100_000), Meta(description="number of turns of a coil")]
+    coil_area: Annotated[float, Meta(gt=0.0, le=100.0), Meta(description="area of a coil, m^2")]
+    field: Annotated[float, Meta(gt=0.0, le=1.0), Meta(description="horizontal magnetic field, T")]
     thread_stiffness: NotNegative = 0.0
     thread_damping: NotNegative = 0.0
 
@@ -78,9 +80,9 @@ class Guidance(Section, frozen=True, kw_only=True):
 class PidGains(Section, frozen=True, kw_only=True):
     """Gains of the PID controller for the angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
 
-    proportional: Positive
-    integral: Positive
-    derivative: Positive
+    proportional: Annotated[Positive, Meta(description="gain of the angle, 1/s^2")]
+    integral: Annotated[Positive, Meta(description="gain of the integral of the angle, 1/s^3")]
+    derivative: Annotated[Positive, Meta(description="gain of the rate, 1/s")]
 
 
 class Control(Section, frozen=True, kw_only=True):
@@ -117,8 +119,8 @@ class Identification(Section, frozen=True, kw_only=True):
 class Step(Section, frozen=True, kw_only=True):
     """One commanded attitude: `q2` at mission time `at` (s), then rotation at `rate` rad/s."""
 
-    at: NotNegative
-    q2: Q2
+    at: Annotated[NotNegative, Meta(description="mission time, s")]
+    q2: Annotated[Q2, Meta(description="second quaternion component, -0.68 to 0.68")]
     rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
 
 
@@ -129,7 +131,7 @@ class Cage(Section, frozen=True, kw_only=True):
     the orbit's field. With a cage, `plant.field` is the weakest field that plans assume.
     """
 
-    elements: tuple[str, str]
+    elements: Annotated[tuple[str, str], Meta(description="two lines of two-line elements")]
     scale: Annotated[float, Meta(gt=0.0, le=100.0)] = 10.0
 
 
@@ -224,8 +226,10 @@ class Craft(Section, frozen=True, kw_only=True):
     `residual_dipole` (A m^2) is the expected magnetic dipole of the satellite in shadow with the coils off.
     """
 
-    size: tuple[Positive, Positive, Positive]
-    mass: Positive | None = None
+    size: Annotated[
+        tuple[Positive, Positive, Positive], Meta(description="edges along the body axes x, y, z, m")
+    ]
+    mass: Annotated[Positive | None, Meta(description="mass, kg")] = None
     centre_of_mass: Vector = (0.0, 0.0, 0.0)
     inertia: Inertia | None = None
     residual_dipole: Vector = (0.0, 0.0, 0.0)
@@ -344,7 +348,7 @@ class PointingSection(Section, frozen=True, kw_only=True):
 class TargetStep(Aim, frozen=True, kw_only=True):
     """A pointing goal that is in force from mission time `at` (s) on."""
 
-    at: NotNegative
+    at: Annotated[NotNegative, Meta(description="mission time, s")]
     point: GoalName
 
     def target(self) -> PointingTarget:

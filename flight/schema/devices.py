@@ -167,11 +167,11 @@ class Winding(Section, frozen=True, kw_only=True):
     the field that `knightcube bringup` expects at the magnetometer.
     """
 
-    axis: Vector
+    axis: Annotated[Vector, Meta(description="direction of the dipole in body axes, three numbers")]
     dipole_per_ampere: Positive | None = None
     turns: Annotated[int, Meta(gt=0, le=100_000)] | None = None
     area: Positive | None = None
-    resistance: Positive
+    resistance: Annotated[Positive, Meta(description="resistance of the winding, ohm")]
     current_limit: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
     channels: tuple[Channel, Channel] | None = None
     sign: Sign = 1
@@ -215,8 +215,8 @@ class Coils(Section, frozen=True, kw_only=True):
     bus: Bus = 1
     address: Address = 0x40
     windings: Annotated[tuple[Winding, ...], Meta(min_length=1, max_length=64)]
-    supply_voltage: Positive
-    current_limit: Positive
+    supply_voltage: Annotated[Positive, Meta(description="voltage across a coil at full duty, V")]
+    current_limit: Annotated[Positive, Meta(description="largest current of a coil, A")]
     stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
 
     @property
@@ -315,7 +315,7 @@ class Battery(Section, frozen=True, kw_only=True):
     linearly.
     """
 
-    capacity: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    capacity: Annotated[float, Meta(gt=0.0, le=1000.0), Meta(description="capacity of the battery, A h")]
     cells: Annotated[int, Meta(ge=1, le=3)] = 2
     resistance: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
     open_circuit: Annotated[
@@ -381,8 +381,8 @@ class CameraLens(Section, frozen=True, kw_only=True):
     not square, and `p1` and `p2` are the coefficients of tangential distortion.
     """
 
-    focal_length: Positive
-    centre: tuple[float, float]
+    focal_length: Annotated[Positive, Meta(description="focal length, px")]
+    centre: Annotated[tuple[float, float], Meta(description="pixel (x, y) on the optical axis")]
     k1: float = 0.0
     k2: float = 0.0
     aspect: float = 0.0
@@ -540,9 +540,9 @@ class SolarString(Section, frozen=True, kw_only=True):
     address `address`.
     """
 
-    normal: Vector
+    normal: Annotated[Vector, Meta(description="outward normal of the cells in body axes, three numbers")]
     address: Address = 0x48
-    channel: Annotated[int, Meta(ge=0, le=3)]
+    channel: Annotated[int, Meta(ge=0, le=3), Meta(description="input of the ADC, 0 to 3")]
     peak: Positive = 0.5
     volt_per_ampere: Positive = 2.0
 

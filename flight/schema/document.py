@@ -15,6 +15,8 @@ import math
 import os
 import re
 import stat
+import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -96,9 +98,27 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
         raise ConfigError(key, f"is {named!r}, which is not permitted: add it as a line to {file} as root")
     try:
         return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        cure = ": install the package that provides it" if isinstance(error, ModuleNotFoundError) else ""
-        raise ConfigError(key, f"is {named!r}, which cannot be imported: {error}{cure}") from error
+    except Exception as error:  # the module may raise any exception while it is imported
+        problem = _import_problem(module, name, error, on_board=file is not None)
+        raise ConfigError(key, f"is {named!r}, which cannot be imported: {problem}") from error
+
+
+def _import_problem(module: str, name: str, error: Exception, on_board: bool) -> str:
+    """Return why an object cannot be imported, with the file and line of an error, and the remedy."""
+    if isinstance(error, ModuleNotFoundError) and error.name and f"{module}.".startswith(f"{error.name}."):
+        here = "" if on_board else f"set PYTHONPATH to the folder of {error.name.partition('.')[0]}.py, or "
+        return f"{error}: {here}install the package that provides it"
+    loaded = sys.modules.get(module)
+    if isinstance(error, AttributeError) and error.obj is loaded is not None:
+        close = difflib.get_close_matches(name.lower(), {one.lower(): one for one in dir(loaded)}, n=1)
+        similar = [one for one in dir(loaded) if close and one.lower() == close[0]]
+        return f"{error}" + (f", did you mean `{module}:{similar[0]}`?" if similar else "")
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}:{error.lineno}: {error.msg}"
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
+    where = f"{own[-1].filename}:{own[-1].lineno}: " if own and own[-1].filename != __file__ else ""
+    cure = ": correct this line, or install the package that it needs" if where else ""
+    return f"{where}{type(error).__name__}: {error}{cure}"
 
 
 def _permitted_objects(path: Path) -> list[str]:
@@ -372,13 +392,13 @@ def _refuse_not_finite(value: Any, dotted: str, document: Document) -> None:
 T = TypeVar("T")
 
 _NOUNS = {
-    "`object`": "a section",
-    "`array`": "a list",
-    "`str`": "a text",
-    "`int`": "a whole number",
-    "`float`": "a number",
-    "`bool`": "true or false",
-    "`null`": "nothing",
+    "object": "a section",
+    "array": "a list",
+    "str": "a text",
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "null": "nothing",
 }
 """Plain nouns that replace the type names in the messages of msgspec."""
 _LONGEST_VALUE = 200
@@ -391,9 +411,11 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
     try:
         return msgspec.convert(tree, shape)
     except msgspec.ValidationError as error:
-        message, _, path = str(error).partition(" - at `$")
-        path = path.rstrip("`")
+        message, _, place = str(error).partition(" - at ")
+        path = place.partition("`$")[2].rstrip("`")
         dotted = join(section, path.lstrip("."))
+        if place.startswith("`key` in "):
+            raise document.error(*_key_problem(message, shape, path, dotted)) from error
         unknown = re.match(r"Object contains unknown field `(.+)`", message)
         if unknown:
             key = unknown.group(1)
@@ -401,19 +423,19 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
             raise document.error(join(dotted, key), problem) from error
         missing = re.match(r"Object missing required field `(.+)`", message)
         if missing:
-            raise document.error(join(dotted, missing.group(1)), "is missing") from error
+            hint = _description(_kinds_at(shape, f"{path}.{missing.group(1)}"))
+            problem = "is missing" + (f": give the {hint}" if hint else "")
+            raise document.error(join(dotted, missing.group(1)), problem) from error
         message = _permitted(message, shape, path)
-        value = tree
         try:
-            for key, index in _steps_of(path):
-                value = value[key] if key else value[int(index)]
+            value = _value_at(tree, path)
         except (KeyError, IndexError, TypeError, ValueError):
             pass  # msgspec writes [...] for an unknown index
         else:
             if not isinstance(value, dict):
                 text = repr(value)
                 cut = text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + "..."
-                message = f"is {cut}: {message}"
+                message = f"is {cut}: {message}{_unit_hint(dotted, value, message)}"
         raise document.error(dotted, message) from error
 
 
@@ -422,8 +444,40 @@ def _steps_of(path: str) -> list[tuple[str, str]]:
     return re.findall(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]", path)
 
 
+def _value_at(tree: Any, path: str) -> Any:
+    """Return the value at a msgspec path. Raises an exception for a path that is not in the tree."""
+    for key, index in _steps_of(path):
+        tree = tree[key] if key else tree[int(index)]
+    return tree
+
+
+def _key_problem(message: str, shape: Any, path: str, dotted: str) -> tuple[str, str]:
+    """Return the dotted name and the problem of a key that the mapping at `path` does not accept."""
+    kinds = [kind for kind in _kinds_at(shape, path) if isinstance(kind, inspect.DictType)]
+    choices = [
+        str(value)
+        for kind in kinds
+        for key in _alternatives(kind.key_type)
+        if isinstance(key, inspect.LiteralType)
+        for value in key.values
+    ]
+    given = re.fullmatch(r"Invalid enum value '?(.+?)'?", message)
+    if given and choices:
+        return join(dotted, given.group(1)), f"is an unknown key: expected one of {', '.join(choices)}"
+    return dotted, f"has a wrong key: {_plain(message)}"
+
+
+def _unit_hint(dotted: str, value: Any, message: str) -> str:
+    """Return a hint about a number with a unit, and about an angle in rad that a key expects in deg."""
+    if isinstance(value, str) and "a number" in message and re.match(r"\s*[-+]?[0-9]", value):
+        return ": write the number without a unit"
+    if dotted.endswith("_deg") and isinstance(value, int | float) and " >" in message and 0.0 < value < 6.3:
+        return f": the unit is deg, and {value:g} rad are {math.degrees(value):.4g} deg"
+    return ""
+
+
 def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
-    """Suggest the right name for an unknown key of the msgspec struct at `path`."""
+    """Suggest a name for an unknown key of the msgspec struct at `path`, first one that begins with it."""
     for step in re.findall(r"\.([^.\[]+)", path):
         fields = {f.encode_name: f.type for f in msgspec.structs.fields(shape)}
         tree = tree.get(step) if isinstance(tree, dict) else None
@@ -431,7 +485,8 @@ def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
         if shape is None:
             return ""
     names = [f.encode_name for f in msgspec.structs.fields(shape)]
-    close = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+    close = [name for name in names if name.startswith(key)]
+    close = close or difflib.get_close_matches(key, names, n=1, cutoff=0.5)
     return f", did you mean `{close[0]}`?" if close else f"; known keys: {', '.join(names)}"
 
 
@@ -449,22 +504,40 @@ def _struct_of(annotation: Any, tree: Any) -> Any:
 
 def _permitted(message: str, shape: Any, path: str) -> str:
     """Return msgspec's message about the value at `path`, with the permitted values of the type `shape`."""
+    kinds = _kinds_at(shape, path)
+    choices = [value for kind in kinds if isinstance(kind, inspect.LiteralType) for value in kind.values]
+    if choices:
+        return "expected one of " + ", ".join(map(str, choices))
+    hint = _description(kinds)
+    if "matching regex" in message and hint:
+        return f"expected {hint}"
+    return _plain(message) + (f" ({hint})" if hint else "")
+
+
+def _plain(message: str) -> str:
+    """Return a message of msgspec with plain nouns instead of type names, such as `float | null`."""
+
+    def nouns(found: re.Match[str]) -> str:
+        return " or ".join(_NOUNS[name] for name in found.group(1).split(" | "))
+
+    names = "|".join(_NOUNS)
+    return re.sub(rf"`((?:{names})(?: \| (?:{names}))*)`", nouns, message[0].lower() + message[1:])
+
+
+def _kinds_at(shape: Any, path: str) -> list[inspect.Type]:
+    """Return the types that the value at `path` may have, with the metadata of each."""
     kinds: list[inspect.Type] = _alternatives(inspect.type_info(shape))
     for key, index in _steps_of(path):
         kinds = [
             inner for kind in kinds for each in _within(kind, key, index) for inner in _alternatives(each)
         ]
-    choices = [value for kind in kinds if isinstance(kind, inspect.LiteralType) for value in kind.values]
-    if choices:
-        return "expected one of " + ", ".join(map(str, choices))
+    return kinds
+
+
+def _description(kinds: list[inspect.Type]) -> str:
+    """Return the description of a value in the configuration's types, or an empty text without one."""
     schemas = [kind.extra_json_schema or {} for kind in kinds if isinstance(kind, inspect.Metadata)]
-    hints = [str(schema["description"]) for schema in schemas if "description" in schema]
-    if "matching regex" in message and hints:
-        return f"expected {' or '.join(hints)}"
-    plain = message[0].lower() + message[1:]
-    for technical, noun in _NOUNS.items():
-        plain = plain.replace(technical, noun)
-    return plain
+    return " or ".join(str(schema["description"]) for schema in schemas if "description" in schema)
 
 
 def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
@@ -487,6 +560,8 @@ def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
         return list(kind.item_types[position : position + 1])
     if isinstance(kind, inspect.VarTupleType) and index:
         return [kind.item_type]
+    if isinstance(kind, inspect.DictType):
+        return [kind.value_type]
     return []
 
 

@@ -436,11 +436,35 @@ def parse(text: str, name: str = "configuration") -> Config:
         if document.values.get(optional) == "none":
             document.values[optional] = None
     _replace_unit(document)
-    # A body defined outside this repository uses the sections of the testbed.
+    _check_body(document)
     shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
     config: Config = convert(document, with_drivers(shape, document))
     check_consistency(config, document)
     return config
+
+
+def _check_body(document: Document) -> None:
+    """Raise ConfigError for a section that belongs to the other kind of body, with the remedy.
+
+    A body defined outside this repository uses the sections of the testbed.
+    """
+    shapes = {"testbed": TestbedConfig, "orbit": OrbitConfig}
+    body = document.values.get("body", "testbed")
+    other = "testbed" if body == "orbit" else "orbit"
+    foreign = {*shapes[other].__struct_fields__} - {
+        *shapes[body if body == "orbit" else "testbed"].__struct_fields__
+    }
+    found = next((key for key in document.values if key in foreign), None)
+    if found is None:
+        return
+    if "body" not in document.values and len(document.chain) == 1:
+        cure = f"add `extends: orbit`, or another configuration, or `body: {other}`"
+        raise document.error(
+            found, f"belongs to `body: {other}`, but no `extends` and no `body` is given: {cure}"
+        )
+    raise document.error(
+        found, f"belongs to `body: {other}`, but `body` is {body}: omit it, or change `body`"
+    )
 
 
 def _replace_unit(document: Document) -> None:

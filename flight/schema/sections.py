@@ -143,7 +143,7 @@ class CommandStep(Aim, frozen=True, kw_only=True):
     the clearing of an event.
     """
 
-    at: NotNegative
+    at: Annotated[NotNegative, Meta(description="mission time, s")]
     mode: CommandedMode | None = None
     slew: Q2 | None = None
     point: GoalName | None = None
@@ -202,7 +202,9 @@ class Link(Section, frozen=True, kw_only=True):
     disables these returns.
     """
 
-    keys: Annotated[str, Meta(min_length=1)]
+    keys: Annotated[
+        str, Meta(min_length=1), Meta(description="folder of the keys of this end, made by `knightcube keys`")
+    ]
     spacecraft: Annotated[int, Meta(ge=0, le=1023)] = 0x1A5
     udp: HostPort | None = None
     telemetry_to: HostPort | None = None
@@ -275,7 +277,7 @@ class Config(Section, frozen=True, kw_only=True):
     health: Health = Health()
     commands: Commands = Commands()
     link: Link | None = None
-    duration: Positive
+    duration: Annotated[Positive, Meta(description="duration of the flight, s")]
     telemetry: Telemetry = Telemetry()
     state: State = State()
     separation: Separation = Separation()

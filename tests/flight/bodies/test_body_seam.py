@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
     ("name", "complaint"),
     [
         ("orbiter", "name one of testbed"),
-        ("no_such_module:BODY", "cannot be imported"),
+        ("no_such_module:BODY", "set PYTHONPATH to the folder of no_such_module.py, or install the package"),
         ("tests.flight.bodies.plain_body:MISSING", "cannot be imported"),
         ("tests.flight.bodies.plain_body:NO_BODY", "not a BodyKind"),
     ],
@@ -68,6 +69,25 @@ def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
 def test_a_body_that_is_not_there_is_one_clear_line(name: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         body_kind(structs.replace(demo_config(1.0), body=name))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("\nimport strct", r":2: ModuleNotFoundError: No module named 'strct': correct this line"),
+        ("def f(:", r"odd_body.py:1: invalid syntax"),
+        ("\n\n1 / 0", r"odd_body.py:3: ZeroDivisionError"),
+        ("Body = 1", r"has no attribute 'BODY', did you mean `odd_body:Body`"),
+    ],
+)
+def test_an_error_inside_a_module_names_its_file_and_line(
+    text: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "odd_body.py").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "odd_body", raising=False)
+    with pytest.raises(ConfigError, match=complaint):
+        body_kind(structs.replace(demo_config(1.0), body="odd_body:BODY"))
 
 
 @pytest.mark.parametrize("q2", [-Q2_LIMIT, Q2_LIMIT])

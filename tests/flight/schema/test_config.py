@@ -6,7 +6,9 @@ import contextlib
 import math
 import re
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +18,7 @@ from flight.bodies.orbit.body import filter_settings
 from flight.link.commands import Point
 from flight.loop.commanding import command_of
 from flight.schema import reader
-from flight.schema.bodies import as_orbit, as_testbed
+from flight.schema.bodies import OrbitConfig, TestbedConfig, as_orbit, as_testbed
 from flight.schema.devices import camera_knowledge
 from flight.schema.document import ConfigError, read_document, to_yaml
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
@@ -123,6 +125,20 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ("name: step-demo", "name: a\nname: b", "`name` is given twice, first in line"),
         ("name: step-demo", "name: [", "is not YAML"),
         ("plant:", "plant: 3\nplant2:", "`plant` is 3"),
+        ("thread_stiffness", "stiff", "`plant.stiff` is an unknown key"),
+        ("supply_voltage", "supply", "`coils.supply` is an unknown key, did you mean `supply_voltage`"),
+        (
+            "plant:",
+            "craft:",
+            ":[0-9]+: `craft` belongs to `body: orbit`, but no `extends` and no `body` is given: ",
+        ),
+        ("plant:", "body: testbed\ncraft:", "`craft` belongs to `body: orbit`, but `body` is testbed"),
+        ("duration: 700.0", "", "`duration` is missing: give the duration of the flight, s"),
+        (
+            "duration: 700.0",
+            "duration: 700 s",
+            r"is '700 s': expected a number, got a text .*\): write the number without a unit",
+        ),
     ],
 )
 def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: str, complaint: str) -> None:
@@ -146,6 +162,22 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
             r"`targets\[0\].point` .* needs `longitude_deg`",
         ),
         ("point: sun}", "point: sun, latitude_deg: 4.0}", "belongs to `point: ground`, not to sun"),
+        ("point: sun}", "point: ground, lat: 4.0}", r"`targets\[0\].lat` .*did you mean `latitude_deg`"),
+        (
+            "mass: 0.611",
+            "mass: 1.9 kg",
+            r"is '1.9 kg': expected a number or nothing, got a text \(mass, kg\)",
+        ),
+        (
+            "field_of_view_deg: 20.0",
+            "field_of_view_deg: 0.28",
+            "> 1.0: the unit is deg, and 0.28 rad are 16.04 deg",
+        ),
+        (
+            "duration:",
+            "magnetometer: {sensors: [{part: lis3mdl, measures: {field: [x, y, z]}}]}\nduration:",
+            r"measures.field` is an unknown key: expected one of acceleration, gyro, magnetic",
+        ),
         ("point: sun}", "point: inertial, quaternion: [0, 0, 0, 2]}", r"quaternion` has length 2: a quat"),
         (
             "point: sun}",
@@ -167,6 +199,27 @@ def test_a_mistake_in_a_satellite_s_targets_gets_one_line(right: str, wrong: str
         reader.parse(ORBIT.replace(right, wrong, 1), "orbit.yaml")
     assert str(caught.value).startswith("orbit.yaml:")
     assert "\n" not in str(caught.value)
+
+
+def _without_description(kind: Any, found: dict[str, None]) -> None:
+    """Add the required numbers and vectors of the sections in a type that have no description to `found`."""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        for one in msgspec.structs.fields(kind):
+            texts = [meta.description for meta in getattr(one.type, "__metadata__", ())]
+            plain = getattr(one.type, "__origin__", one.type)
+            is_number = plain in {int, float} or {*getattr(plain, "__args__", ())} == {float}
+            if one.required and is_number and not any(texts):
+                found[f"{kind.__name__}.{one.name}"] = None
+            _without_description(one.type, found)
+    for inner in getattr(kind, "__args__", ()):
+        _without_description(inner, found)
+
+
+@pytest.mark.parametrize("shape", [OrbitConfig, TestbedConfig, Simulation])
+def test_every_required_number_has_a_description_with_its_unit(shape: type[Any]) -> None:
+    found: dict[str, None] = {}
+    _without_description(shape, found)
+    assert not found
 
 
 @pytest.mark.parametrize(
