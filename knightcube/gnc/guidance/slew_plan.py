@@ -505,7 +505,7 @@ def _axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
     if float(np.linalg.norm(np.cross(axes.pointing, axes.across))) < MINIMUM_SINE:
         raise ArgumentError(
             "across_axis",
-            f"{axes.across.tolist()}: must not be parallel to pointing_axis, because it is the zero of the roll",
+            f"{axes.across.tolist()}: must not be parallel to pointing_axis, because it defines the roll",
         )
     return axes
 
