@@ -80,7 +80,7 @@ def description_errors(config: Config, section: Simulation) -> DescriptionErrors
         moments = 1.0 + drawn(craft.moments, 3)
         if 2.0 * float((moments * inertia).max()) < float((moments * inertia).sum()):
             break
-    groups = math.ceil(len(config.coils.windings) / 3)
+    groups = math.ceil(len(config.coils.slots) / 3)
     camera = 0.0 if config.camera is None else math.radians(config.camera.accuracy.mounting_deg)
     return DescriptionErrors(
         moments=moments,
