@@ -63,7 +63,7 @@ from hal.drivers.current_monitors import (
 )
 from hal.drivers.gps import EARLIEST_NS, NmeaReceiver, UbloxReceiver
 from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL, MODE1, Pca9685
-from hal.drivers.sensor_unit import CircuitPythonI2c, SensorPart, SensorUnit, UnitSettings
+from hal.drivers.sensor_unit import CheckedUnit, CircuitPythonI2c, SensorPart, SensorUnit, UnitSettings
 from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.drivers.vn100 import Vn100, Vn100Settings
 from hal.interfaces.devices import (
@@ -202,6 +202,9 @@ def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
 def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> Any:
     device = driver_of(kind, section, f"{key}.driver").open(rig, section)
     stack.callback(device.close)
+    # The drivers of this package check their readings themselves, at less cost.
+    if kind in {"inertial_unit", "magnetometer"} and ":" in section.driver:
+        return CheckedUnit(device, section.field_range)
     return device
 
 

@@ -1,6 +1,7 @@
 """Inertial unit of separate sensors, each with a driver that has the properties of CircuitPython drivers.
 
-A unit without a gyro gives readings without a rate.
+A unit without a gyro gives readings without a rate. `CheckedUnit` rejects implausible readings of a driver
+that is not part of this package.
 
 CircuitPython drivers of motion sensors have the properties `gyro` (rad/s), `magnetic` (microtesla) and
 `acceleration` (m/s^2), take an I2C bus with the methods of `busio.I2C`, and sleep while they start. All
@@ -23,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.interfaces.devices import FloatArray, ImuLink, ImuReading
+from hal.interfaces.devices import FloatArray, ImuLink, ImuReading, InertialUnit
 from hal.interfaces.errors import DeviceError, NotResponding, Refused
 from hal.interfaces.wires import SECOND_NS, Clock, RawI2cBus, SpiDevice
 
@@ -32,6 +33,10 @@ _FAILURES = 3
 """Number of consecutive failures after which the sensors are started again."""
 _ALIKE = 10
 """Largest accepted number of consecutive equal samples; a working sensor has noise."""
+LARGEST_RATE = math.radians(2000.0)
+"""Default of the largest accepted body rate per axis, rad/s: the range of common gyros."""
+_NORM_TOLERANCE = 1e-2
+"""Largest accepted deviation of a quaternion's norm from 1."""
 _NO_RATE = np.full(3, math.nan)
 _FREE_FALL = 1.0
 """Specific force (m/s^2) below which the vertical direction counts as unknown."""
@@ -114,7 +119,7 @@ class UnitSettings:
     field_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     field_bias: FloatArray = field(default_factory=lambda: np.zeros(3))
     rate_hz: int
-    rate_range: float = math.radians(2000.0)
+    rate_range: float = LARGEST_RATE
     field_range: float
 
     def body_maps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -233,6 +238,69 @@ class SensorUnit:
             field=field,
             acceleration=acceleration,
         )
+
+
+class CheckedUnit:
+    """Inertial unit whose readings are checked, because another team wrote its driver.
+
+    Readings with a value that is not finite or out of range are counted and omitted. If only the rate is out
+    of range, the rate of the reading is NaN. The value `field_range` is the largest accepted magnetic field
+    per axis, T.
+    """
+
+    def __init__(self, unit: InertialUnit, field_range: float) -> None:
+        self._unit, self._field_range = unit, field_range
+        self._out_of_range = self._not_finite = 0
+        self._rejection = ""
+
+    def configure(self) -> None:
+        """Configure the unit. Raises DeviceError."""
+        self._unit.configure()
+
+    def poll(self) -> list[ImuReading]:
+        """Return the plausible samples since the last call. Raises NotResponding."""
+        return [checked for reading in self._unit.poll() if (checked := self._checked(reading)) is not None]
+
+    def link(self) -> ImuLink:
+        """Return the counters of the unit, which include the readings that were rejected here."""
+        link = self._unit.link()
+        return link._replace(
+            out_of_range=link.out_of_range + self._out_of_range,
+            not_finite=link.not_finite + self._not_finite,
+            rejection=self._rejection or link.rejection,
+        )
+
+    def close(self) -> None:
+        """Stop the driver."""
+        self._unit.close()
+
+    def _checked(self, reading: ImuReading) -> ImuReading | None:
+        """Return the reading without an implausible rate, or None if another value is implausible."""
+        values: dict[str, Any] = {
+            name: np.asarray(getattr(reading, name), dtype=float)
+            for name in ("quaternion", "rate", "field", "acceleration")
+        }
+        for name, value in values.items():
+            wrong = value.shape != (3 + (name == "quaternion"),)
+            if wrong or (name != "rate" and not np.isfinite(value).all()):
+                self._not_finite += 1
+                self._rejection = f"{name} = {value.tolist()}"
+                return None
+        norm, field = float(np.linalg.norm(values["quaternion"])), values["field"]
+        if abs(norm - 1.0) > _NORM_TOLERANCE or np.abs(field).max() > self._field_range:
+            self._out_of_range += 1
+            self._rejection = f"field {field.tolist()} T, beyond {self._field_range:g} T"
+            if abs(norm - 1.0) > _NORM_TOLERANCE:
+                self._rejection = f"quaternion of norm {norm:.3g}, not 1"
+            return None
+        rate = values["rate"]
+        if not np.isfinite(rate).all():
+            values["rate"] = _NO_RATE
+        elif np.abs(rate).max() > LARGEST_RATE:
+            self._out_of_range += 1
+            self._rejection = f"rate {rate.tolist()} rad/s, beyond {LARGEST_RATE:.3g} rad/s"
+            values["rate"] = _NO_RATE
+        return reading._replace(**values)
 
 
 def level_attitude(field: FloatArray, acceleration: FloatArray) -> FloatArray:

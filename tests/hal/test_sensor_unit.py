@@ -16,12 +16,14 @@ from hal.buses.linux_wires import LinuxSpiDevice
 from hal.buses.system import SystemClock
 from hal.drivers.sensor_unit import (
     Adis16470,
+    CheckedUnit,
     SensorPart,
     SensorUnit,
     UnitSettings,
     level_attitude,
     quaternion_of,
 )
+from hal.interfaces.devices import ImuLink, ImuReading
 from hal.interfaces.errors import NotResponding, Refused
 from knightcube.astro import quaternion
 from sim_hal.clock import SimClock
@@ -125,6 +127,66 @@ def test_implausible_samples_are_counted_and_not_returned(
     assert bench.unit.poll() == []
     assert getattr(bench.unit.link(), counter) == 10
     assert "magnetic" in bench.unit.link().rejection
+
+
+class ForeignUnit:
+    """An inertial unit that returns given readings."""
+
+    def __init__(self, *changes: dict[str, Any]) -> None:
+        good = ImuReading(1, 2, 3, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))
+        self._readings = [good._replace(**change) for change in changes]
+        self.closed = self.configured = False
+
+    def configure(self) -> None:
+        self.configured = True
+
+    def poll(self) -> list[ImuReading]:
+        readings, self._readings = self._readings, []
+        return readings
+
+    def link(self) -> ImuLink:
+        return ImuLink(60, 5, 0, 0, 1, 2, 9, "of the driver")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize(
+    ("change", "counted", "says"),
+    [
+        ({"field": np.array([0.0, np.nan, 0.0])}, (1, 3), "field = [0.0, nan, 0.0]"),
+        ({"acceleration": np.array([np.inf, 0.0, 0.0])}, (1, 3), "acceleration = [inf"),
+        ({"field": np.zeros(4)}, (1, 3), "field = [0.0, 0.0, 0.0, 0.0]"),
+        ({"field": np.array([0.0, 45.0, 0.0])}, (2, 2), "field [0.0, 45.0, 0.0] T, beyond 0.0006 T"),
+        ({"quaternion": np.array([0.0, 0.0, 0.0, 2.0])}, (2, 2), "quaternion of norm 2, not 1"),
+    ],
+)
+def test_implausible_readings_of_a_foreign_driver_are_counted_and_omitted(
+    change: dict[str, Any], counted: tuple[int, int], says: str
+) -> None:
+    unit = CheckedUnit(ForeignUnit({}, change, {"field": [1e-5, 0.0, 0.0]}), 6e-4)
+    assert unit.link() == ImuLink(60, 5, 0, 0, 1, 2, 9, "of the driver")
+    first, last = unit.poll()
+    assert first.has_rate
+    assert last.field.tolist() == [1e-5, 0.0, 0.0]
+    link = unit.link()
+    assert (link.out_of_range, link.not_finite) == counted
+    assert link.rejection.startswith(says)
+
+
+def test_a_rate_in_counts_counts_as_no_rate() -> None:
+    foreign = ForeignUnit({"rate": np.array([310, -2, 7])}, {"rate": np.full(3, np.nan)}, {"rate": [1, 2, 3]})
+    unit = CheckedUnit(foreign, 6e-4)
+    unit.configure()
+    in_counts, invalid, fast = unit.poll()
+    assert foreign.configured
+    assert not in_counts.has_rate
+    assert not invalid.has_rate
+    assert fast.rate.tolist() == [1.0, 2.0, 3.0]
+    assert unit.link().out_of_range == 2
+    assert unit.link().rejection == "rate [310.0, -2.0, 7.0] rad/s, beyond 34.9 rad/s"
+    unit.close()
+    assert foreign.closed
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 0.7, 2.5])
