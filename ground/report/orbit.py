@@ -341,20 +341,31 @@ def requirements(
     known: Object | None,
     pointed: Object | None,
     seen: Object | None,
+    end_s: float,
 ) -> list[Object]:
     """Return the comparisons of the results with the limits in the configuration's section `requirements`.
 
     The arguments `detumbled`, `known`, `pointed` and `seen` are the report's results on detumbling, attitude
-    knowledge, pointing and the star camera.
+    knowledge, pointing and the star camera. A time limit that had not passed at the end of the log, `end_s`,
+    is neither kept nor exceeded.
     """
     limits = config.requirements
+
+    def pending(begin: float, limit: float | None) -> float:
+        return math.nan if limit is None or end_s < begin + limit else math.inf
+
     periods = detumbled["periods"][:1] if detumbled else []
-    slow = [one["duration_s"] if one["slowed"] else math.inf for one in periods]
+    slow = [
+        one["duration_s"] if one["slowed"] else pending(one["begin_s"], limits.slow_within) for one in periods
+    ]
     rows = [("detumbling time", slow, limits.slow_within, "s")]
     if known is not None:
         slowed_at = [one["begin_s"] + one["duration_s"] for one in periods if one["slowed"]]
         fine_at = known["fine_after_s"]
-        fine = [math.inf if math.isnan(fine_at) else max(0.0, fine_at - at) for at in slowed_at]
+        fine = [
+            pending(at, limits.fine_within) if math.isnan(fine_at) else max(0.0, fine_at - at)
+            for at in slowed_at
+        ]
         # The star camera's attitude is evaluated, because the body's attitude includes the mounting error.
         camera = known.get("star_camera") or known
         error = [math.degrees(camera["with_stars_error_rms_rad"])]

@@ -96,13 +96,13 @@ def seconds(packets: PacketArray) -> FloatArray:
 
 
 def last_time(run: Run) -> float:
-    """Return the mission time (s) at which the logs of a run end, or 0 for empty logs.
+    """Return the mission time (s) at which the flight log of a run ends, or 0 for a log without packets.
 
-    A log that was downloaded from a satellite has no truth, and a satellite in orbit writes no control
-    packets, so the result is the latest time of five packet types.
+    A satellite in orbit writes no control packets, so the result is the latest time of four packet types.
+    Packets before the start of the mission time count as 0.
     """
-    names = ("control", "attitude", "health", "truth", "event")
-    return max((float(seconds(run[name])[-1]) for name in names if len(run[name])), default=0.0)
+    names = ("control", "attitude", "health", "event")
+    return max([0.0, *(float(seconds(run[name])[-1]) for name in names if len(run[name]))])
 
 
 def true_quaternions(truth: PacketArray, packets: PacketArray) -> FloatArray:

@@ -28,6 +28,8 @@ from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
+_LOST_S = 2.0
+"""Time (s) from the end of the flight log to the end of the truth log above which packets are lost."""
 
 
 @np.errstate(all="ignore")  # packets may contain any numbers; results that are not finite become None
@@ -36,14 +38,19 @@ def summarise(run: Run) -> Object:
     attitude = signals.true_attitude(run) or signals.estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
-    in_orbit = len(run["spin"]) > 0
+    config, unread = _orbit_config(run)
+    in_orbit = config is not None or len(run["spin"]) > 0
+    if in_orbit and unread:
+        notes.append(f"pointing and requirements not judged: {unread}")
     steps = [] if in_orbit else judged_steps(run, attitude, identity["duration_planned_s"], notes)
     power = signals.coil_power(run)
     powers = _power(run, power, notes)
     detumbled, known = detumbling(run), knowledge(run)
-    config = _orbit_config(run, notes) if in_orbit else None
     pointed = None if config is None else pointing(run, config.pointing.axis, power)
     seen = None if config is None else star_camera(run, config)
+    required = []
+    if config is not None:
+        required = requirements(config, detumbled, known, pointed, seen, identity["duration_s"])
     summary: Object = {
         "run": identity,
         "attitude_source": attitude.source,
@@ -51,7 +58,7 @@ def summarise(run: Run) -> Object:
         "detumbling": detumbled,
         "knowledge": known,
         "pointing": pointed,
-        "requirements": [] if config is None else requirements(config, detumbled, known, pointed, seen),
+        "requirements": required,
         "thesis": [] if in_orbit else against_thesis(steps, powers),
         "power": powers,
         "rate_groups": _rate_groups(run["rate_group"]),
@@ -89,23 +96,22 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
-    """Return the configuration of the flight, or None if its copy beside the log cannot be read."""
+def _orbit_config(run: Run) -> tuple[OrbitConfig | None, str]:
+    """Return the configuration of a satellite, or None and the reason why it cannot be read."""
     path = run.folder / "config.yaml"
     try:
-        if path.exists():
-            return as_orbit(reader.load(path))
-        why = f"{path} does not exist"
+        return (as_orbit(reader.load(path)), "") if path.exists() else (None, f"{path} does not exist")
     except ConfigError as error:
-        why = str(error)
-    notes.append(f"pointing and requirements not judged: {why}")
-    return None
+        return None, str(error)
 
 
 def _identity(run: Run, attitude: signals.ThreadMotion, notes: list[str]) -> Object:
     identity: Object = {"folder": str(run.folder), "duration_s": signals.last_time(run), "cut_short": False}
     if attitude.source == "estimate":
         notes.append("no truth log: judged on the estimate")
+    behind = float(signals.seconds(run["truth"])[-1]) - identity["duration_s"] if len(run["truth"]) else 0.0
+    if behind > _LOST_S:
+        notes.append(f"the flight log ends {behind:.1f} s before the truth log: its last packets are lost")
     if not len(run["run"]):
         notes.append("no run packet: the configuration of this run is not known")
         return {**identity, "duration_planned_s": math.nan}
@@ -115,6 +121,8 @@ def _identity(run: Run, attitude: signals.ThreadMotion, notes: list[str]) -> Obj
     cut_short = bool(planned - identity["duration_s"] > 3.0 * period)
     if cut_short:
         notes.append(f"cut short: {identity['duration_s']:.1f} s of {planned:.1f} s")
+    if identity["duration_s"] == 0.0:
+        notes.append("stopped before the first control cycle")
     return {
         **identity,
         "cut_short": cut_short,

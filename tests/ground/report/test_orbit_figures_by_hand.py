@@ -264,7 +264,7 @@ def test_every_requirement_is_judged_by_its_figure() -> None:
     slowed = {"periods": [{"begin_s": 10.0, "duration_s": 80.0, "slowed": True}]}
     known = {"fine_after_s": 150.0, "with_stars_error_rms_rad": math.radians(0.05)}
     pointed = {"targets": [{"target": "nadir", "axis_rms_rad": math.radians(6.0)}]}
-    rows = orbit.requirements(config, slowed, known, pointed, {"share": 0.75})
+    rows = orbit.requirements(config, slowed, known, pointed, {"share": 0.75}, 300.0)
     found = [(row["quantity"], row["worst"], row["limit"]) for row in rows]
     assert found == [
         ("detumbling time", 80.0, 100.0),
@@ -273,12 +273,15 @@ def test_every_requirement_is_judged_by_its_figure() -> None:
         ("pointing to nadir, rms", pytest.approx(6.0), 5.0),
         ("unobstructed frames without attitude or rate", pytest.approx(25.0), 20.0),
     ]
-    early = orbit.requirements(config, slowed, {**known, "fine_after_s": 20.0}, None, None)
+    early = orbit.requirements(config, slowed, {**known, "fine_after_s": 20.0}, None, None, 300.0)
     assert early[1]["worst"] == 0.0
-    never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None, None)
-    assert never[1]["worst"] == math.inf
+    never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None, None, 140.0)
+    assert (never[1]["worst"], never[1]["verdict"]) == (math.inf, "miss")
     spinning = {"periods": [{"begin_s": 10.0, "duration_s": 80.0, "slowed": False}]}
-    assert orbit.requirements(config, spinning, None, None, None)[0]["worst"] == math.inf
-    assert (
-        orbit.requirements(replace(config, requirements=Requirements()), slowed, known, pointed, None) == []
-    )
+    assert orbit.requirements(config, spinning, None, None, None, 110.0)[0]["worst"] == math.inf
+    nothing = replace(config, requirements=Requirements())
+    assert orbit.requirements(nothing, slowed, known, pointed, None, 300.0) == []
+    # A limit that had not passed at the end of the log is neither kept nor exceeded.
+    assert orbit.requirements(config, spinning, None, None, None, 109.0)[0]["verdict"] == "unknown"
+    never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None, None, 139.0)
+    assert never[1]["verdict"] == "unknown"

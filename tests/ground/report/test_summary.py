@@ -15,6 +15,7 @@ from flight.link.telemetry.definitions import STREAK, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from flight.loop.facts import FACTS, StreamState
+from flight.schema import reader
 from ground.report import format_report, summarise
 from ground.report.signals import coil_power, covariance_matrices, mean_rates
 from ground.telemetry import Run, read_run, scan
@@ -113,6 +114,31 @@ def test_a_run_cut_short_is_judged_on_its_complete_steps_and_says_so(tmp_path: P
     assert "cut short: 250.0 s of 700.0 s" in summary["notes"]
     assert "step 2: the log does not cover the whole step, not judged" in summary["notes"]
     assert {row["verdict"] for row in summary["thesis"]} == {"pass"}
+
+
+def test_the_flight_log_decides_how_long_a_run_lasted(tmp_path: Path) -> None:
+    """The truth log of a simulation may be longer than a flight log that lost its last packets."""
+    short(tmp_path, planned=250.0)
+    log = tmp_path / "run" / "flight-0001.ccsds"
+    log.write_bytes(log.read_bytes()[: log.stat().st_size * 3 // 5])
+    summary = summarise(read_run(tmp_path / "run"))
+    lasted = summary["run"]["duration_s"]
+    assert 100.0 < lasted < 200.0
+    assert summary["run"]["cut_short"]
+    (note,) = [note for note in summary["notes"] if note.startswith("the flight log ends ")]
+    assert float(note.split()[4]) == pytest.approx(250.0 - lasted, abs=0.2)
+
+
+def test_a_satellite_stopped_before_its_first_cycle_is_not_judged_as_a_testbed(tmp_path: Path) -> None:
+    text = (Path(reader.__file__).parent / "configurations" / "orbit.yaml").read_text(encoding="utf-8")
+    (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
+    event = {"code": events.STOPPED.code, "name": "stopped", "severity": 0, "text": "by SIGINT"}
+    summary = summarise(packed_run(tmp_path, run=[(0.0, {"duration": 3000.0})], event=[(-0.958, event)]))
+    assert summary["run"]["duration_s"] == 0.0
+    assert summary["thesis"] == []
+    assert [row["verdict"] for row in summary["requirements"]] == ["unknown"]
+    assert "stopped before the first control cycle" in summary["notes"]
+    assert not any("target packets" in note for note in summary["notes"])
 
 
 def test_a_shorter_run_that_was_meant_to_be_short_is_complete(tmp_path: Path) -> None:
