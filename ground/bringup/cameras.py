@@ -13,9 +13,9 @@ from ground.bringup.bench import Outcome, Session, StepSkipped
 from ground.bringup.diagnosis import UNRECOGNISED, Finding
 from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.vision.frame import LEAST_SIDE
 from knightcube.vision.lens_calibration import MIN_STARS, calibrate_lens
 from knightcube.vision.startracker.detect import detect
-from knightcube.vision.startracker.survey import LEAST_SIDE
 
 _FRAMES = 3
 _LENS_FRAMES = 6

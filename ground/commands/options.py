@@ -18,7 +18,7 @@ from flight.schema.document import config_path
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image, read_raw
-from knightcube.vision.startracker.survey import LEAST_SIDE
+from knightcube.vision.frame import LEAST_SIDE
 
 _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
 

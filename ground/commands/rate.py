@@ -28,6 +28,7 @@ from knightcube.reference.corner_streak_rate import estimate_rate
 from knightcube.reference.corner_streaks import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.frame import raw_counts
 from knightcube.vision.objects.detect import SpaceObject, detect_objects
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
@@ -50,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube rate` to the parser."""
     parser.description = (
         "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
-        "JPEG or FITS of 8 or 16 bits. The rate is of the camera, in its frame: boresight +z, x right, y "
+        "JPEG or FITS. The rate is of the camera, in its frame: boresight +z, x right, y "
         "down. "
         "A single picture does not determine the sign of the rate: --prior gives the approximate rate."
     )
@@ -71,15 +72,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Estimate, print and draw the rate. The exit status is 1 if the picture gives no rate."""
-    pixels = read_picture(options)
-    if not np.issubdtype(pixels.dtype, np.unsignedinteger):
-        raise UsageError(f"{options.image}: pixels of {pixels.dtype}: give unsigned integers of 8 or 16 bits")
+    pixels, unit, zero = raw_counts(read_picture(options))
     camera = configuration.load_camera(options.camera) if options.camera else None
     pinhole, exposure = _geometry(options, camera, pixels)
     prior = None if options.prior is None else np.array(options.prior)
-    likelihood = _likelihood(options, camera)
+    likelihood = _likelihood(options, camera).in_units_of(unit, zero)
     found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
-    objects = _objects(pixels, pinhole, found, likelihood)
+    objects = _objects(pixels, pinhole, found, likelihood, unit)
     facts = _facts(found, objects, options.method) | {"shutter_described": not likelihood.shutter_unstated}
     unstated = isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated
     print_result(options, facts, _text(found, objects) + (_SHUTTER if unstated else ""))
@@ -131,12 +130,13 @@ def _estimate(
 
 
 def _objects(
-    pixels: Image, pinhole: Pinhole, found: FrameMotion, likelihood: LikelihoodSettings
+    pixels: Image, pinhole: Pinhole, found: FrameMotion, likelihood: LikelihoodSettings, unit: float
 ) -> tuple[SpaceObject, ...]:
     if found.rate is None:
         return ()
     settings = ObjectSettings(gain=likelihood.gain, saturation=likelihood.saturation)
-    return detect_objects(pixels, pinhole, found.rate, found.exposure, settings).objects
+    found_objects = detect_objects(pixels, pinhole, found.rate, found.exposure, settings).objects
+    return tuple(replace(item, flux=unit * item.flux) for item in found_objects)
 
 
 def _facts(found: FrameMotion, objects: tuple[SpaceObject, ...], method: str) -> dict[str, Any]:

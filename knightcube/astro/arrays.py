@@ -1,4 +1,4 @@
-"""Array types used throughout the library, row selection in dataclasses of arrays, and vector products."""
+"""Array types, checks of arguments, row selection in dataclasses of arrays, and vector products."""
 
 from __future__ import annotations
 
@@ -38,6 +38,34 @@ def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> F
     if not np.isfinite(found).all():
         raise ArgumentError(name, f"{found.tolist()}: give finite numbers")
     return found
+
+
+def checked_number(name: str, value: float, unit: str) -> float:
+    """Return the argument `name` in `unit`. Raises ArgumentError unless it is a positive, finite number."""
+    number = _real(value)
+    if not 0.0 < number < math.inf:
+        raise ArgumentError(name, f"{value!r}: give a positive, finite number of {unit}")
+    return number
+
+
+def checked_deviation(name: str, value: float, unit: str) -> float:
+    """Return the standard deviation `name` in `unit`; infinity stands for an unknown value.
+
+    Raises ArgumentError unless the standard deviation is a number that is not negative.
+    """
+    number = _real(value)
+    if not number >= 0.0:
+        raise ArgumentError(name, f"{value!r}: give a standard deviation of 0 {unit} or more")
+    return number
+
+
+def _real(value: npt.ArrayLike) -> float:
+    """Return an integer or a floating-point number as a float, and NaN for any other value."""
+    return (
+        float(np.asarray(value))
+        if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "uif"
+        else math.nan
+    )
 
 
 _UNIT = 1e-12

@@ -9,7 +9,7 @@ star is excluded by mistake.
 
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
 8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits. Colour
-images are converted to grey values.
+images are converted to grey values, and images of any numeric type to counts.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.errors import ArgumentError
+from knightcube.vision.background import MAD_TO_SIGMA
 
 _STRETCH = 32_768
 """Number of pixels that are summed in one step, small enough for the processor's cache."""
@@ -415,26 +417,110 @@ LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the luminance (ITU-R BT.601)."""
 
 
+LEAST_SIDE = 16
+"""Minimum number of rows and of columns of an image."""
+# Noise (counts) to which an image of floating-point numbers is scaled.
+_FLOATING_NOISE = 16.0
+# Minimum noise (electrons) of a pixel of any camera, also of the mean of many images.
+_LEAST_NOISE = 0.1
+# Counts from which on a float32, the type in which frames are processed, does not hold each integer.
+_INEXACT = 1 << 24
+# Largest number of counts of an image of floating-point numbers.
+_MOST_COUNTS = float(1 << 31)
+
+
 def grey_image(pixels: npt.ArrayLike) -> Image:
     """Return an image (rows, columns) of grey values from an array of grey or colour pixels.
 
-    A grey image (rows, columns) is returned unchanged. Colours (rows, columns, 3) in the order red, green and
-    blue, with or without a fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the
-    same type; transparency is ignored. A third axis of length 1, or of 2 for grey and transparency, is
-    removed. Raises ValueError for an array of any other shape.
+    A grey image (rows, columns) is returned unchanged, except for its byte order and the precision of its
+    floating-point numbers. Colours (rows, columns, 3) in the order red, green and blue, with or without a
+    fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the same type; transparency
+    is ignored. A third axis of length 1, or of 2 for grey and transparency, is removed. Raises ArgumentError
+    for an array of any other shape, and as `check_pixels`.
     """
     if isinstance(pixels, (str, Path)):
-        raise ValueError(f"{pixels}: give an array of pixels, such as read_image({str(pixels)!r})")
+        raise ArgumentError(
+            "image", f"{pixels}: give an array of pixels, such as read_image({str(pixels)!r})"
+        )
+    if np.ma.is_masked(pixels):
+        masked = np.count_nonzero(np.ma.getmaskarray(np.ma.asarray(pixels)))
+        raise ArgumentError(
+            "image", f"{masked} masked pixels: fill them, such as image.filled(np.ma.median(image))"
+        )
     image = np.asarray(pixels)
-    if image.ndim == 2:
-        return image
+    if image.dtype.kind == "f" and image.itemsize not in (4, 8):
+        # The noise of a float16 image overflows its type, and compiled code knows no long double.
+        image = image.astype(np.float32 if image.itemsize < 4 else np.float64)
+    image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim == 3 and image.shape[2] in (1, 2):
-        return image[..., 0]
-    if image.ndim == 3 and image.shape[2] in (3, 4):
-        return grey_of_planes(np.moveaxis(image[..., :3], -1, 0))
-    raise ValueError(
-        f"an image of shape {image.shape}: give (rows, columns), or (rows, columns, 3) for colours"
-    )
+        image = image[..., 0]
+    elif image.ndim == 3 and image.shape[2] in (3, 4):
+        check_pixels(image[..., 0])
+        image = grey_of_planes(np.moveaxis(image[..., :3], -1, 0))
+    elif image.ndim != 2:
+        raise ArgumentError(
+            "image",
+            f"an array of shape {image.shape}: give (rows, columns), or (rows, columns, 3) for colours",
+        )
+    check_pixels(image)
+    return image
+
+
+def check_pixels(image: Image) -> None:
+    """Raise ArgumentError unless an image (rows, columns) has 16 x 16 or more finite real numbers."""
+    if image.ndim != 2 or min(image.shape) < LEAST_SIDE:
+        raise ArgumentError(
+            "image", f"an array of shape {image.shape}: give (rows, columns), {LEAST_SIDE} or more each"
+        )
+    if image.dtype.kind not in "uif":
+        raise ArgumentError("image", f"pixels of {image.dtype}: give integers or floating-point numbers")
+    if image.dtype.kind == "f" and not np.all(np.isfinite(image)):
+        bad = np.count_nonzero(~np.isfinite(image))
+        raise ArgumentError(
+            "image", f"{bad} pixels are not finite: replace them, such as by the median of the other pixels"
+        )
+
+
+def count_of_floats(image: Image) -> float:
+    """Return the size of a count for floating-point pixels whose noise is to be `_FLOATING_NOISE` counts."""
+    sample = image[::4, ::4].astype(float)
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - np.median(sample))))
+    return (spread or float(sample.std()) or 1.0) / _FLOATING_NOISE
+
+
+def gain_in_counts(gain: float, unit: float) -> float:
+    """Return a `gain` in electrons per unit of the pixel values as electrons per count of `raw_counts`.
+
+    If an image was divided by its maximum, a gain of about 1 would mean a noise far below one electron, since
+    the pixel values are not counts. In this case, one electron per count is assumed.
+    """
+    scaled = gain * unit
+    return 1.0 if unit != 1.0 and scaled * _FLOATING_NOISE < _LEAST_NOISE else scaled
+
+
+def raw_counts(image: Image) -> tuple[Image, float, float]:
+    """Return an image (rows, columns) as unsigned integers, the unit of a count, and the value of 0 counts.
+
+    A pixel value is the value of 0 counts plus its counts times the unit. The unit of whole numbers is 1, and
+    their value of 0 counts is 0 unless a pixel is negative or exceeds the precision of a float32. Other
+    numbers are rounded to a sixteenth of their noise. Raises ArgumentError if the range of the pixels is
+    infinite.
+    """
+    if image.dtype.kind == "u" and image.itemsize <= 2:
+        return image, 1.0, 0.0
+    low, high = image.min().item(), image.max().item()
+    floating = image.dtype.kind == "f"
+    zero = 0 if low >= 0 and high < _INEXACT else low
+    if high - zero < _INEXACT and not (floating and np.any(image != np.rint(image))):
+        kind = np.uint16 if high - zero <= np.iinfo(np.uint16).max else np.uint32
+        # The difference of unsigned integers is exact for every integer type, because it is modular.
+        counts = image - zero if floating else image.astype(np.uint64) - np.uint64(zero % (1 << 64))
+        return counts.astype(kind), 1.0, float(zero)
+    if not math.isfinite(high - low):
+        raise ArgumentError("image", f"pixels from {low:g} to {high:g}: divide them by a large number")
+    unit = max(count_of_floats(image), (high - low) / _MOST_COUNTS)
+    counts = np.rint((image.astype(np.float64) - low) / unit)
+    return counts.astype(np.uint32), unit, float(low)
 
 
 def grey_of_planes(planes: Image) -> Image:

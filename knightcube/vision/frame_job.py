@@ -30,6 +30,7 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import FlightError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Pinhole
+from knightcube.vision.frame import FrameState, frame_state, raw_counts, saturation_count
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import FieldPoints, MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detect import measure_areas
@@ -52,6 +53,7 @@ from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, S
 from knightcube.vision.startracker.tracking import PRIOR_SIGMAS
 from knightcube.vision.streaks.geometry import streak_pinhole
 from knightcube.vision.streaks.streak_result import (
+    REASONS,
     FrameMotion,
     LikelihoodSettings,
     MotionResult,
@@ -350,18 +352,34 @@ def found_in_image(
 ) -> FrameFound:
     """Return the solution of an image (rows, columns), and the lens parameters estimated up to this image.
 
+    The image has integers or floating-point numbers, which are converted to counts. If the image shows no
+    stars because it is overexposed, or because all its pixels are equal, the reason states this.
     The scale is the lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for
     a calibrated camera. Stars are first searched near the positions predicted by `attitude_prior`. The
     predicted rate determines the sense of the rotation, which a single frame does not show. The parameters
     `lens` are estimated from earlier images of the camera, or None if they are not estimated.
     """
+    pixels, unit, zero = raw_counts(pixels)
+    settings = replace(
+        settings,
+        detection=settings.detection.in_units_of(unit, zero),
+        likelihood=settings.likelihood.in_units_of(unit, zero),
+    )
     tracker = TrackerSettings(settings, scale)
     # A rate with a large uncertainty is accepted, because the attitude depends only on the star positions.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
     )
-    return run_with_lens(job if lens is None else replace(job, lens=(lens, 0.0)), tracker, sky)
+    found = run_with_lens(job if lens is None else replace(job, lens=(lens, 0.0)), tracker, sky)
+    if found.solution is None or found.solution.status is not SolveStatus.NO_STARS:
+        return found
+    likelihood = settings.likelihood
+    top = min(saturation_count(pixels), likelihood.saturation or math.inf)
+    state = frame_state(pixels, top, likelihood.saturated_fraction)
+    if state is FrameState.USABLE:
+        return found
+    return replace(found, solution=replace(found.solution, reason=REASONS[StreakStatus(state.value)]))
 
 
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:

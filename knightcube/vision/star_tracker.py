@@ -15,9 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.astro.arrays import (
+    FloatArray,
+    Image,
+    IntArray,
+    checked_deviation,
+    checked_number,
+    finite_array,
+)
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
-from knightcube.errors import InputError
+from knightcube.errors import ArgumentError, InputError
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.frame import grey_image
 from knightcube.vision.frame_job import found_in_image
@@ -43,6 +50,8 @@ FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, as a fraction of the field of view."""
 _LEAST_FOV_ERROR = 0.001
 """Minimum uncertainty of a field of view without a calibrated lens, as a fraction of the field of view."""
+_UNIT_TOLERANCE = 1e-3
+"""Largest deviation of the length of a predicted quaternion from 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +235,8 @@ class StarTracker:
             image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger.
                 Larger values are brighter. The luminance of a colour image (rows, columns, 3) is used; the
                 colours are red, green and blue, and a fourth channel of transparency is ignored.
-            exposure: exposure time, s. The exposure time is only needed for the rate of streaked stars.
+            exposure: exposure time, s. The exposure time is only needed for the rate of streaked stars, and
+                with a predicted rate.
             utc: date of the image, which is UTC if it has no time zone. The date is used for proper motion
                 and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is None, the
                 epoch of the index is used, without aberration.
@@ -238,21 +248,24 @@ class StarTracker:
             rate_sigma: standard deviation of each component of the predicted rate, rad/s.
 
         Raises:
-            ValueError: if the image has another shape, fewer than 16 x 16 pixels or non-finite values.
-            InputError: if the image does not have the size of the camera.
+            ArgumentError: if the image has another shape, another size than the camera, fewer than 16 x 16
+                pixels, masked or non-finite values, or if another argument has a value that it cannot have.
         """
         image = grey_image(image)
+        seconds = 1.0 if exposure is None else checked_number("exposure", exposure, "seconds")
+        attitudes, rates = _priors(attitude, attitude_sigma, rate, rate_sigma)
+        if rates is not None and exposure is None:
+            raise ArgumentError("exposure", "None: a predicted rate needs the exposure time in seconds")
         camera, scale = self._camera_for(image.shape)
         sky, settings = self._index, self._settings
         if utc is not None:
+            if not isinstance(utc, datetime):
+                raise ArgumentError("utc", f"{utc!r}: give a datetime, such as datetime(2026, 7, 2, 12, 30)")
             date = julian_date(utc)
             sky = sky.at(2000.0 + (date - J2000) / 365.25)
             settings = replace(settings, velocity=earth_velocity(date))
         if self._learn and self.lens is None:
             self.lens = self._described(camera, scale)
-        seconds = 1.0 if exposure is None else exposure
-        attitudes = None if attitude is None else AttitudePrior(np.asarray(attitude, float), attitude_sigma)
-        rates = None if rate is None else RatePrior(np.asarray(rate, dtype=float), rate_sigma)
         found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
         self.lens, frame = found.lens, found.solution
         assert frame is not None  # the job contains the settings of the star tracker
@@ -299,7 +312,7 @@ class StarTracker:
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
         if shape != (camera.rows, camera.columns):
-            raise InputError(
+            raise ArgumentError(
                 "image",
                 f"{shape[1]} x {shape[0]} pixels, but the camera has {camera.columns} x {camera.rows}",
             )
@@ -372,6 +385,24 @@ def camera_of_field(
     middle = math.sqrt(tangents[0] * tangents[1])
     camera = Pinhole(shape[1], shape[0], 0.5 * shape[1] / middle)
     return camera, (tangents[0] / middle, tangents[1] / middle)
+
+
+def _priors(
+    attitude: FloatArray | None, attitude_sigma: float, rate: FloatArray | None, rate_sigma: float
+) -> tuple[AttitudePrior | None, RatePrior | None]:
+    """Return the predicted attitude and rate. Raises ArgumentError for a value that is not possible."""
+    attitudes = rates = None
+    attitude_sigma = checked_deviation("attitude_sigma", attitude_sigma, "rad")
+    rate_sigma = checked_deviation("rate_sigma", rate_sigma, "rad/s")
+    if attitude is not None:
+        quaternion = finite_array("attitude", attitude, (4,))
+        if abs(math.hypot(*quaternion) - 1.0) > _UNIT_TOLERANCE:
+            raise ArgumentError("attitude", f"{attitude!r}: give a quaternion of unit length, scalar last")
+        # An uncertainty of half a turn or more leaves every attitude possible.
+        attitudes = AttitudePrior(quaternion, attitude_sigma) if attitude_sigma < math.pi else None
+    if rate is not None:
+        rates = RatePrior(finite_array("rate", rate, (3,)), rate_sigma)
+    return attitudes, rates
 
 
 def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None:

@@ -27,7 +27,7 @@ from scipy.ndimage import find_objects, label
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
-from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image
+from knightcube.vision.camera.lens import CameraModel, MountedCamera, image_of_camera
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus
 
 
@@ -187,7 +187,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         ValueError: if the image does not have the size of the camera, or has non-finite pixels.
     """
     settings = LINEAR if settings is None else settings
-    check_image(image, camera)
+    image = image_of_camera(image, camera)
     # Off the axis, a pinhole camera stretches a disc by at most the squared secant of the field angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch

@@ -25,7 +25,8 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.compiled import compiled_form_of
-from knightcube.errors import KnightCubeError
+from knightcube.errors import ArgumentError, KnightCubeError
+from knightcube.vision.frame import grey_image
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,15 +384,24 @@ def _reach(k1: float, k2: float) -> float:
     return math.sqrt(2.0 / denominator) if denominator > _NO_FOLD else math.inf
 
 
-def check_image(image: Image, camera: CameraModel) -> None:
-    """Raise ValueError unless an image has the size (rows, columns) of a camera and finite pixels."""
+def image_of_camera(image: Image, camera: CameraModel) -> Image:
+    """Return an image of a camera as grey values (rows, columns), as `grey_image` does.
+
+    Raises ArgumentError unless the image has the size of the camera, and finite real numbers as pixels.
+    """
+    image = grey_image(image)
+    check_shape(image, camera)
+    return image
+
+
+def check_shape(image: Image, camera: CameraModel) -> None:
+    """Raise ArgumentError unless an array has the shape (rows, columns) of a camera."""
     if image.shape != (camera.rows, camera.columns):
-        raise ValueError(
-            f"an image of shape {image.shape}, but the camera has {camera.columns} x {camera.rows} pixels: "
-            f"give ({camera.rows}, {camera.columns}) grey values"
+        raise ArgumentError(
+            "image",
+            f"an array of shape {image.shape}, but the camera has {camera.columns} x {camera.rows} pixels: "
+            f"give ({camera.rows}, {camera.columns}) grey values",
         )
-    if image.dtype.kind == "f" and not np.all(np.isfinite(image)):
-        raise ValueError("an image with pixels that are not finite")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,7 +29,7 @@ import numpy as np
 from knightcube.astro import chi_square
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import multiply
-from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image
+from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_shape, image_of_camera
 from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, ScanLines, find_edges, observe
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine, near_limb
 from knightcube.vision.horizon.initial_guess import (
@@ -241,10 +241,10 @@ class _ScannedImage:
 
     def __init__(self, image: Image, camera: CameraModel, hidden: BoolArray | None) -> None:
         """Keep an image and its mask. Raises ValueError as `find_nadir`."""
-        check_image(image, camera)
         if hidden is not None:
-            check_image(hidden, camera)
-        self.image, self.camera, self.hidden = image, camera, hidden
+            check_shape(hidden, camera)
+        self.image = image_of_camera(image, camera)
+        self.camera, self.hidden = camera, hidden
         self._observed: dict[int, tuple[Observation, ScanLines, list[_FreeCone]]] = {}
 
     def observed(self, settings: EdgeSettings) -> tuple[Observation, ScanLines, list[_FreeCone]]:

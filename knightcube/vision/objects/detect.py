@@ -34,13 +34,20 @@ from enum import Enum
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import (
+    BoolArray,
+    FloatArray,
+    Image,
+    IntArray,
+    checked_number,
+    finite_array,
+)
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.compiled import compiled_form_of
 from knightcube.errors import FlightError
 from knightcube.vision.background import MAD_TO_SIGMA
-from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
-from knightcube.vision.frame import line_of, positions
+from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera
+from knightcube.vision.frame import gain_in_counts, line_of, positions, raw_counts
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     PATHS_PER_LENGTH,
@@ -753,6 +760,21 @@ class DetectedObjects:
         return len(self.objects) > 0
 
 
+# Number of positions along each side of an image that are tested for a star that remains in the image.
+_TESTED_STARS = 33
+
+
+def _keeps_stars(rotation: FloatArray, pinhole: Pinhole) -> bool:
+    """Return whether a star can be in the image both at the start and at the end of a rotation (3,), rad."""
+    if float(np.linalg.norm(rotation)) >= np.pi:
+        return False
+    x, y = (np.linspace(-0.5, side - 0.5, _TESTED_STARS) for side in (pinhole.columns, pinhole.rows))
+    middles = pinhole.unit_vectors(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    turns = attitude_matrix(from_rotation_vector(np.array([[-0.5], [0.5]]) * rotation))
+    ends = [pinhole.contains(pinhole.project(middles @ turn.T)) for turn in turns]
+    return bool(np.any(ends[0] & ends[1]))
+
+
 def detect_objects(
     image: Image,
     camera: CameraModel,
@@ -763,27 +785,37 @@ def detect_objects(
     """Return the objects that move relative to the stars, in an image whose stars are streaks.
 
     Args:
-        image: pixel values (rows, columns) of an unsigned integer type, with streaks of 20 px or more.
+        image: pixel values (rows, columns) of any integer or floating type, with streaks of 20 px or more.
+            Gain and saturation of the settings are in the unit of the pixel values.
         camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`. The
             search neglects lens distortion.
         rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
             from the streaks of the image. If the sign of the rate is unknown, the directions of motion of all
             objects may have the wrong sign.
-        exposure: exposure time, s.
+        exposure: exposure time, s. If the camera rotates so far during the exposure that no star remains in
+            the image, the result has no objects, and its `reason` states the rotation.
         settings: thresholds, gain and saturation, or None for the defaults.
 
     Raises:
-        ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
+        ArgumentError: if the image does not have the size of the camera, if its pixels are not finite
+            numbers, if the rate is not three finite numbers, or if the exposure is not positive.
 
     Source: Sease 2013, chapter 4, as corrected in the errata. The test whether stars alone explain the pixels
     is not part of Sease's method.
     """
     settings = ObjectSettings() if settings is None else settings
-    check_image(image, camera)
+    exposure = checked_number("exposure", exposure, "seconds")
+    rotation = finite_array("rate", rate, (3,)) * exposure
+    pixels, unit, zero = raw_counts(image_of_camera(image, camera))
+    if not _keeps_stars(rotation, camera.ideal):
+        none, angle = np.empty((0, 3)), float(np.linalg.norm(rotation))
+        reason = f"no star remains in the image during a rotation by {angle:.3g} rad: check rate and exposure"
+        return DetectedObjects((), none, np.empty((0, 3, 3)), reason)
+    saturation = None if settings.saturation is None else (settings.saturation - zero) / unit
+    settings = replace(settings, gain=gain_in_counts(settings.gain, unit), saturation=saturation)
     ends = EndpointSettings(gain=settings.gain, saturation=settings.saturation)
-    rotation = np.asarray(rate, dtype=float) * exposure
-    report = detect(image, camera.ideal, rotation, exposure, ends, settings)
-    objects = () if report is None else report.objects
+    report = detect(pixels, camera.ideal, rotation, exposure, ends, settings)
+    objects = () if report is None else tuple(replace(each, flux=unit * each.flux) for each in report.objects)
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
     # A pixel subtends the largest angle on the boresight; that angle is used for all directions.

@@ -355,8 +355,10 @@ def _streak_images_numpy(pixels: IntArray, paths: FloatArray, sigma: float, slop
 
 def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
     """Add one count, divided equally among `points` (m, 2), px, to `image` (1, p), or (3, p) with slopes."""
+    columns, rows = np.ascontiguousarray(pixels.T)
+    reach = _FARTHEST * sigma + 1.0
     for point in points:
-        near = np.flatnonzero(np.abs(pixels - point).max(axis=1) < _FARTHEST * sigma + 1.0)
+        near = np.flatnonzero((np.abs(columns - point[0]) < reach) & (np.abs(rows - point[1]) < reach))
         edges = ((pixels[near] - point)[:, :, None] + np.array([-0.5, 0.5])) / sigma
         x, y = np.diff(ndtr(edges), axis=2)[..., 0].T / np.sqrt(len(points))
         image[0, near] += x * y

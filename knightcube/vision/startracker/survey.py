@@ -22,7 +22,6 @@ import numpy.typing as npt
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray, median
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import (
-    MAD_TO_SIGMA,
     Background,
     among_blocks,
     estimate_background,
@@ -33,6 +32,8 @@ from knightcube.vision.background import (
 )
 from knightcube.vision.frame import (
     HOT_SIGMAS,
+    check_pixels,
+    count_of_floats,
     hot_among,
     label_pixels,
     moments,
@@ -41,9 +42,6 @@ from knightcube.vision.frame import (
 
 KERNEL_NORM = 6.0
 """Noise of the smoothed frame for white noise of 1 count per pixel, the root sum square of the kernel."""
-LEAST_SIDE = 16
-# Noise (counts) to which a floating-point frame is scaled.
-_FLOATING_NOISE = 16.0
 _BAND = 32
 # Number of pixels of a row that are first compared with their limit without branches.
 _SEGMENT = 64
@@ -123,21 +121,13 @@ class BrightPixels:
 def in_counts(pixels: Image) -> tuple[Image, float]:
     """Return a frame (rows, columns) scaled to counts, and the size of one count in the original unit.
 
-    Integer frames are returned unchanged. Raises ValueError unless the pixels are finite real numbers and the
-    frame has at least 16 x 16 pixels.
+    Integer frames are returned unchanged. Raises ArgumentError unless the pixels are finite real numbers and
+    the frame has at least 16 x 16 pixels.
     """
-    if pixels.ndim != 2 or min(pixels.shape) < LEAST_SIDE:
-        raise ValueError(f"a frame of shape {pixels.shape}: give (rows, columns), {LEAST_SIDE} or more each")
-    if pixels.dtype.kind not in "uif":
-        raise ValueError(f"a frame of {pixels.dtype}: give integers or floating numbers")
+    check_pixels(pixels)
     if pixels.dtype.kind != "f":
         return pixels, 1.0
-    if not np.all(np.isfinite(pixels)):
-        raise ValueError("a frame with pixels that are not finite")
-    sample = pixels[::4, ::4].astype(float)
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - np.median(sample))))
-    spread = spread or float(sample.std()) or 1.0
-    unit = spread / _FLOATING_NOISE
+    unit = count_of_floats(pixels)
     return (pixels / unit).astype(np.float32), unit
 
 
@@ -450,11 +440,11 @@ class DetectionSettings:
         if self.window % 2 == 0 or not 5 <= self.window <= 31:
             raise ValueError(f"window = {self.window!r}: give an odd number of pixels, 5 .. 31")
 
-    def in_units_of(self, unit: float) -> DetectionSettings:
-        """Return the settings converted to a frame whose pixel values were divided by `unit`."""
-        if unit == 1.0:
+    def in_units_of(self, unit: float, zero: float = 0.0) -> DetectionSettings:
+        """Return the settings for a frame from which `zero` was subtracted and that was divided by `unit`."""
+        if unit == 1.0 and zero == 0.0:
             return self
-        saturation = None if self.saturation is None else self.saturation / unit
+        saturation = None if self.saturation is None else (self.saturation - zero) / unit
         return replace(self, saturation=saturation, gain=None if self.gain is None else self.gain * unit)
 
 

@@ -25,8 +25,8 @@ from itertools import chain, islice
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
-from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
-from knightcube.vision.frame import saturation_count
+from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole, image_of_camera
+from knightcube.vision.frame import raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
 from knightcube.vision.streaks.first_guess import (
@@ -660,7 +660,8 @@ def estimate_rate(
     `reason` states the cause.
 
     Args:
-        image: raw counts (rows, columns), of an unsigned integer type.
+        image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger. Raw
+            counts are best, because the gain and the saturation are in the unit of the pixel values.
         camera: pinhole model or calibrated lens. The distortion of a lens is included only as an uncertainty
             of the pinhole model.
         exposure: exposure time, s.
@@ -669,12 +670,17 @@ def estimate_rate(
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         settings: gain, saturation, point spread and line time of the camera, and limits of the fit.
 
-    Raises KnightCubeError for an invalid image, exposure or prior.
+    Raises:
+        ArgumentError: if the image is not an array of finite numbers of the size of the camera, if exposure
+            or prior deviation is not a positive number, or if the prior rate is not three finite numbers.
     """
     settings = settings or LikelihoodSettings()
+    pixels, unit, zero = raw_counts(image_of_camera(image, camera))
+    settings = settings.in_units_of(unit, zero)
     if isinstance(camera, Lens):
         settings = replace(settings, knowledge=knowledge_of_pinhole(settings.knowledge, camera))
-    found = estimate_motion(image, camera.ideal, exposure, settings, prior_rate, prior_sigma)
+    found = estimate_motion(pixels, camera.ideal, exposure, settings, prior_rate, prior_sigma)
+    found = replace(found, flux=unit * found.flux, faint_flux=unit * found.faint_flux)
     if found.rate is not None or found.reason:
         return found
     return replace(found, reason=REASONS[found.status])
@@ -697,8 +703,8 @@ def estimate_motion(
     checksum `previous_checksum` of the previous frame. The `prior_course` is the rotation as a function of
     time during the exposure, as estimated by the navigation filter; None if unknown.
 
-    Raises KnightCubeError for an invalid frame, exposure or prior. If the frame yields no rate, the
-    attributes `status` and `reason` of the result state the cause.
+    Raises ArgumentError for an invalid frame, exposure or prior. If the frame yields no rate, the attributes
+    `status` and `reason` of the result state the cause.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     # The actual saturation level of a frame may be lower than the configured one, but never higher.

@@ -17,11 +17,19 @@ from typing import Literal, Self, TypeVar
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import (
+    BoolArray,
+    FloatArray,
+    Image,
+    IntArray,
+    checked_deviation,
+    checked_number,
+    finite_array,
+)
 from knightcube.astro.quaternion import from_rotation_vector
-from knightcube.errors import FlightError
-from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Lens, Pinhole
-from knightcube.vision.frame import FrameState, frame_state
+from knightcube.errors import ArgumentError
+from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Lens, Pinhole, check_shape
+from knightcube.vision.frame import FrameState, check_pixels, frame_state, gain_in_counts
 from knightcube.vision.streaks.geometry import GAUSSIAN, Course, PsfProfile
 
 _UNCALIBRATED = CameraKnowledge()
@@ -108,6 +116,13 @@ class LikelihoodSettings:
     def shutter_unstated(self) -> bool:
         """Whether the shutter may be a rolling shutter because its type is unknown."""
         return self.line_time is None and self.line_time_sigma > 0.0
+
+    def in_units_of(self, unit: float, zero: float) -> LikelihoodSettings:
+        """Return the settings for a frame from which `zero` was subtracted and that was divided by `unit`."""
+        if unit == 1.0 and zero == 0.0:
+            return self
+        saturation = None if self.saturation is None else (self.saturation - zero) / unit
+        return replace(self, saturation=saturation, gain=gain_in_counts(self.gain, unit))
 
 
 def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
@@ -298,18 +313,15 @@ Result = TypeVar("Result", bound=FrameMotion)
 def validate(
     pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
 ) -> None:
-    """Raise FlightError if the frame, exposure (s), prior rate (rad/s) or prior deviation is invalid."""
-    expected = (pinhole.rows, pinhole.columns)
-    if pixels.shape != expected:
-        raise FlightError(f"frame of shape {pixels.shape}: the camera needs grey values of shape {expected}")
-    if not np.issubdtype(pixels.dtype, np.unsignedinteger):
-        raise FlightError(f"frame of {pixels.dtype}: pass the raw counts as unsigned integers")
-    if not (np.isfinite(exposure) and exposure > 0.0):
-        raise FlightError(f"exposure of {exposure} s: must be finite and positive")
-    if prior_rate is not None and not (np.shape(prior_rate) == (3,) and np.all(np.isfinite(prior_rate))):
-        raise FlightError(f"prior rate {prior_rate}: must be three finite values in rad/s, or None")
-    if not prior_sigma >= 0.0:
-        raise FlightError(f"prior sigma {prior_sigma} rad/s: must not be negative or NaN")
+    """Raise ArgumentError if the frame, exposure (s), prior rate (rad/s) or prior deviation is invalid."""
+    check_shape(pixels, pinhole)
+    if pixels.dtype.kind != "u":
+        raise ArgumentError("frame", f"pixels of {pixels.dtype}: pass the raw counts as unsigned integers")
+    check_pixels(pixels)
+    checked_number("exposure", exposure, "seconds")
+    if prior_rate is not None:
+        finite_array("prior_rate", prior_rate, (3,))
+    checked_deviation("prior_sigma", prior_sigma, "rad/s")
 
 
 # Distance (px) between the rows of a frame that its checksum includes.

@@ -12,6 +12,7 @@ pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
 from sim_hal.star_camera import StarCameraModel  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
+from tests.support.fits_files import fits_file  # noqa: E402
 from tests.support.scenes import Scene, slew  # noqa: E402
 
 CAMERA = StarCameraModel(columns=640, rows=640, field_of_view=float(np.deg2rad(12.5)))
@@ -53,6 +54,19 @@ def test_without_a_prior_the_direction_of_time_is_reported_as_unknown(scene: Sce
     assert done.returncode == 0, done.stderr
     assert "ambiguous" in done.stdout
     assert "give --prior" in done.stdout
+
+
+def test_a_picture_of_floating_point_numbers_gives_the_same_rate(
+    scene: Scene, picture: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "frame.fits").write_bytes(fits_file(scene.pixels.astype(">f4"), -32))
+    options = ("--fov", FOV, "--exposure", "0.2", "--json")
+    rates = [
+        json.loads(command("rate", path, *options).stdout)["rate_rad_s"]
+        for path in (tmp_path / "frame.fits", picture)
+    ]
+    assert rates[0] is not None
+    assert rates[0] == rates[1]
 
 
 def test_the_overlay_marks_the_streaks_in_colour(picture: Path, tmp_path: Path) -> None:

@@ -262,9 +262,9 @@ def test_nonsense_is_refused_with_its_value() -> None:
         estimate_rate(frame.astype(float), _SMALL.pinhole, 1.0, settings)
     with pytest.raises(FlightError, match="exposure"):
         estimate_rate(frame, _SMALL.pinhole, 0.0, settings)
-    with pytest.raises(FlightError, match="prior rate"):
+    with pytest.raises(FlightError, match="prior_rate"):
         estimate_rate(frame, _SMALL.pinhole, 1.0, settings, np.array([0.0, np.nan, 0.0]), 1.0)
-    with pytest.raises(FlightError, match="prior sigma"):
+    with pytest.raises(FlightError, match="prior_sigma"):
         estimate_rate(frame, _SMALL.pinhole, 1.0, settings, np.zeros(3), float("nan"))
 
 

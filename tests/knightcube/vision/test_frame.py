@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from knightcube.astro.arrays import BoolArray
+from knightcube.astro.arrays import BoolArray, Image
+from knightcube.errors import ArgumentError
 from knightcube.vision import frame
 from knightcube.vision.background import Background, estimate_background
 from knightcube.vision.frame import (
@@ -18,10 +20,13 @@ from knightcube.vision.frame import (
     box_sum,
     find_hot_pixels,
     frame_state,
+    gain_in_counts,
+    grey_image,
     in_steps,
     label_pixels,
     line_of,
     moments,
+    raw_counts,
     saturation_count,
     saturation_level,
     saturation_of_bright,
@@ -48,6 +53,71 @@ def test_dead_overexposed_and_usable_frames_are_distinguished() -> None:
 def test_saturation_is_the_integer_types_top_unless_given() -> None:
     assert saturation_level(np.zeros(1, dtype=np.uint8), None) == 255.0
     assert saturation_level(np.zeros(1, dtype=np.uint16), 4095.0) == 4095.0
+
+
+@pytest.mark.parametrize(
+    ("image", "zero", "dtype"),
+    [
+        (np.array([[0, 65_535]], np.int64), 0.0, np.uint16),
+        (np.array([[0.0, 65_536.0]], np.float32), 0.0, np.uint32),
+        (np.array([[-128, 127]], np.int8), -128.0, np.uint16),
+        (np.array([[-(2**63), 5 - 2**63]], np.int64), -(2.0**63), np.uint16),
+        (np.array([[2**64 - 1, 2**64 - 6]], np.uint64), 2.0**64 - 6.0, np.uint16),
+        (np.array([[1e15, 1e15 + 100_000.0]]), 1e15, np.uint32),
+    ],
+)
+def test_whole_numbers_become_the_same_counts(image: Image, zero: float, dtype: type[np.generic]) -> None:
+    counts, unit, least = raw_counts(image)
+    assert (counts.dtype, unit, least) == (np.dtype(dtype), 1.0, zero)
+    assert counts.tolist() == [[value - min(image[0].tolist()) for value in image[0].tolist()]]
+
+
+def test_other_numbers_become_sixteenths_of_their_noise() -> None:
+    image = 0.4 + 0.003 * np.random.default_rng(8).normal(size=(200, 240))
+    counts, unit, zero = raw_counts(image)
+    assert unit == pytest.approx(0.003 / 16.0, rel=0.05)
+    assert np.abs(zero + unit * counts - image).max() <= 0.5001 * unit
+    image[0, 0] = 1e12
+    counts, unit, zero = raw_counts(image)
+    assert zero + unit * float(counts[0, 0]) == pytest.approx(1e12)
+    assert gain_in_counts(2.0, 0.5) == 1.0
+    assert gain_in_counts(1.0, 1e-5) == 1.0, "the pixel values are not counts"
+    assert gain_in_counts(1e-4, 1.0) == 1e-4
+    with pytest.raises(ArgumentError, match="divide them"):
+        raw_counts(np.array([[-1.7e308, 1.7e308]]))
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.ma.masked_greater(np.arange(400).reshape(20, 20), 397), "2 masked pixels: fill them"),
+        (np.zeros((1, 3), np.uint16), "an array of shape (1, 3): give (rows, columns), 16 or more each"),
+        (np.zeros((20, 20), bool), "pixels of bool: give integers or floating-point numbers"),
+        (np.zeros((20, 20, 3), complex), "pixels of complex128"),
+        (np.full((20, 20), np.inf), "400 pixels are not finite: replace them"),
+        (np.zeros((20, 20, 5)), "an array of shape (20, 20, 5): give (rows, columns), or (rows, columns, 3)"),
+    ],
+)
+def test_an_array_that_cannot_be_an_image_is_refused(image: Image, message: str) -> None:
+    with pytest.raises(ArgumentError, match=re.escape(f"image: {message}")) as caught:
+        grey_image(image)
+    assert isinstance(caught.value, ValueError)
+
+
+def test_an_image_gets_a_type_that_compiled_code_knows() -> None:
+    image = np.arange(400.0).reshape(20, 20)
+    kinds: dict[Any, type[np.generic]] = {
+        np.float16: np.float32,
+        np.longdouble: np.float64,
+        ">f4": np.float32,
+        ">i2": np.int16,
+    }
+    for given, used in kinds.items():
+        found = grey_image(image.astype(given))
+        assert found.dtype == np.dtype(used)
+        assert found.dtype.isnative
+        np.testing.assert_array_equal(found, image)
+    assert np.array_equal(grey_image(np.ma.masked_array(image)), image)
 
 
 Y, X = np.indices((200, 150))

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
-from datetime import UTC, datetime
+from collections.abc import Callable
+from datetime import UTC, date, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from knightcube.astro.arrays import Image
 from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
-from knightcube.errors import InputError
+from knightcube.errors import ArgumentError, InputError
 from knightcube.vision import star_tracker
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
@@ -28,6 +32,11 @@ ARCSECOND = math.radians(1.0 / 3600.0)
 @pytest.fixture(scope="module")
 def resting() -> SkyFrame:
     return sky_frame(np.random.default_rng(31), 0.0, 0.2)
+
+
+@pytest.fixture(scope="module")
+def streaked() -> SkyFrame:
+    return sky_frame(np.random.default_rng(32), 40.0, 0.2)
 
 
 def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) -> None:
@@ -118,8 +127,8 @@ def test_an_image_without_stars_gives_the_reason() -> None:
     assert solution.sky_map is None
 
 
-def test_streaks_give_the_rate_and_a_prediction_its_sign() -> None:
-    frame = sky_frame(np.random.default_rng(32), 40.0, 0.2)
+def test_streaks_give_the_rate_and_a_prediction_its_sign(streaked: SkyFrame) -> None:
+    frame = streaked
     tracker = StarTracker(fov_deg=12.0)
     alone = tracker.solve(frame.pixels, exposure=frame.exposure)
     assert alone.rate is not None
@@ -130,6 +139,103 @@ def test_streaks_give_the_rate_and_a_prediction_its_sign() -> None:
     assert known.rate_sign_known
     assert known.rate @ frame.rate > 0.0
     assert tracker.solve(frame.pixels).rate is None
+
+
+@pytest.mark.parametrize("learn", [False, True])
+@pytest.mark.parametrize("kind", ["resting", "streaked"])
+@pytest.mark.parametrize("dtype", ["int16", "int64", "uint32", ">i2", ">f4", "float64", "long double"])
+def test_whole_numbers_of_any_type_give_the_same_solution(
+    dtype: str, kind: str, learn: bool, request: pytest.FixtureRequest
+) -> None:
+    frame: SkyFrame = request.getfixturevalue(kind)
+    image = frame.pixels.astype(np.longdouble if dtype == "long double" else dtype)
+    solutions = [
+        StarTracker(fov_deg=12.0, learn=learn).solve(pixels, exposure=frame.exposure)
+        for pixels in (image, frame.pixels)
+    ]
+    assert solutions[0]
+    np.testing.assert_array_equal(solutions[0].quaternion, solutions[1].quaternion)
+    np.testing.assert_array_equal(solutions[0].covariance, solutions[1].covariance)
+
+
+@pytest.mark.parametrize("kind", ["resting", "streaked"])
+@pytest.mark.parametrize(
+    "altered",
+    [
+        lambda pixels: pixels.astype(np.int64) + 10**15,
+        lambda pixels: pixels.astype(np.int16) - 300,
+        lambda pixels: pixels.astype(np.float16),
+        lambda pixels: pixels / 65_535.0,
+        lambda pixels: 0.37 * pixels - 12.5,
+    ],
+)
+def test_scaled_and_displaced_pixel_values_give_nearly_the_same_solution(
+    altered: Callable[[Image], Image], kind: str, request: pytest.FixtureRequest
+) -> None:
+    frame: SkyFrame = request.getfixturevalue(kind)
+    tracker = StarTracker(fov_deg=12.0)
+    found, usual = (
+        tracker.solve(pixels, exposure=frame.exposure) for pixels in (altered(frame.pixels), frame.pixels)
+    )
+    assert found
+    sigma = math.sqrt(float(np.trace(usual.covariance)))
+    assert angle_between(found.quaternion, usual.quaternion) < 0.2 * sigma
+    assert np.trace(found.covariance) == pytest.approx(np.trace(usual.covariance), rel=0.1)
+    if usual.rate is not None and usual.rate_covariance is not None:
+        assert found.rate is not None
+        off = found.rate - usual.rate
+        # The gain of one electron per pixel value does not hold for scaled pixel values.
+        assert off @ np.linalg.solve(usual.rate_covariance, off) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("image", "reason"),
+    [
+        (np.full((64, 64), 65_535, np.uint16), "the frame is overexposed"),
+        (np.full((64, 64), 255, np.uint8), "the frame is overexposed"),
+        (np.full((64, 64), 65_535.0), "the frame is overexposed"),
+        (np.where(np.indices((64, 64))[0] < 30, 4_095, np.indices((64, 64))[1]), "the frame is overexposed"),
+        (np.full((64, 64), 0.7), "all pixels of the frame are equal"),
+        (np.zeros((64, 64)), "all pixels of the frame are equal"),
+    ],
+)
+def test_an_overexposed_image_and_an_empty_one_are_named(image: Image, reason: str) -> None:
+    solution = StarTracker(fov_deg=12.0).solve(image)
+    assert (solution.status, solution.reason) == ("no-stars", reason)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"exposure": -1.0}, "exposure: -1.0: give a positive, finite number of seconds"),
+        ({"exposure": math.nan}, "exposure: nan"),
+        ({"exposure": "0.2"}, "exposure: '0.2'"),
+        ({"rate": np.full(3, np.nan), "exposure": 0.2}, "rate: [nan, nan, nan]: give finite numbers"),
+        ({"rate": 0.1, "exposure": 0.2}, "rate: an array of shape (): give finite numbers of shape (3,)"),
+        ({"rate": [0.1, 0.0, 0.0]}, "exposure: None: a predicted rate needs the exposure time"),
+        ({"rate_sigma": -1.0}, "rate_sigma: -1.0: give a standard deviation of 0 rad/s or more"),
+        ({"attitude_sigma": -1.0}, "attitude_sigma: -1.0: give a standard deviation of 0 rad or more"),
+        ({"attitude_sigma": math.nan}, "attitude_sigma: nan"),
+        ({"attitude": np.zeros(4)}, "give a quaternion of unit length, scalar last"),
+        ({"attitude": np.full(4, np.nan)}, "attitude: [nan, nan, nan, nan]: give finite numbers"),
+        (
+            {"attitude": [0.0, 0.0, 1.0]},
+            "attitude: an array of shape (3,): give finite numbers of shape (4,)",
+        ),
+        ({"utc": "2026-01-01"}, "utc: '2026-01-01': give a datetime"),
+        ({"utc": date(2026, 1, 1)}, "utc: datetime.date(2026, 1, 1): give a datetime"),
+    ],
+)
+def test_a_wrong_argument_of_solve_is_named(resting: SkyFrame, given: dict[str, Any], message: str) -> None:
+    tracker = StarTracker(fov_deg=12.0)
+    with pytest.raises(ArgumentError, match=re.escape(message)):
+        tracker.solve(resting.pixels, **given)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 3.0, 1e6, math.inf])
+def test_a_large_deviation_is_an_unknown_prediction(resting: SkyFrame, sigma: float) -> None:
+    anything = np.array([0.0, 0.0, 0.0, 1.0])
+    assert StarTracker(fov_deg=12.0).solve(resting.pixels, attitude=anything, attitude_sigma=sigma)
 
 
 def test_a_wrong_field_of_view_is_refused_with_the_searched_fields(resting: SkyFrame) -> None:

@@ -8,6 +8,8 @@ attitude from a crowded sky at rest.
 from __future__ import annotations
 
 import dataclasses
+import math
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +19,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import rotation_between
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
-from knightcube.errors import FlightError
+from knightcube.errors import ArgumentError, FlightError
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run
 from knightcube.vision.objects import detect as detect_module
@@ -410,6 +412,49 @@ def test_the_public_search_gives_the_direction_of_each_object_with_its_covarianc
     assert spread == pytest.approx([0.0, sigma**2, sigma**2], abs=1e-20)
     with pytest.raises(ValueError, match="but the camera has"):
         detect_objects(pixels[1:], pinhole, _ROTATION, exposure)
+
+
+@pytest.mark.parametrize(
+    ("rate", "exposure", "message"),
+    [
+        (np.full(3, np.nan), 0.5, "rate: .*give finite"),
+        (np.full(3, np.inf), 0.5, "rate: .*give finite"),
+        (0.1, 0.5, "rate: an array of shape"),
+        (_ROTATION, math.nan, "exposure: nan"),
+        (_ROTATION, -1.0, "exposure: -1.0: give a positive"),
+        (_ROTATION, 0.0, "exposure: 0.0"),
+    ],
+)
+def test_the_public_search_refuses_a_wrong_rate_or_exposure(rate: Any, exposure: float, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        detect_objects(np.zeros((512, 512), np.uint16), _FRAME_CAMERA.pinhole, rate, exposure)
+
+
+@pytest.mark.parametrize("turn", [1_000.0 * _ROTATION, np.array([0.0, 0.0, 3.2]), np.array([0.7, 0.0, 0.0])])
+def test_a_rotation_that_leaves_no_star_in_the_image_is_answered_at_once(turn: FloatArray) -> None:
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [], _FAINTEST)
+    begin = time.monotonic()
+    found = detect_objects(pixels, _FRAME_CAMERA.pinhole, turn, 1.0)
+    assert time.monotonic() - begin < 2.0
+    assert not found
+    assert "no star remains in the image" in found.reason
+    assert found.directions.shape == (0, 3)
+
+
+def test_the_public_search_accepts_numbers_of_every_type() -> None:
+    path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 25.0 / _FOCAL, 0.3), _ROTATION)
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 0.5, 5, [(path, 4.0)], _FAINTEST)
+    settings = ObjectSettings(gain=_SETTINGS.gain, saturation=_SETTINGS.saturation)
+    rate = _turn(pixels, _ROTATION, 0.5) / 0.5
+    usual = detect_objects(pixels, _FRAME_CAMERA.pinhole, rate, 0.5, settings)
+    for image in (pixels.astype(np.int32), pixels.astype(np.float32)):
+        same = detect_objects(image, _FRAME_CAMERA.pinhole, rate, 0.5, settings)
+        np.testing.assert_array_equal(same.directions, usual.directions)
+    assert settings.saturation is not None
+    scaled = dataclasses.replace(settings, gain=7.3 * settings.gain, saturation=settings.saturation / 7.3)
+    found = detect_objects(pixels / 7.3, _FRAME_CAMERA.pinhole, rate, 0.5, scaled)
+    assert found.objects[0].flux == pytest.approx(usual.objects[0].flux / 7.3, rel=0.05)
+    np.testing.assert_allclose(found.directions, usual.directions, atol=0.3 / _FOCAL)
 
 
 def test_an_object_below_the_required_significance_is_not_reported() -> None:

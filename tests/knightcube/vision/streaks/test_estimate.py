@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -16,7 +17,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import ArgumentError, FlightError
 from knightcube.vision.camera.lens import CameraKnowledge, Lens
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import chained_stars, estimate_motion, estimate_rate
@@ -522,6 +523,46 @@ def test_one_call_names_the_reason_for_a_missing_rate() -> None:
     noise = np.random.default_rng(3).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
     found = estimate_rate(noise, CAMERA.pinhole, 1.0)
     assert (found.rate, found.reason) == (None, "too few streaks are significant")
+
+
+def test_an_image_of_floating_point_numbers_gives_the_rate_of_its_counts() -> None:
+    scene = real_sky(60, 1.1, 60.0, 0.5)
+    settings = LikelihoodSettings(saturation=SATURATION)
+
+    def estimated(image: Image, settings: LikelihoodSettings) -> MotionResult:
+        given = {"prior_rate": scene.rate, "settings": settings}
+        return estimate_rate(image, CAMERA.pinhole, scene.exposure, **given)  # type: ignore[arg-type]  # named
+
+    usual = estimated(scene.pixels, settings)
+    assert usual.rate is not None
+    assert usual.covariance is not None
+    same = estimated(scene.pixels.astype(np.float64), settings)
+    np.testing.assert_array_equal(same.rate, usual.rate)
+    np.testing.assert_array_equal(same.flux, usual.flux)
+    scaled = replace(settings, gain=2.7 * settings.gain, saturation=SATURATION / 2.7 - 50.0)
+    found = estimated(scene.pixels / 2.7 - 50.0, scaled)
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert _squared(found.rate - usual.rate, usual.covariance) < 0.1
+    assert np.trace(found.covariance) == pytest.approx(np.trace(usual.covariance), rel=0.1)
+    brightest = np.sort(usual.flux)[-5:]
+    assert 2.7 * np.sort(found.flux)[-5:] == pytest.approx(brightest, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"image": np.zeros((1, 3), np.uint16)}, "image: an array of shape"),
+        ({"image": np.zeros((1024, 1000))}, "but the camera has 1024 x 1024 pixels"),
+        ({"exposure": -0.1}, "exposure: -0.1"),
+        ({"prior_rate": 0.1}, "prior_rate: an array of shape"),
+        ({"prior_sigma": -1.0}, "prior_sigma: -1.0"),
+    ],
+)
+def test_one_call_refuses_a_wrong_argument_by_name(given: dict[str, Any], message: str) -> None:
+    usual: dict[str, Any] = {"image": np.zeros((1024, 1024)), "camera": CAMERA.pinhole, "exposure": 1.0}
+    with pytest.raises(ArgumentError, match=message):
+        estimate_rate(**{**usual, **given})
 
 
 def test_a_calibrated_lens_widens_the_covariance_by_what_the_pinhole_lacks() -> None:

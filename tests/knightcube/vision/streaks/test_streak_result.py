@@ -84,10 +84,10 @@ def test_every_status_without_a_rate_has_a_reason() -> None:
         ((40, 41), 1.0, None, 0.0, "shape"),
         ((40, 40), 0.0, None, 0.0, "exposure"),
         ((40, 40), np.nan, None, 0.0, "exposure"),
-        ((40, 40), 1.0, np.array([0.0, np.nan, 0.0]), 0.0, "prior rate"),
-        ((40, 40), 1.0, np.zeros(2), 0.0, "prior rate"),
-        ((40, 40), 1.0, np.zeros(3), -1.0, "prior sigma"),
-        ((40, 40), 1.0, np.zeros(3), np.nan, "prior sigma"),
+        ((40, 40), 1.0, np.array([0.0, np.nan, 0.0]), 0.0, "prior_rate"),
+        ((40, 40), 1.0, np.zeros(2), 0.0, "prior_rate"),
+        ((40, 40), 1.0, np.zeros(3), -1.0, "prior_sigma"),
+        ((40, 40), 1.0, np.zeros(3), np.nan, "prior_sigma"),
     ],
 )
 def test_invalid_arguments_are_named(
