@@ -146,12 +146,16 @@ def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAn
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event of the flight log at mission time `time` (s)."""
+    """An event of the flight log at mission time `time` (s).
+
+    The number `suppressed` counts events of the same kind since the preceding one that were not recorded.
+    """
 
     time: float
     severity: int
     name: str
     text: str
+    suppressed: int = 0
 
 
 @dataclass(slots=True)
@@ -185,6 +189,7 @@ class FlightState:
                 int(row["severity"]),
                 printable(to_text(row["name"])),
                 printable(to_text(row["text"])),
+                int(row["suppressed"]),
             )
             for row in packets["event"]
         ]
@@ -272,7 +277,8 @@ class PlainLines:
 
 def event_line(event: LoggedEvent) -> str:
     """Return an event as a line."""
-    return f"{event.time:9.3f} s  {named(SEVERITIES, event.severity):8} {event.name}: {event.text}"
+    before = f" ({event.suppressed} before it not recorded)" if event.suppressed else ""
+    return f"{event.time:9.3f} s  {named(SEVERITIES, event.severity):8} {event.name}: {event.text}{before}"
 
 
 def state_line(state: FlightState) -> str:

@@ -430,6 +430,7 @@ class Supervision:
         self._notes.clear()
         for kind, text in notes:
             self._events.report(kind, now_ns, text)
+        self._events.release(now_ns)
 
 
 CONTROL_PRIORITY = 50

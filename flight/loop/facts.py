@@ -3,7 +3,7 @@
 Events are written to the flight log, and each event triggers the reaction that belongs to its kind. The first
 event of a kind is written at once. Later, at most one event of each kind is written per `THROTTLE_NS`,
 together with the number of events held back. A fault in every 40 Hz cycle therefore writes only one event
-every few seconds.
+every few seconds. The last event held back is written with its own time and text.
 
 A monitored condition (class `Fact`) is active or inactive. As in NASA's Limit Checker, it becomes active
 after N consecutive updates in which the condition is true; an update with an unknown state (None) leaves the
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from flight.link import events
-from flight.link.events import EVENTS, STEERING, EventKind, Mode, Reaction
+from flight.link.events import STEERING, EventKind, Mode, Reaction
 from flight.link.telemetry.log import Recorder
 from flight.loop.executive import JobRunner
 from flight.schema.sections import CONTROL_RATE_HZ, Config
@@ -41,6 +41,16 @@ Reactor = Callable[[EventKind, int, str], None]
 """Function that carries out the reaction to an event, given its kind, time (ns) and text."""
 
 
+@dataclass(frozen=True, slots=True)
+class _HeldBack:
+    """The newest event of a kind that is held back, and the number `count` of all events held back."""
+
+    kind: EventKind
+    time_ns: int
+    text: str
+    count: int
+
+
 class EventLog:
     """Passes events to a sink, and limits the number of written events of each kind.
 
@@ -53,7 +63,7 @@ class EventLog:
         self._react: Reactor | None = None
         self._throttle_ns = throttle_ns
         self._last_written: dict[int, int] = {}
-        self._held_back: dict[int, int] = {}
+        self._held_back: dict[int, _HeldBack] = {}
         self.count = 0
         self.counts: Counter[EventKind] = Counter()
         self.first_texts: dict[EventKind, str] = {}
@@ -67,21 +77,33 @@ class EventLog:
         self.count += 1
         self.counts[kind] += 1
         self.first_texts.setdefault(kind, text)
-        last_ns = self._last_written.get(kind.code)
+        last_ns, held = self._last_written.get(kind.code), self._held_back.pop(kind.code, None)
+        before = held.count if held else 0
         if last_ns is not None and time_ns - last_ns < self._throttle_ns:
-            self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1
+            self._held_back[kind.code] = _HeldBack(kind, time_ns, text, before + 1)
         else:
-            self._last_written[kind.code] = time_ns
-            self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
+            self._write(kind, time_ns, before, text, time_ns)
         if self._react is not None and kind.reaction is not Reaction.NOTE:
             self._react(kind, time_ns, text)
 
-    def flush(self, time_ns: int) -> None:
-        """Write the events that are still held back at the end of the flight."""
-        by_code = {kind.code: kind for kind in EVENTS}
-        for code, held_back in list(self._held_back.items()):
-            self._sink(by_code[code], time_ns, held_back - 1, "the last event suppressed by the rate limit")
-        self._held_back.clear()
+    def release(self, now_ns: int) -> None:
+        """Write the newest event of each kind that is held back and may be written again."""
+        for code, held in list(self._held_back.items()):
+            if now_ns - self._last_written[code] >= self._throttle_ns:
+                self._release(held, now_ns)
+
+    def flush(self, now_ns: int) -> None:
+        """Write the newest event of each kind that is held back, at the end of the flight."""
+        for held in list(self._held_back.values()):
+            self._release(held, now_ns)
+
+    def _release(self, held: _HeldBack, now_ns: int) -> None:
+        del self._held_back[held.kind.code]
+        self._write(held.kind, held.time_ns, held.count - 1, held.text, now_ns)
+
+    def _write(self, kind: EventKind, time_ns: int, held_back: int, text: str, now_ns: int) -> None:
+        self._last_written[kind.code] = now_ns
+        self._sink(kind, time_ns, held_back, text)
 
 
 EVERYWHERE = frozenset(Mode)

@@ -484,6 +484,7 @@ class HealthWatch:
     def run(self, cycle: Cycle) -> None:
         """Run all checks once."""
         now_ns = cycle.start_ns
+        self._events.release(now_ns)
         self._check_streams(now_ns)
         self._check_progress(now_ns)
         failures = failing(self._clock.tickers, now_ns)

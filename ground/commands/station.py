@@ -229,7 +229,13 @@ def _facts(state: FlightState) -> dict[str, Any]:
         "faults": state.faults,
         "faults_since_s": state.since,
         "events": [
-            {"time_s": event.time, "severity": event.severity, "name": event.name, "text": event.text}
+            {
+                "time_s": event.time,
+                "severity": event.severity,
+                "name": event.name,
+                "text": event.text,
+                "suppressed": event.suppressed,
+            }
             for event in state.events
         ],
         "ended": state.ended or None,

@@ -23,7 +23,16 @@ from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Packer, PacketArray
 from ground.commands import station
 from ground.telemetry import read_run, scan
-from ground.watch import LISTED_EVENTS, FlightState, LogTail, PlainLines, panel, state_line
+from ground.watch import (
+    LISTED_EVENTS,
+    FlightState,
+    LoggedEvent,
+    LogTail,
+    PlainLines,
+    event_line,
+    panel,
+    state_line,
+)
 from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
@@ -84,7 +93,7 @@ def test_one_look_as_json_has_mode_currents_streams_and_events(growing: Path) ->
     assert facts["currents_a"] == [0.1, 0.0, 0.0]
     assert (facts["streams"]["imu"], facts["streams"]["coils"]) == ("good", "stale")
     assert facts["events"][-1] == {
-        "time_s": 5.7, "severity": 2, "name": "imu-silent", "text": "0.2 s without a byte"
+        "time_s": 5.7, "severity": 2, "name": "imu-silent", "text": "0.2 s without a byte", "suppressed": 0
     }  # fmt: skip
     assert command("watch", growing, "--once").stdout.count("\n") == 1
 
@@ -349,3 +358,10 @@ def test_one_look_over_a_link_waits_for_a_complete_state(capsys: pytest.CaptureF
     assert shown.endswith("slips 4  alarms none  faults received 0 since 5.0 s\n")  # earlier ones are unknown
     assert station._watch(options, Portions(), 0.01, "over the link") == 1
     assert "no state of the flight in 0.01 s over the link" in capsys.readouterr().err
+
+
+def test_the_line_of_an_event_counts_the_events_before_it_that_were_not_recorded() -> None:
+    plain = LoggedEvent(5.7, 2, "gps-refused", "60 m off")
+    assert event_line(plain).endswith("gps-refused: 60 m off")
+    many = LoggedEvent(5.7, 2, "gps-refused", "60 m off", 4)
+    assert event_line(many).endswith("gps-refused: 60 m off (4 before it not recorded)")

@@ -341,16 +341,35 @@ def test_the_throttle_writes_one_event_of_a_kind_in_its_time_with_the_number_hel
     written: list[tuple[str, int, int, str]] = []
     log = EventLog(lambda kind, time_ns, held, text: written.append((kind.name, time_ns, held, text)), 100)
     for time_ns in (0, 1, 99, 100, 150):
-        log.report(events.CYCLE_SLIP, time_ns, "slip")
+        log.report(events.CYCLE_SLIP, time_ns, f"slip at {time_ns}")
     log.report(events.BLIND, 150, "blind")
     assert written == [
-        ("cycle-slip", 0, 0, "slip"),
-        ("cycle-slip", 100, 2, "slip"),
+        ("cycle-slip", 0, 0, "slip at 0"),
+        ("cycle-slip", 100, 2, "slip at 100"),
         ("blind", 150, 0, "blind"),
     ]
     assert log.count == 6
     assert log.counts == {events.CYCLE_SLIP: 5, events.BLIND: 1}
-    log.flush(200)
-    assert written[3:] == [("cycle-slip", 200, 0, "the last event suppressed by the rate limit")]
+    # The last event that is held back keeps its time and text.
+    log.report(events.CYCLE_SLIP, 160, "slip at 160")
+    log.flush(170)
+    assert written[3:] == [("cycle-slip", 160, 1, "slip at 160")]
     log.flush(300)
     assert len(written) == 4
+
+
+def test_an_event_held_back_is_written_as_soon_as_the_throttle_permits() -> None:
+    written: list[tuple[int, int, str]] = []
+    log = EventLog(lambda _, time_ns, held, text: written.append((time_ns, held, text)), 100)
+    for time_ns, text in ((0, "doubted"), (20, "trusted"), (40, "doubted again")):
+        log.report(events.COMMANDS_DOUBTED, time_ns, text)
+    log.release(99)
+    assert written == [(0, 0, "doubted")]
+    log.release(100)
+    assert written[1:] == [(40, 1, "doubted again")]
+    # The throttle counts from the time at which the event was written.
+    log.report(events.COMMANDS_DOUBTED, 150, "once more")
+    log.release(199)
+    assert len(written) == 2
+    log.release(200)
+    assert written[2:] == [(150, 0, "once more")]
