@@ -248,6 +248,8 @@ def _note_complete(out: Path) -> None:
 
 def results_in(out: Path) -> list[Result]:
     """Return the results in the folder of a campaign, ordered by the keys of their cases."""
+    if not (out / _RESULTS).exists():
+        return []
     with (out / _RESULTS).open(encoding="utf-8") as lines:
         done = _read(lines)[0]
     return [done[key] for key in sorted(done)]
@@ -276,7 +278,15 @@ def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
     if label_path.exists():
         found = json.loads(label_path.read_text(encoding="utf-8"))
         if found != label:
-            raise UsageError(f"{out} contains {found}, not {label}: give another folder with --out")
+            differing = ", ".join(
+                f"{key} {found.get(key, 'none')}, not {label.get(key, 'none')}"
+                for key in dict.fromkeys((*found, *label))
+                if found.get(key) != label.get(key)
+            )
+            raise UsageError(
+                f"{out} contains a campaign with {differing}: give another folder with --out, or continue "
+                "the campaign in this folder with its own options"
+            )
     else:
         beside = label_path.with_suffix(".new")
         beside.write_text(json.dumps(label) + "\n", encoding="utf-8")

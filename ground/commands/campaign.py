@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flight.app.cli import PROGRAM
 from flight.schema.document import config_path
-from ground.commands.options import count, positive
+from ground.commands.options import count, interruptible, positive
 from knightcube.errors import UsageError
 
 
@@ -61,9 +61,12 @@ def run(options: argparse.Namespace) -> int:
     out = options.out or Path("runs") / "campaigns" / options.config.stem
     try:
         where = {"workers": options.workers, "dask": options.dask, "only": options.only}
-        found = fly(campaign, options.runs, options.seed, out, progress=True, **where)
+        with interruptible():
+            found = fly(campaign, options.runs, options.seed, out, progress=True, **where)
     except KeyboardInterrupt:
-        sys.stderr.write(f"\ninterrupted; run the same command again to continue in {out}\n")
+        kept = len(results_in(out))
+        text = f"interrupted; {kept} results are kept; run the same command again to continue in {out}"
+        sys.stderr.write(f"\n{text}\n")
         return 130
     except CampaignError as error:
         raise CampaignError(f"{error}; run the same command again to continue in {out}") from error

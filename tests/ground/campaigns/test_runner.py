@@ -252,13 +252,16 @@ def test_a_row_without_results_is_null_in_the_summary(tmp_path: Path, in_process
     }
 
 
-@pytest.mark.parametrize("other", [{"runs": 4, "seed": 5}, {"runs": 3, "seed": 6}, {"only": "-1"}])
+@pytest.mark.parametrize(
+    ("other", "difference"),
+    [({"runs": 4}, "runs 3, not 4"), ({"seed": 6}, "seed 5, not 6"), ({"only": "-1"}, "only none, not -1")],
+)
 def test_the_folder_of_another_campaign_is_refused(
-    other: dict[str, Any], tmp_path: Path, in_process: list[str]
+    other: dict[str, Any], difference: str, tmp_path: Path, in_process: list[str]
 ) -> None:
     fly(TOY, 3, 5, tmp_path)
     in_process.clear()
-    with pytest.raises(UsageError, match="give another folder with --out"):
+    with pytest.raises(UsageError, match=f"campaign with {difference}: give another folder with --out"):
         fly(TOY, **({"runs": 3, "seed": 5} | other), out=tmp_path)
     assert in_process == []
     assert len(results_in(tmp_path)) == 3

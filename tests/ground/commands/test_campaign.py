@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,17 @@ class Scripted:
         self.flown: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
         self.drawn: list[tuple[Any, Path]] = []
         self.error: BaseException | None = None
+        self.is_interrupted = False
         self.picture: bool | UsageError = True
         self.facts = {"flights": 3, "within all limits": 2}
         monkeypatch.setattr("ground.campaigns.runner.fly", self.fly)
-        monkeypatch.setattr("ground.campaigns.runner.results_in", lambda out: f"results in {out}")
+        monkeypatch.setattr("ground.campaigns.runner.results_in", lambda out: [out, "results"])
         monkeypatch.setattr("ground.campaigns.varied.draw_campaign", self.draw)
 
     def fly(self, *words: Any, **settings: Any) -> Summary:
         self.flown.append((words, settings))
+        if self.is_interrupted:
+            signal.raise_signal(signal.SIGINT)
         if self.error is not None:
             raise self.error
         return Summary("a table\n", self.facts)
@@ -60,7 +64,7 @@ def test_the_arguments_reach_the_campaign(scripted: Scripted) -> None:
     assert made.name.startswith("step_demo with plant.inertia=5%, steps[1].q2=+-0.1, 4.5 s (CRC")
     assert (runs, seed, out) == (7, 9, Path("here"))
     assert settings == {"progress": True, "workers": 2, "dask": "tcp://one", "only": "x"}
-    assert scripted.drawn == [("results in here", Path("here/campaign.png"))]
+    assert scripted.drawn == [([Path("here"), "results"], Path("here/campaign.png"))]
 
 
 def test_the_defaults_are_a_hundred_flights_in_a_folder_named_after_the_configuration(
@@ -104,9 +108,16 @@ def test_a_picture_that_cannot_be_drawn_does_not_change_the_status(
 def test_an_interrupted_campaign_says_how_to_continue(
     scripted: Scripted, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scripted.error = KeyboardInterrupt()
-    assert scripted.run("--out", "here") == 130
-    assert capsys.readouterr().err == "\ninterrupted; run the same command again to continue in here\n"
+    """The program `knightcube` ends by SIGINT at once unless a command handles the signal."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    scripted.is_interrupted = True
+    try:
+        assert scripted.run("--out", "here") == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    scripted.is_interrupted = False
+    text = "interrupted; 2 results are kept; run the same command again to continue in here"
+    assert capsys.readouterr().err == f"\n{text}\n"
     scripted.error = CampaignError("the scheduler is lost")
     text = "the scheduler is lost; run the same command again to continue in here"
     with pytest.raises(CampaignError, match=text):
