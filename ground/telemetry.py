@@ -3,7 +3,7 @@
 The reader counts every byte, inside or outside packets. The packets of a run are exported to CSV files,
 Parquet files, or one SQLite database, with the same columns: the first column is the mission time `time_s`,
 and an array has one column per element, such as quaternion_1 to quaternion_4. Numbers are written with full
-precision.
+precision. The table of events also has their UTC.
 """
 
 from __future__ import annotations
@@ -13,14 +13,16 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from flight.link.telemetry.definitions import EVENT
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
@@ -182,7 +184,25 @@ def tables(run: Run) -> Iterator[tuple[str, list[PacketColumn]]]:
     """Yield the name and the columns of each packet type in the run."""
     for name, layout in LAYOUTS.items():
         if len(run[name]):
-            yield name, list(_columns(layout, run[name]))
+            columns = list(_columns(layout, run[name]))
+            yield name, columns + ([_dates(run)] if layout.packet is EVENT else [])
+
+
+def _dates(run: Run) -> PacketColumn:
+    """Return the column with the UTC of each event, by the newest label of the flight."""
+    label, times = run["run"], run["event"]["time_ns"].tolist()
+    start_ns = int(label["utc_ns"][-1]) if len(label) else 0
+    meaning = "UTC by the newest packet run; empty if the flight knew no UTC"
+    texts = [_date(start_ns + time_ns) if start_ns > 0 else "" for time_ns in times]
+    return PacketColumn("utc", "-", meaning, texts)
+
+
+def _date(utc_ns: int) -> str:
+    """Return a UTC in ns since 1970 as ISO 8601 text with milliseconds; an impossible date is empty."""
+    with suppress(OverflowError, ValueError, OSError):
+        date = datetime.fromtimestamp(utc_ns // 10**9, UTC)
+        return f"{date:%Y-%m-%dT%H:%M:%S}.{utc_ns // 10**6 % 1000:03d}Z"
+    return ""
 
 
 def _columns(layout: Layout, packets: PacketArray) -> Iterator[PacketColumn]:

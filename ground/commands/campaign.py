@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
-from flight.app.cli import PROGRAM
+from flight.app.cli import PROGRAM, to_json
 from flight.schema.document import config_path
 from ground.commands.options import count, interruptible, positive
 from knightcube.errors import UsageError
@@ -70,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         return 130
     except CampaignError as error:
         raise CampaignError(f"{error}; run the same command again to continue in {out}") from error
-    sys.stdout.write(json.dumps(found.facts) + "\n" if options.json else found.text)
+    sys.stdout.write(to_json(found.facts) if options.json else found.text)
     try:
         drawn = draw_campaign(results_in(out), out / "campaign.png")
     except UsageError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import sys
 import textwrap
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from flight.app.cli import PROGRAM
+from flight.app.cli import PROGRAM, to_json
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import config_path, read_text
@@ -139,7 +138,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         dates, positions = _positions(*_given_orbit(options))
     made = fit_elements(dates, positions, velocities)
-    sys.stdout.write(json.dumps(_facts(made, dates)) + "\n" if options.json else _text(made, dates))
+    sys.stdout.write(to_json(_facts(made, dates)) if options.json else _text(made, dates))
     return 0
 
 
@@ -362,7 +361,7 @@ def run_passes(options: argparse.Namespace) -> int:
     found = prediction.passes(stations)
     if options.json:
         facts = {"timing_error_s": prediction.timing_error_s, "passes": [facts_of(one) for one in found]}
-        sys.stdout.write(json.dumps(facts) + "\n")
+        sys.stdout.write(to_json(facts))
     elif options.schedule:
         for one in found:
             for at, target in scheduled_targets(one, options.lead):

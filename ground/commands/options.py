@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import re
 import signal
@@ -14,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from flight.app.cli import to_json
 from flight.schema.document import config_path
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
@@ -47,7 +47,7 @@ def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespac
 
 def print_result(options: argparse.Namespace, facts: Any, text: str) -> None:
     """Print a result as one JSON object if the option `--json` is given, otherwise as text."""
-    sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n" if options.json else text)
+    sys.stdout.write(to_json(facts, allow_nan=False) if options.json else text)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from flight.app.cli import PROGRAM
+from flight.app.cli import PROGRAM, to_json
 from flight.app.run import utc_ns
 from flight.app.service import EndingSignals
 from flight.link import commands
@@ -383,7 +383,7 @@ def _show(table: ParameterTable, before: ParameterTable, refused: str, as_json: 
     if as_json:
         facts: Object = {"crc": f"{table.crc:08x}", "table": table.origin, "loads": table.loads}
         facts |= {"kept": table.kept, "refused": refused, "values": table.values}
-        sys.stdout.write(json.dumps(facts) + "\n")
+        sys.stdout.write(to_json(facts))
         return
     for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
         low, high = field.valid or (-np.inf, np.inf)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import signal
 import socket
 import sys
@@ -17,6 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from flight.app.cli import to_json
 from flight.app.service import EndingSignals
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
@@ -155,7 +155,7 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
             sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}\n")
             return 1
         line = state_line(state) + (f"  ended: {state.ended}" if state.ended else "")
-        sys.stdout.write((json.dumps(_facts(state)) if options.json else line) + "\n")
+        sys.stdout.write(to_json(_facts(state)) if options.json else line + "\n")
         return 0
     with _ending() as ended, _display(options, state, tail) as refresh:
         refresh()
@@ -253,7 +253,7 @@ def _watch_socket(options: argparse.Namespace) -> int:
                 sys.stdout.writelines(f"{event_line(event)}\n" for event in found)
             facts = {"commands": answer.count, "answered_s": answer.delay}
             text = f"{state_line(state)}  answered in {1e3 * answer.delay:.1f} ms"
-            sys.stdout.write((json.dumps(_facts(state) | facts) if options.json else text) + "\n")
+            sys.stdout.write(to_json(_facts(state) | facts) if options.json else text + "\n")
             sys.stdout.flush()
             if once or ended.wait(_PING_S):
                 return 0

@@ -298,6 +298,7 @@ def spin_figure(signals: RunSignals) -> Figure | None:
     _detumbling_rate(rate, signals.run)
     panels.vectors(field, seconds(spin), 1e6 * spin["field"].astype(float))
     panels.vectors(dipole, seconds(spin), 1e3 * spin["dipole"].astype(float))
+    panels.plain_ticks(rate)
     panels.style(rate, "rate, deg/s", "Detumbling", "")
     panels.style(field, "field, µT", "Magnetic field in the body frame", "")
     panels.style(dipole, "dipole, mA m²", "Commanded dipole")
@@ -325,6 +326,7 @@ def _detumbling_rate(ax: Axes, run: Run) -> None:
     if periods:
         margin = SPIN_MARGIN * (periods[-1][1] - periods[0][0])
         first, last = max(periods[0][0] - margin, 0.0), periods[-1][1] + margin
+        last = min(last, float(time[-1])) if len(time) else last
         ax.set_xlim(first, last)
         shown_rows = (time >= first) & (time <= last)
         speed = speed[shown_rows]

@@ -152,6 +152,7 @@ def knowledge(run: Run) -> Object | None:
         "fixes_refused": int(last["fixes_refused"]),
         "restarts": int(last["restarts"]),
         "dipole_error_share": dipole_errors(run),
+        "dipole_judged_s": {name: float(len(rows)) for name, rows in _judged_dipoles(run).items()},
         "star_camera": star_camera_knowledge(run),
         "description": learned_description(run),
     }
@@ -231,20 +232,27 @@ def dipole_errors(run: Run) -> dict[str, float]:
     Only the last ten minutes in sunlight and in shadow are evaluated. The two values are NaN without an
     estimate or a truth log.
     """
+    found = {}
+    for name, rows in _judged_dipoles(run).items():
+        error, true = rows[:, 0], rows[:, 1]
+        size = max(float(np.sqrt(np.sum(true**2))), MIN_DIPOLE)
+        found[name] = float(np.sqrt(np.sum(error**2))) / size if len(rows) else math.nan
+    return found
+
+
+def _judged_dipoles(run: Run) -> dict[str, FloatArray]:
+    """Return errors and true residual dipoles (n, 2, 3), A m^2, of the last ten minutes, one per second.
+
+    A flight that was shorter in sunlight or in shadow has fewer rows.
+    """
     packets, truth = run["navigation"], run["orbit_truth"]
     packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
-    found = {"sunlight": math.nan, "shadow": math.nan}
     if not len(packets) or not len(truth):
-        return found
+        return {"sunlight": np.empty((0, 2, 3)), "shadow": np.empty((0, 2, 3))}
     at = np.clip(np.searchsorted(seconds(truth), seconds(packets)), 0, len(truth) - 1)
     true, lit = truth["residual_dipole"][at].astype(float), truth["sunlit"][at]
-    error = packets["residual_dipole"].astype(float) - true
-    for name, inside in (("sunlight", lit > SUNLIT), ("shadow", lit < 1.0 - SUNLIT)):
-        last = np.flatnonzero(inside)[-JUDGED:]
-        if len(last):
-            size = max(float(np.sqrt(np.sum(true[last] ** 2))), MIN_DIPOLE)
-            found[name] = float(np.sqrt(np.sum(error[last] ** 2))) / size
-    return found
+    rows = np.stack([packets["residual_dipole"].astype(float) - true, true], axis=1)
+    return {"sunlight": rows[lit > SUNLIT][-JUDGED:], "shadow": rows[lit < 1.0 - SUNLIT][-JUDGED:]}
 
 
 def _rms(values: FloatArray) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from flight.link.telemetry.definitions import MAX_NODES
 from flight.link.telemetry.packets import PacketArray
@@ -40,6 +40,8 @@ VERMILLION, PURPLE, SKY = "#D55E00", "#CC79A7", "#56B4E9"
 PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 DASHED = (0, (5, 2))
+MAX_SHORT = 100.0
+"""Ratio of the ends of a short logarithmic axis, below which 2 and 5 times powers of ten are labelled."""
 _MAX_ERROR = 1e9
 """Largest plausible rate error (mrad/s).
 
@@ -134,6 +136,15 @@ def legend(ax: Axes) -> None:
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "frameon": False}
         gaps: dict[str, Any] = {"borderaxespad": 0.2, "columnspacing": 1.4}
         ax.legend(handles, labels, ncols=len(handles), fontsize=9, **place, **gaps)
+
+
+def plain_ticks(ax: Axes) -> None:
+    """Label the logarithmic y axis with plain numbers, at 1, 2 and 5 times powers of ten if it is short."""
+    low, high = ax.get_ylim()
+    subs = (1.0, 2.0, 5.0) if high < MAX_SHORT * low else (1.0,)
+    ax.yaxis.set_major_locator(LogLocator(subs=subs))
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def level(ax: Axes, value: float, label: str, colour: str = VERMILLION) -> None:

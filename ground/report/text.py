@@ -140,7 +140,7 @@ def _knowledge(found: Object | None) -> list[str]:
     if found is None:
         return []
     share = ", ".join(f"{name} {number(part, 1, 100.0)} %" for name, part in found["share"].items())
-    dipole, camera = found["dipole_error_share"], found["star_camera"]
+    dipole, judged, camera = found["dipole_error_share"], found["dipole_judged_s"], found["star_camera"]
     own: list[str] = []
     if camera is not None:
         error, nees = number(camera["with_stars_error_rms_rad"], 4, DEGREES), number(camera["nees_per_axis"])
@@ -163,7 +163,8 @@ def _knowledge(found: Object | None) -> list[str]:
         *own,
         *learned,
         *(
-            f"  error of the residual dipole in the last ten minutes in {where}: {number(share, 0, 100.0)} %"
+            f"  error of the residual dipole in the last {number(judged[where], 1, 1.0 / 60.0)} min "
+            f"in {where}: {number(share, 0, 100.0)} %"
             for where, share in dipole.items()
             if share is not None
         ),

@@ -25,6 +25,7 @@ from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock
 from tests.pace import ordinary_seconds
+from tests.support.packed_run import packed_run
 
 SHORT = Recipe(duration=30.0, planned=30.0, hold=10.0, rate_hz=10.0)
 
@@ -250,6 +251,18 @@ def test_numbers_come_back_exactly_under_their_names_and_units(tmp_path: Path) -
     np.testing.assert_array_equal(table[:, 0], np.arange(201) / 10.0)
     np.testing.assert_array_equal(table[:, 1:5], run["truth"]["quaternion"])
     np.testing.assert_array_equal(table[:, -2], run["truth"]["energy"])
+
+
+@pytest.mark.parametrize(
+    ("utc_ns", "utc"), [(1_774_008_001_000_000_000, "2026-03-20T12:00:16.450Z"), (0, ""), (None, "")]
+)
+def test_events_have_their_utc_if_the_flight_knows_it(utc_ns: int | None, utc: str, tmp_path: Path) -> None:
+    happened = [(15.45, {"name": "camera-saturated"})]
+    labels = [] if utc_ns is None else [(0.0, {"utc_ns": utc_ns})]
+    run = packed_run(event=happened, run=labels)
+    export(run, tmp_path)
+    names, rows = read(tmp_path / "event.csv")
+    assert dict(zip(names, rows[0], strict=True))["utc"] == utc
 
 
 def test_numpy_reads_a_file_by_its_column_names(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import errno
 import importlib
 import importlib.util
 import io
+import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -96,6 +97,22 @@ examples:
   {PROGRAM} solve samples/stars.png --fov 15 --overlay solved.png
   {PROGRAM} horizon samples/limb.png --fov 67 --altitude 515 --overlay limb.png
 """
+
+
+def to_json(facts: Any, *, allow_nan: bool = True) -> str:
+    """Return the result of a command as one line of JSON, with numbers rounded to twelve digits.
+
+    Otherwise, times that are computed from integers in ns would be printed as 15.450000000000001.
+    """
+    return json.dumps(_rounded(facts), allow_nan=allow_nan) + "\n"
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(each) for each in value]
+    return float(f"{value:.12g}") if isinstance(value, float) else value
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

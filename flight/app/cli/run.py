@@ -8,7 +8,6 @@ The serial port and the camera that a running flight uses are reported as busy.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from flight.app.cli import PROGRAM
+from flight.app.cli import PROGRAM, to_json
 from flight.app.devices import (
     NO_CAMERA,
     check_settings,
@@ -189,7 +188,7 @@ def run(options: argparse.Namespace) -> int:
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun
     if options.json:
-        sys.stdout.write(json.dumps(summary_facts(result, elapsed)) + "\n")
+        sys.stdout.write(to_json(summary_facts(result, elapsed)))
     else:
         sys.stdout.write(summary_text(result, elapsed))
     for problem in filter(None, (result.log_error, result.restart)):
@@ -340,7 +339,7 @@ def check(options: argparse.Namespace) -> int:
         else:
             check_simulated_elements(RunRequest(path, Path()), chosen.text, config)
             _fly(verdict)
-    sys.stdout.write(json.dumps(_facts(verdict)) + "\n" if options.json else _text(verdict))
+    sys.stdout.write(to_json(_facts(verdict)) if options.json else _text(verdict))
     return 1 if verdict.problems else 0
 
 

@@ -119,6 +119,7 @@ def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
     assert found["description"] == []
     assert orbit.knowledge(packed_run(attitude=attitude)) is None
     assert math.isnan(found["dipole_error_share"]["sunlight"])
+    assert found["dipole_judged_s"] == {"sunlight": 0.0, "shadow": 0.0}
     errors = orbit.attitude_errors(run)
     assert errors.times.tolist() == [1.5, 3.0, 12.0, 13.0], "only where the truth is known"
     np.testing.assert_allclose(errors.error[:, 0], [1e-3, 2e-3, 3e-3, 6e-3], rtol=1e-6)

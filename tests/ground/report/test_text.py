@@ -134,6 +134,7 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
         "with_stars_error_rms_rad": 0.002 * DEGREE, "fine_error_worst_rad": 0.03 * DEGREE,
         "worst_sigmas": 3.14, "nees_per_axis": 1.049, "refused": 5, "fixes_refused": 6, "restarts": 7,
         "dipole_error_share": {"sunlight": 0.126, "shadow": 0.054},
+        "dipole_judged_s": {"sunlight": 600.0, "shadow": 90.0},
         "star_camera": {"with_stars_error_rms_rad": 0.003 * DEGREE, "nees_per_axis": 0.987},
         "description": [{"name": "inertia", "first_error": 0.0123, "error": 0.00045, "sigma": 0.00067}],
     }  # fmt: skip
@@ -146,8 +147,8 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
         "  error of the star camera's attitude 0.0030 deg rms with stars, NEES per axis 0.99",
         "  estimated parameters, rms (inertia divided by its trace, camera in rad):",
         "  inertia: error 0.012 at the start, 0.00045 at the end, one sigma 0.00067",
-        "  error of the residual dipole in the last ten minutes in sunlight: 13 %",
-        "  error of the residual dipole in the last ten minutes in shadow: 5 %",
+        "  error of the residual dipole in the last 10.0 min in sunlight: 13 %",
+        "  error of the residual dipole in the last 1.5 min in shadow: 5 %",
         "  5 measurements and 6 fixes refused, 7 restarts",
     ]
 

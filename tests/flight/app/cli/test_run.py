@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from flight.app import flight
+from flight.app.cli import to_json
 from flight.app.cli.run import configure, counts_text, progress_on, seed_number, summary_facts, summary_text
 from flight.app.run import RunRequest, RunResult
 from flight.loop.flight_loop import FlightEnding, FlightProgress
@@ -134,3 +135,8 @@ def test_a_seed_that_the_log_cannot_hold_is_refused(text: str) -> None:
 
 def test_the_smallest_and_the_largest_seed_are_accepted() -> None:
     assert (seed_number("0"), seed_number(str(2**64 - 1))) == (0, 2**64 - 1)
+
+
+def test_numbers_of_a_json_result_are_rounded_to_twelve_digits() -> None:
+    facts = {"time_s": 618 * 0.025, "rows": [{"x": 15.450000000000001}], "utc_ns": 1774008001000000000}
+    assert to_json(facts) == '{"time_s": 15.45, "rows": [{"x": 15.45}], "utc_ns": 1774008001000000000}\n'
