@@ -25,7 +25,7 @@ from knightcube.astro.arrays import (
 )
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
 from knightcube.errors import ArgumentError, InputError
-from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole, check_camera
 from knightcube.vision.frame import grey_image
 from knightcube.vision.frame_job import found_in_image
 from knightcube.vision.lens_knowledge import LensKnowledge
@@ -146,7 +146,7 @@ class StarSolution:
         return (
             f"<StarSolution {self.status}: right ascension {self.right_ascension_deg:.4f}, declination "
             f"{self.declination_deg:.4f}, roll {self.roll_deg:.3f} deg, 1 sigma {across:.2g} arcsec, "
-            f"{len(self.stars)} stars>"
+            f"{len(self.stars)} stars{', mirrored' if self.mirrored else ''}>"
         )
 
     @property
@@ -180,9 +180,9 @@ class StarTracker:
     Args:
         fov_deg: field of view between the outer edges of the first and last column, from 1 to 120 deg. If
             `fov_deg` is None, fields from 4 to 60 deg are tried.
-        fov_error_deg: largest error of the field of view, deg. If `fov_error_deg` is None, the error is 5 %
-            of `fov_deg`, or zero for a given `camera`. An error of `fov_deg` below 0.1 % is taken as 0.1 %,
-            because the lens is not calibrated.
+        fov_error_deg: largest error of `fov_deg`, or of the field of view of `camera`, deg. If
+            `fov_error_deg` is None, the error is 5 % of `fov_deg`, or zero for a given `camera`. An error of
+            `fov_deg` below 0.1 % is taken as 0.1 %, because the lens is not calibrated.
         camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`) instead of `fov_deg`.
         settings: settings of detection, identification and attitude estimation. None: the defaults.
         index: a sky index, or the path of a sky index file. None: the default index.
@@ -207,7 +207,11 @@ class StarTracker:
         learn: bool = False,
     ) -> None:
         if fov_deg is not None and camera is not None:
-            raise InputError("fov_deg", "give a field of view or a camera, not both")
+            raise ArgumentError("fov_deg", "give a field of view or a camera, not both")
+        if fov_error_deg is not None and fov_deg is None and camera is None:
+            raise ArgumentError("fov_error_deg", f"{fov_error_deg:g}: give `fov_deg` or `camera` too")
+        if camera is not None:
+            check_camera(camera)
         _check_field_of_view(fov_deg, fov_error_deg)
         self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
         self._settings = SolveSettings() if settings is None else settings

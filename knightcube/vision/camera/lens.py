@@ -29,6 +29,21 @@ from knightcube.errors import ArgumentError, KnightCubeError
 from knightcube.vision.frame import grey_image
 
 
+class LensError(KnightCubeError):
+    """Error raised for a lens with invalid detector size, focal length or distortion parameters.
+
+    The constructors `Lens` and `Pinhole` raise it, with the value and its range.
+    """
+
+
+def _check_detector(columns: int, rows: int, focal_length: float) -> None:
+    """Raise LensError unless the numbers of pixels are positive integers and the focal length is positive."""
+    if not (columns > 0 and rows > 0 and columns % 1 == 0 and rows % 1 == 0):
+        raise LensError(f"{columns} x {rows} pixels: give positive whole numbers")
+    if not 0.0 < focal_length < math.inf:
+        raise LensError(f"focal length {focal_length} px: must be positive and finite")
+
+
 @dataclass(frozen=True, slots=True)
 class Pinhole:
     """An ideal camera without distortion.
@@ -36,15 +51,28 @@ class Pinhole:
     Attributes:
         columns, rows: number of pixels.
         focal_length: focal length, px.
+
+    Raises:
+        LensError: unless the numbers of pixels are positive integers and the focal length is positive.
     """
 
     columns: int
     rows: int
     focal_length: float
 
+    def __post_init__(self) -> None:
+        _check_detector(self.columns, self.rows, self.focal_length)
+
     @classmethod
     def from_field_of_view(cls, columns: int, rows: int, field_of_view: float) -> Pinhole:
-        """Return the camera whose image width spans `field_of_view`, rad, edge to edge (Sease, eq. (2.4))."""
+        """Return the camera whose image width spans `field_of_view`, rad, edge to edge (Sease, eq. (2.4)).
+
+        Raises LensError unless the field of view lies between 0 and pi rad.
+        """
+        if not 0.0 < field_of_view < math.pi:
+            degrees = math.pi <= field_of_view < 180.0
+            hint = f"; {field_of_view:g} deg are {math.radians(field_of_view):.4g} rad" if degrees else ""
+            raise LensError(f"field of view {field_of_view:g} rad: must be between 0 and pi rad{hint}")
         return cls(columns, rows, 0.5 * columns / np.tan(0.5 * field_of_view))
 
     @property
@@ -107,13 +135,6 @@ _MOST_SHAPE = 0.3
 """Largest magnitude of aspect and shear."""
 _MOST_TANGENTIAL, _TANGENTIAL_STEPS = 0.5, 40
 """Largest derivative of the tangential distortion at a corner, and maximum number of inversion iterations."""
-
-
-class LensError(KnightCubeError):
-    """Error raised for a lens with invalid detector size, focal length or distortion parameters.
-
-    The constructors `Lens` and `Pinhole` raise it, with the value and its range.
-    """
 
 
 class CameraModel(Protocol):
@@ -185,10 +206,7 @@ class Lens:
     reach: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not (self.columns > 0 and self.rows > 0 and 0.0 < self.focal_length < np.inf):
-            raise LensError(
-                f"{self.columns} x {self.rows} pixels, focal length {self.focal_length}: must be positive"
-            )
+        _check_detector(self.columns, self.rows, self.focal_length)
         # Python floats are used, because numpy takes ten times as long for single numbers.
         if not all(map(math.isfinite, (*self.centre, self.k1, self.k2))):
             raise LensError(f"centre {self.centre}, k1 {self.k1}, k2 {self.k2}: must be finite")
@@ -384,11 +402,18 @@ def _reach(k1: float, k2: float) -> float:
     return math.sqrt(2.0 / denominator) if denominator > _NO_FOLD else math.inf
 
 
+def check_camera(camera: CameraModel) -> None:
+    """Raise ArgumentError unless `camera` is a `Pinhole` or a `Lens`."""
+    if not isinstance(camera, Pinhole | Lens):
+        raise ArgumentError("camera", f"{camera!r}: give a Pinhole or a Lens")
+
+
 def image_of_camera(image: Image, camera: CameraModel) -> Image:
     """Return an image of a camera as grey values (rows, columns), as `grey_image` does.
 
     Raises ArgumentError unless the image has the size of the camera, and finite real numbers as pixels.
     """
+    check_camera(camera)
     image = grey_image(image)
     check_shape(image, camera)
     return image

@@ -89,6 +89,12 @@ def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_
     assert found[13] == len(expected.stars)
 
 
+def test_the_text_of_a_solution_states_a_mirrored_image(resting: SkyFrame) -> None:
+    tracker = StarTracker(fov_deg=12.0)
+    assert "mirrored" not in repr(tracker.solve(resting.pixels))
+    assert repr(tracker.solve(resting.pixels[::-1])).endswith(" stars, mirrored>")
+
+
 def test_right_ascension_declination_and_roll_are_those_of_the_quaternion(resting: SkyFrame) -> None:
     """The boresight is the third row of the attitude matrix, and north is up at zero roll."""
     solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
@@ -310,8 +316,12 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
         StarTracker(fov_deg=0.5)
     with pytest.raises(InputError, match="-1: give 0 or more degrees"):
         StarTracker(fov_deg=10.0, fov_error_deg=-1.0)
-    with pytest.raises(InputError, match="not both"):
+    with pytest.raises(ArgumentError, match="not both"):
         StarTracker(fov_deg=10.0, camera=lens)
+    with pytest.raises(ArgumentError, match="camera: 'lens': give a Pinhole or a Lens"):
+        StarTracker(camera="lens")  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="fov_error_deg: 2: give `fov_deg` or `camera` too"):
+        StarTracker(fov_error_deg=2.0)
     with pytest.raises(InputError, match=r"none\.index"):
         StarTracker(index=tmp_path / "none.index")
     with pytest.raises(InputError, match="48 x 64 pixels, but the camera has 64 x 48"):

@@ -122,6 +122,42 @@ def test_terms_that_no_lens_has_are_refused(terms: dict[str, float], complaint: 
         Lens(1000, 800, 1000.0, (499.5, 399.5), **terms)
 
 
+@pytest.mark.parametrize(
+    ("size", "focal_length", "complaint"),
+    [
+        ((1024, 768), -5.0, r"focal length -5\.0 px: must be positive and finite"),
+        ((1024, 768), np.nan, "focal length nan px"),
+        ((1024, 768), np.inf, "focal length inf px"),
+        ((0, 768), 900.0, "0 x 768 pixels: give positive whole numbers"),
+        ((1024, -768), 900.0, "1024 x -768 pixels"),
+        ((512.5, 768), 900.0, "512.5 x 768 pixels"),
+    ],
+)
+def test_a_detector_that_cannot_exist_is_refused(
+    size: tuple[int, int], focal_length: float, complaint: str
+) -> None:
+    with pytest.raises(LensError, match=complaint):
+        Pinhole(*size, focal_length)
+    with pytest.raises(LensError, match=complaint):
+        Lens(*size, focal_length, (511.5, 383.5))
+
+
+@pytest.mark.parametrize(
+    ("field", "complaint"),
+    [
+        (11.4, r"11\.4 rad: must be between 0 and pi rad; 11\.4 deg are 0\.199 rad"),
+        (20.0, r"20 deg are 0\.3491 rad"),
+        (0.0, "field of view 0 rad: must be between 0 and pi rad$"),
+        (-0.3, "field of view -0.3 rad"),
+        (np.nan, "field of view nan rad"),
+        (np.inf, "field of view inf rad: must be between 0 and pi rad$"),
+    ],
+)
+def test_a_field_of_view_beyond_half_a_turn_is_refused(field: float, complaint: str) -> None:
+    with pytest.raises(LensError, match=complaint):
+        Pinhole.from_field_of_view(1024, 768, field)
+
+
 def test_an_invalid_pixel_does_not_affect_the_others() -> None:
     lens = Lens(1024, 768, 1000.0, (511.5, 383.5), 0.2, 0.1)
     vectors = lens.unit_vectors(np.array([[np.nan, 5.0], [1000.0, 700.0]]))
