@@ -37,13 +37,17 @@ class SunSettings:
 
     At a given exposure, the bright disc of the Sun, including its glare, has a fixed radius. The radius
     limits should differ from the radius of the disc with its glare by about a fifth. If the radius limits are
-    wider, a cloud may be mistaken for the Sun. The default values fit a logarithmic camera like the Fuga 15d;
-    `LINEAR` fits a linear camera in which white clouds are close to saturation.
+    wider, a cloud may be mistaken for the Sun. The default values fit a logarithmic 8-bit camera like the
+    Fuga 15d: 200 of 255 counts, and a disc of 0.35 to 0.6 deg. `LINEAR` fits a linear 8-bit camera in which
+    white clouds are close to saturation: 200 of 255 counts, and a disc of 1.3 to 2.0 deg. The settings of
+    another linear camera are `replace(LINEAR, level=...)`, because `SunSettings(level=...)` has the radius
+    limits of a logarithmic camera.
 
     Attributes:
-        level: threshold of the Sun's image, counts. For a logarithmic camera, the threshold is well above the
-            brightest cloud, so that only the disc of the Sun exceeds it. For a linear camera, the threshold
-            is slightly below saturation.
+        level: threshold of the Sun's image, in the unit of the pixel values. For a logarithmic camera, the
+            threshold is well above the brightest cloud, so that only the disc of the Sun exceeds it. For a
+            linear camera, the threshold is slightly below saturation, such as 60,000 for 16 bits or 0.9 for
+            pixel values up to 1.
         stride: distance between the rows that are read first, px.
         least_radius: radius below which a bright patch is a hot pixel, rad; the Sun's is 0.0047 rad.
         greatest_radius: radius above which a bright patch counts as a cloud or the Earth, rad.
@@ -85,7 +89,10 @@ class SunSettings:
 
 
 LINEAR = SunSettings(least_radius=math.radians(1.3), greatest_radius=math.radians(2.0))
-"""Settings for a linear 8-bit camera, with 200 counts for matt white and 1 % of scattered light."""
+"""Settings for a linear 8-bit camera, with 200 of 255 counts for matt white and 1 % of scattered light.
+
+The scattered light of the Sun exceeds 200 counts up to 1.3 to 2.0 deg from its centre.
+"""
 
 
 class SunStatus(Enum):
@@ -181,10 +188,13 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     Args:
         image: pixel values (rows, columns) of any integer or floating type. Larger values are brighter.
         camera: camera model (`Pinhole` or `Lens` of `knightcube.vision.camera.lens`) of the image's size.
-        settings: settings of the search. If `settings` is None, `LINEAR` for a linear 8-bit camera is used.
+        settings: settings of the search. If `settings` is None, `LINEAR` for a linear camera of 0 to 255
+            counts is used. For another range of pixel values, give `replace(LINEAR, level=...)` with a level
+            slightly below saturation.
 
     Raises:
-        ValueError: if the image does not have the size of the camera, or has non-finite pixels.
+        ArgumentError: if the image does not have the size of the camera, or if its pixels are not finite
+            numbers.
     """
     settings = LINEAR if settings is None else settings
     image = image_of_camera(image, camera)
@@ -193,9 +203,9 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     reach = settings.greatest_radius * camera.focal_length * stretch
     # A truncated disc with less than half of its width visible is excluded, because its edge is too short.
     narrowest = settings.least_radius * camera.focal_length - settings.stride
-    patches, wide = _bright_patches(image, settings, narrowest, 2.0 * reach)
+    patches, wide, narrow = _bright_patches(image, settings, narrowest, 2.0 * reach, camera.focal_length)
     read = camera.columns * len(range(settings.stride // 2, camera.rows, settings.stride))
-    reasons = ["a patch larger than the Sun and its glare"] if wide else []
+    reasons = [wide] if wide else []
     found: list[SunMeasurement] = []
     for middle, half in patches:
         # Spokes of twice the radius plus a margin are searched, because the centre may lie outside the image.
@@ -210,26 +220,27 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         else:
             found.append(_measurement(disc, camera, settings))
     if not found:
-        if reasons:
-            return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
-        return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
+        if reasons or narrow:
+            return SunSolution(SunStatus.NOT_THE_SUN, [*reasons, narrow][0], None, read)
+        return SunSolution(SunStatus.NO_SUN, _nothing_bright(image, settings), None, read)
     # If several bright patches are round, the largest patch is taken as the Sun.
     sun = max(found, key=lambda one: one.radius)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
 
 def _bright_patches(
-    image: Image, settings: SunSettings, narrowest: float, widest: float
-) -> tuple[list[tuple[FloatArray, float]], bool]:
+    image: Image, settings: SunSettings, narrowest: float, widest: float, focal_length: float
+) -> tuple[list[tuple[FloatArray, float]], str, str]:
     """Return centre (2,), px, and half extent, px, of the bright patches, the largest first.
 
     Only every `stride`th row is read. Patches narrower than `narrowest` px or wider than `widest` px are
-    excluded. The second returned value states whether a patch was excluded as too wide.
+    excluded. The two texts describe the largest patches that are too wide and too narrow, and are empty
+    without such a patch.
     """
     stride = settings.stride
     bright = image[stride // 2 :: stride] >= settings.level
     if not bright.any():
-        return [], False
+        return [], "", ""
     # Only the smallest rectangle around all bright pixels is labelled, which saves computing time.
     down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
     top, left = int(down[0]), int(across[0])
@@ -237,19 +248,41 @@ def _bright_patches(
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     boxes = find_objects(labels)
     patches: list[tuple[FloatArray, float]] = []
-    wide = False
+    wide = narrow = ""
     for patch in np.argsort(-sizes, kind="stable").tolist():
         if sizes[patch] < _LEAST_PATCH or len(patches) == _MOST_PATCHES:
             break
         box = boxes[patch]
         extent = max((box[0].stop - box[0].start) * stride, box[1].stop - box[1].start)
-        wide = wide or extent > widest
         if not narrowest <= extent <= widest:
+            text = f"{_off_limits(0.5 * extent / focal_length, settings)} {extent} px wide"
+            wide, narrow = (wide, narrow or text) if extent < narrowest else (wide or text, narrow)
             continue
         y, x = np.nonzero(labels[box] == patch + 1)
         y, x = y + box[0].start + top, x + box[1].start + left
         patches.append((np.array([x.mean(), stride // 2 + stride * y.mean()]), 0.5 * extent))
-    return patches, wide
+    return patches, wide, narrow
+
+
+def _off_limits(radius: float, settings: SunSettings) -> str:
+    """Return the reason why a patch of `radius`, rad, is not the Sun, with the setting that excludes it."""
+    text = f"a patch of {math.degrees(radius):.2f} deg radius at level {settings.level:g},"
+    if radius < settings.least_radius:
+        return f"{text} smaller than `least_radius` of {math.degrees(settings.least_radius):.2f} deg,"
+    text = f"{text} larger than `greatest_radius` of {math.degrees(settings.greatest_radius):.2f} deg"
+    if settings.greatest_radius < LINEAR.least_radius <= radius <= LINEAR.greatest_radius:
+        return f"{text} (for a linear camera use replace(LINEAR, level={settings.level:g})),"
+    return f"{text} (set `level` just below saturation, or expose for a shorter time),"
+
+
+def _nothing_bright(image: Image, settings: SunSettings) -> str:
+    """Return the reason why an image without patches of the size of the Sun has no Sun."""
+    level, highest = settings.level, float(image[settings.stride // 2 :: settings.stride].max())
+    if highest >= level:
+        return f"fewer than {_LEAST_PATCH} adjacent pixels reach the level of {level:g}, as hot pixels do"
+    return (
+        f"the largest pixel value, {highest:.6g}, is below the level of {level:g}: set `level` of SunSettings"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -367,11 +400,8 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     """Return the reason why the disc is not the Sun, or an empty string."""
     circle, rim = disc.circle, disc.rim
     used = int(np.count_nonzero(circle.used))
-    radius = np.degrees(circle.radius)
-    if circle.radius < settings.least_radius:
-        return f"a patch of {radius:.2f} deg radius, too small,"
-    if circle.radius > settings.greatest_radius:
-        return f"a patch of {radius:.2f} deg radius, too large,"
+    if not settings.least_radius <= circle.radius <= settings.greatest_radius:
+        return _off_limits(circle.radius, settings)
     if used < settings.least_agreement * (len(rim.points) + rim.endless):
         return f"an edge on the circle in only {used} of {len(rim.points) + rim.endless} directions"
     if used * 2.0 * np.pi / _SPOKES < settings.least_arc:

@@ -5,6 +5,7 @@ Solar strings select the camera that is read. If no camera finds the Sun, the st
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -221,6 +222,56 @@ def test_patches_that_are_too_small_too_large_or_not_round_are_refused_with_a_re
     assert find_sun(_disc_frame(3.0), CAMERA, SunSettings()).status is SunStatus.FOUND
 
 
+def _sun_frame(radius_deg: float, sky: float, disc: float) -> FloatArray:
+    """Return an image of `CAMERA` with a disc of `radius_deg` around pixel (256, 200)."""
+    y, x = np.mgrid[0:512, 0:512] - np.array([200.0, 256.0])[:, None, None]
+    inside = np.clip(np.radians(radius_deg) * CAMERA.focal_length + 0.5 - np.hypot(x, y), 0.0, 1.0)
+    return np.asarray(sky + (disc - sky) * inside)
+
+
+@pytest.mark.parametrize(
+    ("frame", "settings", "reason"),
+    [
+        (
+            _sun_frame(1.6, 0.05, 1.0),
+            None,
+            "the largest pixel value, 1, is below the level of 200: set `level`",
+        ),
+        (
+            _sun_frame(1.6, 900.0, 6e4),
+            None,
+            r"deg radius at level 200, larger than `greatest_radius` of 2\.00 deg",
+        ),
+        (
+            _sun_frame(0.3, 20.0, 250.0),
+            None,
+            r"at level 200, smaller than `least_radius` of 1\.30 deg, \d px wide",
+        ),
+        (_sun_frame(1.6, 900.0, 6e4), SunSettings(level=5e4), r"use replace\(LINEAR, level=50000\)"),
+        (
+            np.where(np.arange(512**2).reshape(512, 512) == 512 * 100 + 7, 255.0, 9.0),
+            None,
+            "fewer than 3 adjacent pixels reach the level of 200",
+        ),
+    ],
+)
+def test_the_reason_names_the_setting_that_excludes_the_sun(
+    frame: FloatArray, settings: SunSettings | None, reason: str
+) -> None:
+    found = find_sun(frame, CAMERA, settings)
+    assert not found
+    assert re.search(reason, found.reason), found.reason
+
+
+@pytest.mark.parametrize(("sky", "disc", "level"), [(900.0, 6e4, 5e4), (0.05, 1.0, 0.9)])
+def test_the_level_of_the_linear_settings_fits_other_ranges_of_pixel_values(
+    sky: float, disc: float, level: float
+) -> None:
+    found = find_sun(_sun_frame(1.6, sky, disc), CAMERA, replace(LINEAR, level=level))
+    assert found.sun is not None
+    assert np.hypot(*(found.sun.point - [256.0, 200.0])) < 0.2
+
+
 def test_an_empty_and_a_full_frame_have_no_sun() -> None:
     dark = find_sun(np.zeros((512, 512), dtype=np.uint8), CAMERA, SunSettings())
     assert dark.status is SunStatus.NO_SUN
@@ -289,7 +340,7 @@ def test_the_solar_strings_give_the_direction_if_no_camera_finds_the_sun(
     sigma = float(np.sqrt(0.5 * np.trace(found.covariance)))
     assert np.radians(0.5) < sigma < np.radians(6.0)
     assert off < 4.0 * sigma
-    assert "camera 1: nothing reaches 200 counts" in found.reason
+    assert "is below the level of 200" in found.reason
 
 
 def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthScene, Image]) -> None:
@@ -460,9 +511,14 @@ def test_a_disc_is_refused_beyond_each_limit() -> None:
     spokes = sun_module._SPOKES
     assert _disc(0.45, spokes, spokes, 0, 0.1, 1.0) == ""
     assert _disc(0.351, spokes, spokes, 0, 0.1, 1.0) == ""
-    assert _disc(0.349, spokes, spokes, 0, 0.1, 1.0) == "a patch of 0.35 deg radius, too small,"
+    assert _disc(0.349, spokes, spokes, 0, 0.1, 1.0) == (
+        "a patch of 0.35 deg radius at level 200, smaller than `least_radius` of 0.35 deg,"
+    )
     assert _disc(0.599, spokes, spokes, 0, 0.1, 1.0) == ""
-    assert _disc(0.62, spokes, spokes, 0, 0.1, 1.0) == "a patch of 0.62 deg radius, too large,"
+    assert _disc(0.62, spokes, spokes, 0, 0.1, 1.0) == (
+        "a patch of 0.62 deg radius at level 200, larger than `greatest_radius` of 0.60 deg "
+        "(set `level` just below saturation, or expose for a shorter time),"
+    )
     few = int(0.54 * spokes)
     assert (
         _disc(0.45, few, spokes, 0, 0.1, 1.0) == f"an edge on the circle in only {few} of {spokes} directions"
