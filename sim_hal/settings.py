@@ -64,7 +64,7 @@ class TipOff(Section, frozen=True, kw_only=True):
     random.
     """
 
-    speed: NotNegative = 0.1745
+    speed: Annotated[float, Meta(ge=0.0, le=3.5, description="rad/s")] = 0.1745
     rate: Vector | None = None
     attitude: Quaternion | None = None
 

@@ -349,7 +349,8 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
             )
             raise ConfigError(f"{key}.spi", problem)
         axes: dict[str, FloatArray] = {
-            quantity: axis_matrix(names) for quantity, names in sensor.measures.items()
+            quantity: _axes_of(f"{key}.measures.{quantity}", quantity, names)
+            for quantity, names in sensor.measures.items()
         }
         parts.append(SensorPart(sensor.part, partial(_started, part, rig, sensor), axes))
         measured |= set(axes)
@@ -358,6 +359,19 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
             f"{kind}.sensors", "do not measure the magnetic field: add a sensor that measures `magnetic`"
         )
     return SensorUnit(rig.clock, parts, UnitSettings(**_common_settings(unit)))
+
+
+def _axes_of(key: str, quantity: str, names: Sequence[str]) -> FloatArray:
+    """Return the matrix (3, 3) from sensor to unit axes. Raises ConfigError for axes that no sensor has."""
+    matrix, given = axis_matrix(names), f"is [{', '.join(names)}]"
+    if not np.abs(matrix).sum(axis=0).all():
+        raise ConfigError(key, f"{given}: name each of the sensor's axes x, y and z once")
+    # Some magnetometers have left-handed axes.
+    if quantity != "magnetic" and np.linalg.det(matrix) < 0.0:
+        raise ConfigError(
+            key, f"{given}: these axes are left-handed: change the sign of one axis, or swap two"
+        )
+    return matrix
 
 
 def _started(part: Callable[..., Any], rig: Rig, sensor: Sensor) -> Any:

@@ -144,6 +144,9 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
             key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
             most = f"the supply can drive only {reached:.3g} A through {coil.resistance:g} ohm"
             refuse(key, f"is {limit:g}: {most}")
+        if reached > _MOST_SURPLUS * limit:
+            more = f"the supply would drive {reached:.3g} A, more than {_MOST_SURPLUS:g} times the limit"
+            refuse(f"{place}.resistance", f"is {coil.resistance:g}: {more} of {limit:g} A: give ohm and A")
     try:
         slots = coils.slots
     except UsageError as error:
@@ -169,9 +172,44 @@ def _check_craft(craft: Craft, refuse: Refuse) -> None:
             refuse("craft.centre_of_mass", f"is {offset:g} m along {axis}: outside the box of {edge:g} m")
 
 
+# Limits of the density of a satellite, kg/m^3: an inflated balloon, and platinum.
+_DENSITIES = (5.0, 20_000.0)
+# Largest ratio of moments of inertia to those of the same mass at the corners of the body, for long booms.
+_MOST_SPREAD = 10.0
+# Smallest ratio of moments of inertia to those of a homogeneous body.
+_LEAST_INERTIA = 0.05
+# Largest dipole moment of a coil per kg of the satellite, A m^2/kg: a tenth of the mass is saturated iron.
+_MOST_DIPOLE = 20.0
+# Largest ratio of the current that the supply can drive to the limit of the current.
+_MOST_SURPLUS = 100.0
+
+
+def _check_units(craft: Craft, coils: Coils, refuse: Refuse) -> None:
+    """Refuse values that no satellite has, which are probably given in another unit."""
+    low, high = _DENSITIES
+    volume, square = math.prod(craft.size), sum(edge * edge for edge in craft.size)
+    box = f"a box of {' x '.join(f'{edge:g}' for edge in craft.size)} m"
+    mass, trace = craft.mass, float(np.trace(craft.inertia_matrix()))
+    if mass is not None and not low <= mass / volume <= high:
+        density = f"a density of {mass / volume:.3g} kg/m^3, not {low:g} to {high:g}"
+        refuse("craft.mass", f"is {mass:g}: in {box} (`craft.size`) this is {density}: give kg and m")
+    heaviest = mass or high * volume
+    most, least = _MOST_SPREAD * heaviest * square / 2.0, _LEAST_INERTIA * (mass or 0.0) * square / 6.0
+    if not least <= trace <= most:
+        limits = f"{heaviest:.3g} kg in {box} have {least:.2g} to {most:.2g}"
+        refuse("craft.inertia", f"has moments with a sum of {trace:.4g} kg m^2, but {limits}: give kg m^2")
+    for index, coil in enumerate(coils.windings):
+        dipole = coil.strength() * (coil.current_limit or coils.current_limit)
+        if dipole > _MOST_DIPOLE * heaviest:
+            limit = f"more than {_MOST_DIPOLE * heaviest:.3g} A m^2, the most for {heaviest:.3g} kg"
+            cure = "give m^2 for `area` and `dipole_per_ampere`, and A for `current_limit`"
+            refuse(f"coils.windings[{index}]", f"has a dipole moment of {dipole:.4g} A m^2, {limit}: {cure}")
+
+
 def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
     _check_satellite_coils(config.coils, refuse)
     _check_craft(config.craft, refuse)
+    _check_units(config.craft, config.coils, refuse)
     times = [step.at for step in config.targets]
     _check_order("targets", times, refuse)
     for index, step in enumerate(config.targets):

@@ -1,4 +1,4 @@
-"""Tests that the check of real devices closes each opened device, whether or not the device responds."""
+"""Tests of the opening of devices: closed after a check, and sensors with possible axes only."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from unittest.mock import Mock
 import pytest
 
 from flight.app import devices
+from flight.schema.devices import Sensor, SensorsSection
+from flight.schema.document import ConfigError
 from hal.interfaces.errors import NotResponding
 
 
@@ -27,3 +29,25 @@ def test_sensors_that_were_opened_to_be_checked_are_closed(
         with pytest.raises(NotResponding):
             devices.probe_sensors(Mock(), section)
     unit.close.assert_called_once_with()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "names", "problem"),
+    [
+        ("magnetic", ("x", "y", "y"), r"is \[x, y, y\]: name each of the sensor's axes x, y and z once"),
+        ("gyro", ("x", "-x", "z"), "name each of the sensor's axes"),
+        ("gyro", ("x", "y", "-z"), "these axes are left-handed"),
+        ("acceleration", ("y", "x", "z"), "these axes are left-handed"),
+        ("magnetic", ("x", "y", "-z"), ""),
+        ("gyro", ("-y", "x", "z"), ""),
+    ],
+)
+def test_axes_that_no_sensor_has_are_refused(quantity: str, names: tuple[str, ...], problem: str) -> None:
+    measures = cast(Any, {"magnetic": ("x", "y", "z")} | {quantity: names})
+    section = SensorsSection(sensors=(Sensor(part="icm20948", measures=measures),))
+    if not problem:
+        devices.open_sensors(Mock(), section)
+        return
+    with pytest.raises(ConfigError, match=problem) as caught:
+        devices.open_sensors(Mock(), section)
+    assert caught.value.where == f"inertial_unit.sensors[0].measures.{quantity}"

@@ -405,6 +405,35 @@ def test_a_mistake_in_the_coils_gets_one_line(wrong: str, complaint: str) -> Non
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong", "complaint"),
+    [
+        (
+            "mass: 0.611",
+            "mass: 611",
+            r"`craft.mass` is 611: .* of 6.11e\+05 kg/m\^3.*: give kg and m",
+        ),
+        ("size: [0.1, 0.1, 0.1]", "size: [100, 100, 100]", r"`craft.mass` is 0.611: in a box of 100 x 100 x"),
+        ("inertia: [1.10e-3,", "inertia: [1.0, 1.0, 1.0]  # [", r"`craft.inertia` has .* sum of 3 kg m\^2"),
+        ("inertia: [1.10e-3,", "inertia: [1e-6, 1e-6, 1e-6]  # [", r"`craft.inertia` has .* sum of 3e-06 kg"),
+        (
+            COIL,
+            "{axis: [0, 0, 1], turns: 80, area: 81, resistance: 23.0}",
+            r"windings\[\d\]` has a .* of 959",
+        ),
+        (
+            COIL,
+            "{axis: [0, 0, 1], dipole_per_ampere: 0.648, resistance: 0.023}",
+            r"resistance` is 0.023: .* A:",
+        ),
+    ],
+)
+def test_values_in_another_unit_are_refused_with_the_unit(right: str, wrong: str, complaint: str) -> None:
+    assert right in ORBIT
+    with pytest.raises(ConfigError, match=complaint):
+        reader.parse(ORBIT.replace(right, wrong, 1), "orbit.yaml")
+
+
 def test_a_rod_and_an_air_coil_have_their_own_limits_and_strengths() -> None:
     air = "{axis: [0.0, 0.0, 2.0], turns: 80, area: 0.0081, resistance: 40.0, current_limit: 0.05}"
     coils = as_orbit(reader.parse(ORBIT.replace(COIL, air, 1))).coils
