@@ -219,9 +219,15 @@ def test_an_overexposed_image_and_an_empty_one_are_named(image: Image, reason: s
         ({"rate": np.full(3, np.nan), "exposure": 0.2}, "rate: [nan, nan, nan]: give finite numbers"),
         ({"rate": 0.1, "exposure": 0.2}, "rate: an array of shape (): give finite numbers of shape (3,)"),
         ({"rate": [0.1, 0.0, 0.0]}, "exposure: None: a predicted rate needs the exposure time"),
-        ({"rate_sigma": -1.0}, "rate_sigma: -1.0: give a standard deviation of 0 rad/s or more"),
-        ({"attitude_sigma": -1.0}, "attitude_sigma: -1.0: give a standard deviation of 0 rad or more"),
-        ({"attitude_sigma": math.nan}, "attitude_sigma: nan"),
+        (
+            {"rate": np.zeros(3), "rate_sigma": -1.0},
+            "rate_sigma: -1.0: give a standard deviation of 0 rad/s or more",
+        ),
+        (
+            {"attitude": np.eye(4)[3], "attitude_sigma": -1.0},
+            "attitude_sigma: -1.0: give a standard deviation of 0 rad or more",
+        ),
+        ({"attitude": np.eye(4)[3], "attitude_sigma": math.nan}, "attitude_sigma: nan"),
         ({"attitude": np.zeros(4)}, "give a quaternion of unit length, scalar last"),
         ({"attitude": np.full(4, np.nan)}, "attitude: [nan, nan, nan, nan]: give finite numbers"),
         (
