@@ -360,11 +360,12 @@ def found_in_image(
     `lens` are estimated from earlier images of the camera, or None if they are not estimated.
     """
     pixels, unit, zero = raw_counts(pixels)
-    settings = replace(
-        settings,
-        detection=settings.detection.in_units_of(unit, zero),
-        likelihood=settings.likelihood.in_units_of(unit, zero),
-    )
+    if unit != 1.0 or zero != 0.0:
+        settings = replace(
+            settings,
+            detection=settings.detection.in_units_of(unit, zero),
+            likelihood=settings.likelihood.in_units_of(unit, zero),
+        )
     tracker = TrackerSettings(settings, scale)
     # A rate with a large uncertainty is accepted, because the attitude depends only on the star positions.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
