@@ -217,6 +217,8 @@ class StarTracker:
         self._settings = SolveSettings() if settings is None else settings
         self._learn = learn
         self.lens: LensKnowledge | None = None
+        if not isinstance(index, SkyIndex | Path | str | None):
+            raise ArgumentError("index", f"{index!r}: give a SkyIndex or the path of a sky index file")
         if index is None:
             self._index = default_index()
         else:

@@ -166,6 +166,14 @@ class SunSolution:
         """Return whether the Sun was found."""
         return self.sun is not None
 
+    def __repr__(self) -> str:
+        """Return one line of text: status, direction and uncertainty, or the reason."""
+        if self.sun is None:
+            return f"<SunSolution {self.status.value}: {self.reason}>"
+        direction = ", ".join(f"{value:.5f}" for value in self.sun.direction)
+        sigma = math.degrees(self.sun.sigma)
+        return f"<SunSolution {self.status.value}: direction [{direction}], 1 sigma {sigma:.2g} deg>"
+
 
 _MOST_PATCHES = 4
 """Maximum number of bright patches that are examined, starting with the largest."""

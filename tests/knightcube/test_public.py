@@ -18,7 +18,10 @@ import pytest
 import knightcube
 from knightcube import LensCalibration, SingleAxisPlant, StarTracker, plan_step
 from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement
+from knightcube.vision.objects.detect import DetectedObjects, SpaceObject
+from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.sun import SunMeasurement, SunSolution, SunStatus
 
 
 def _names_for_type_checkers() -> set[tuple[str, str]]:
@@ -65,6 +68,13 @@ def test_every_error_in_a_public_docstring_can_be_caught_by_its_public_name(name
 
 
 NADIR = NadirMeasurement(np.array([0.6, 0.0, 0.8]), 1e-6 * np.eye(3), 5e5, 1e3, 0.1, used=90)
+NONE = np.empty((0, 3))
+OBJECT = SpaceObject(
+    np.array([[10.0, 30.0], [30.0, 30.0]]), np.ones(2), (), 1e4, 500.0, 0.01, np.array([1.0, 0.0]), 0.1
+)
+SUN = SunMeasurement(
+    np.array([0.6, 0.0, 0.8]), np.eye(3)[:2], 1e-6 * np.eye(2), np.zeros(2), 0.03, 0.1, 6.0, cut=False
+)
 PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.9e-4, resistance=23.0, current_limit=0.148)
 
 
@@ -88,6 +98,21 @@ PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.9e-4, resistance=23.0
         (
             lambda: HorizonSolution(HorizonStatus.NO_HORIZON, "all dark"),
             "<HorizonSolution no-horizon: all dark>",
+        ),
+        (lambda: DetectedObjects((), NONE, np.empty((0, 3, 3)), "dark"), "<DetectedObjects: dark>"),
+        (lambda: DetectedObjects((), NONE, np.empty((0, 3, 3))), "<DetectedObjects: 0 objects>"),
+        (
+            lambda: DetectedObjects((OBJECT,), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3, 3))),
+            r"<DetectedObjects: 1 objects at pixels \(20.0, 30.0\)>",
+        ),
+        (lambda: SunSolution(SunStatus.NO_SUN, "all dark"), "<SunSolution no-sun: all dark>"),
+        (
+            lambda: SunSolution(SunStatus.FOUND, sun=SUN),
+            r"<SunSolution found: direction \[0.60000, 0.00000, 0.80000\], 1 sigma 0.057 deg>",
+        ),
+        (
+            default_index,
+            r"<SkyIndex: <GuideStars: \d+ stars to V 8.5, epoch 2026.5>, <TriangleIndex: \d+ triangles>>",
         ),
         (
             lambda: plan_step(PLANT, start_angle=0.0, end_angle=0.5, horizon=15.0),

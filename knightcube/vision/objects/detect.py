@@ -759,6 +759,14 @@ class DetectedObjects:
         """Return whether the image shows an object."""
         return len(self.objects) > 0
 
+    def __repr__(self) -> str:
+        """Return one line of text: the positions of the three brightest objects, or the reason."""
+        if self.reason:
+            return f"<DetectedObjects: {self.reason}>"
+        middles = [item.endpoints.mean(axis=0) for item in self.objects[:3]]
+        pixels = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in middles)
+        return f"<DetectedObjects: {len(self.objects)} objects{' at pixels ' + pixels if pixels else ''}>"
+
 
 # Number of positions along each side of an image that are tested for a star that remains in the image.
 _TESTED_STARS = 33

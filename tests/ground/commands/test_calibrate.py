@@ -299,6 +299,9 @@ def test_a_camera_of_a_configuration_gives_field_and_resolution(tmp_path: Path) 
         (("--fov", "1"), "2 to 120 deg"),
         (("--fov", "20", "--faintest", "nan"), "finite"),
         (("--fov", "20", "--faintest", "-9"), "stars to V -9"),
+        (("--fov", "20", "--faintest", "2"), "48 stars to V 2, a mean of 0.5 in a field of 20 deg"),
+        (("--fov", "20", "--faintest", "12"), "faintest: 12: give a V magnitude up to 8.5"),
+        (("--fov", "20", "--epoch", "1e6"), "epoch: 1e+06: give a Julian year from 1900 to 2200"),
         (("--fov", "20", "--faintest", "4", "--out", "/proc/nowhere/x.index"), "cannot be written"),
     ],
 )

@@ -154,6 +154,11 @@ class GuideStars:
     def __len__(self) -> int:
         return len(self.hip)
 
+    def __repr__(self) -> str:
+        """Return the number of stars, the magnitude of the faintest, and the epoch, without the arrays."""
+        faintest = f" to V {self.magnitude[-1]:.1f}" if len(self) else ""
+        return f"<GuideStars: {len(self)} stars{faintest}, epoch {self.epoch:.6g}>"
+
     def brighter_than(self, magnitude: float) -> GuideStars:
         """Return the stars with V magnitudes below `magnitude`, as views of the same arrays."""
         count = int(np.searchsorted(self.magnitude, magnitude, side="left"))
@@ -243,6 +248,10 @@ class TriangleIndex:
 
     def __len__(self) -> int:
         return len(self.entry)
+
+    def __repr__(self) -> str:
+        """Return the number of triangles, without the arrays."""
+        return f"<TriangleIndex: {len(self)} triangles>"
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
@@ -457,6 +466,10 @@ class SkyIndex:
     motion: npt.NDArray[np.float32]
     triangles: TriangleIndex
 
+    def __repr__(self) -> str:
+        """Return the numbers of stars and triangles, without the arrays."""
+        return f"<SkyIndex: {self.stars!r}, {self.triangles!r}>"
+
     @cached_property
     def coarse(self) -> npt.NDArray[np.float32]:
         """The unit vectors to the guide stars as (3, n), float32, for a fast search near a boresight."""
@@ -490,8 +503,8 @@ class SkyIndex:
         return SkyIndex(stars, self.motion, self.triangles)
 
 
-def save(sky: SkyIndex, path: Path) -> None:
-    """Write the sky index atomically to the file `path`."""
+def save(sky: SkyIndex, path: Path | str) -> None:
+    """Write the sky index atomically to the file `path`. Raises OSError if the file cannot be written."""
     columns: Columns = {
         "hip": sky.stars.hip,
         "direction": sky.stars.direction.astype(np.float32),
@@ -500,15 +513,15 @@ def save(sky: SkyIndex, path: Path) -> None:
     }
     for field in fields(sky.triangles):
         columns[field.name] = np.asarray(getattr(sky.triangles, field.name))
-    save_table(path, KIND, columns, {"epoch": sky.stars.epoch})
+    save_table(Path(path), KIND, columns, {"epoch": sky.stars.epoch})
 
 
-def load(path: Path = PATH) -> SkyIndex:
+def load(path: Path | str = PATH) -> SkyIndex:
     """Return the sky index in a file; the triangles are memory-mapped.
 
     Raises InputError if the file is missing, damaged, or of another version.
     """
-    columns, facts = load_table(path, KIND)
+    columns, facts = load_table(Path(path), KIND)
     direction: FloatArray = columns["direction"].astype(np.float64)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     stars = GuideStars(columns["hip"], direction, columns["magnitude"] / 1000.0, facts["epoch"])

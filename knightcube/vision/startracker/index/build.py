@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro import catalogue
-from knightcube.errors import InputError, UsageError
+from knightcube.errors import ArgumentError, InputError, UsageError
 from knightcube.vision.startracker.index import (
     PATH,
     GuideStars,
@@ -55,19 +55,52 @@ class IndexSettings:
     density: float = 7.5
     few: int = 5
 
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for a value that is out of range."""
+        if not self.faintest <= _FAINTEST:
+            raise ArgumentError(
+                "faintest",
+                f"{self.faintest:g}: give a V magnitude up to {_FAINTEST:g}, the catalogue's limit",
+            )
+        if not _EPOCHS[0] <= self.epoch <= _EPOCHS[1]:
+            raise ArgumentError(
+                "epoch", f"{self.epoch:g}: give a Julian year from {_EPOCHS[0]:g} to {_EPOCHS[1]:g}"
+            )
+        if not 0.0 < self.smallest < self.largest < np.pi:
+            raise ArgumentError(
+                "smallest", f"{self.smallest:g} rad, largest {self.largest:g} rad: give increasing angles"
+            )
+        if not 0.0 <= self.resolution < self.smallest:
+            raise ArgumentError(
+                "resolution",
+                f"{self.resolution:g} rad: give 0 to {self.smallest:g} rad, the smallest triangle",
+            )
+
     @classmethod
     def of_field(cls, fov: float, pixel: float | None = None) -> IndexSettings:
         """Return the settings for a camera with the field of view `fov`, rad, and pixels of `pixel` rad.
 
-        Raises UsageError if the field of view is below 2 deg or above 120 deg.
+        Raises UsageError if the field of view is below 2 deg or above 120 deg, or if a pixel is not smaller
+        than a sixteenth of the field of view.
         """
         if not _NARROWEST <= fov <= _WIDEST:
             raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index can serve 2 to 120 deg")
+        if pixel is not None and not 0.0 < pixel < _WIDEST_PIXEL * fov:
+            raise ArgumentError(
+                "pixel", f"{pixel:g} rad: give more than 0 and less than a sixteenth of `fov`"
+            )
         longest = min(fov, DEFAULT.largest)
         resolution = DEFAULT.resolution if pixel is None else _RESOLVED_PIXELS * pixel
         return cls(smallest=_SMALLEST_SHARE * longest, largest=longest, resolution=resolution)
 
 
+# Limit of the catalogue (V), and range of epochs (Julian years) in which the proper motions are valid.
+_FAINTEST, _EPOCHS = 8.5, (1900.0, 2200.0)
+# Largest size of a pixel, relative to the field of view.
+_WIDEST_PIXEL = 1.0 / 16.0
+# Minimum mean number of guide stars in a square with the size of the largest triangle.
+# In a field with a mean of two stars, one image in seven shows the four stars that a fix needs.
+_LEAST_PER_FIELD = 2.0
 _NARROWEST, _WIDEST = float(np.deg2rad(2.0)), float(np.deg2rad(120.0))
 # Ratio of the smallest to the largest triangle in the index for a given field of view.
 _SMALLEST_SHARE = 0.2
@@ -80,15 +113,24 @@ _REFERENCE_SIZE = float(np.deg2rad(2.5))
 
 
 def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
-    """Return the sky index of the star catalogue.
+    """Return the sky index of the star catalogue, in some seconds.
 
-    Raises UsageError if the index would contain too many or too few stars.
+        sky = build(replace(IndexSettings.of_field(fov), faintest=6.5))
+
+    Raises UsageError if the index would contain too many stars, or so few stars that an image rarely shows
+    the four stars that a fix needs.
     """
     stars = catalogue.load()
     guide_stars = choose_guide_stars(stars, settings.faintest, settings.epoch, settings.resolution)
     if not 3 <= len(guide_stars) <= _MOST_STARS:
         raise UsageError(
             f"{len(guide_stars)} stars to V {settings.faintest:g}: an index can hold 3 to {_MOST_STARS}"
+        )
+    per_field = len(guide_stars) * settings.largest**2 / (4.0 * np.pi)
+    if per_field < _LEAST_PER_FIELD:
+        raise UsageError(
+            f"{len(guide_stars)} stars to V {settings.faintest:g}, a mean of {per_field:.1f} in a field of "
+            f"{np.rad2deg(settings.largest):.3g} deg, but a fix needs 4: give fainter stars by `faintest`"
         )
     count = round(_BANDS_PER_OCTAVE * np.log2(settings.largest / settings.smallest))
     sizes = np.geomspace(settings.smallest, settings.largest, count + 1)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,8 @@ import pytest
 
 from knightcube.astro import catalogue
 from knightcube.astro.quaternion import attitude_matrix, normalise
-from knightcube.errors import InputError
+from knightcube.errors import ArgumentError, InputError, UsageError
+from knightcube.vision.star_tracker import StarTracker
 from knightcube.vision.startracker.index import (
     CELLS,
     FINE,
@@ -161,6 +165,57 @@ def test_an_index_file_round_trips_and_is_deterministic(stored: Path, tmp_path: 
     assert np.array_equal(back.triangles.corners, sky.triangles.corners)
     assert np.abs(back.stars.direction - sky.stars.direction).max() < 1e-7
     assert np.abs(back.stars.magnitude - sky.stars.magnitude).max() < 1e-3
+
+
+def test_a_star_tracker_uses_an_index_that_was_built_saved_and_loaded(stored: Path) -> None:
+    sky = load(str(stored))
+    assert repr(sky).startswith("<SkyIndex: <GuideStars: 1615 stars to V 5.0, epoch 2026.5>")
+    for index in (sky, stored, str(stored)):
+        found = StarTracker(fov_deg=20.0, index=index).solve(np.zeros((64, 64)))
+        assert len(found.index.stars) == len(sky.stars)
+    with pytest.raises(ArgumentError, match="index: 5: give a SkyIndex or the path"):
+        StarTracker(index=5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"faintest": 12.0}, "faintest: 12: give a V magnitude up to 8.5"),
+        ({"faintest": np.nan}, "faintest: nan"),
+        ({"epoch": 1e6}, "epoch: 1e+06: give a Julian year from 1900 to 2200"),
+        ({"epoch": np.nan}, "epoch: nan"),
+        ({"resolution": -1.0}, "resolution: -1 rad: give 0 to"),
+        ({"smallest": 0.5}, "smallest: 0.5 rad, largest 0.436332 rad: give increasing angles"),
+    ],
+)
+def test_settings_out_of_range_are_refused(given: dict[str, float], message: str) -> None:
+    with pytest.raises(ArgumentError, match=re.escape(message)):
+        IndexSettings(**given)  # type: ignore[arg-type]  # of numbers
+
+
+def test_a_pixel_out_of_range_is_refused() -> None:
+    for pixel in (-1.0, 0.0, np.nan, 0.1):
+        with pytest.raises(ArgumentError, match=r"pixel: .* rad: give more than 0 and less than a sixteenth"):
+            IndexSettings.of_field(0.2, pixel)
+
+
+@pytest.mark.parametrize(
+    ("fov_deg", "faintest", "message"),
+    [
+        (
+            20.0,
+            2.0,
+            "48 stars to V 2, a mean of 0.5 in a field of 20 deg, but a fix needs 4: give fainter stars",
+        ),
+        (60.0, 0.0, "4 stars to V 0"),
+        (10.0, 4.0, "a mean of 1.3 in a field of 10 deg"),
+        (20.0, -9.0, "0 stars to V -9"),
+    ],
+)
+def test_an_index_with_too_few_stars_is_refused(fov_deg: float, faintest: float, message: str) -> None:
+    settings = replace(IndexSettings.of_field(math.radians(fov_deg)), faintest=faintest)
+    with pytest.raises(UsageError, match=re.escape(message)):
+        index_build.build(settings)
 
 
 @pytest.mark.parametrize("place", [12, 200, -1])
