@@ -25,7 +25,9 @@ import importlib
 import logging
 import os
 import pickle
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Generic, ParamSpec, TypeVar
 
 Parameters = ParamSpec("Parameters")
@@ -37,7 +39,7 @@ _ANY_ORDER = {"reassoc", "contract", "nsz"}
 _UNWRAPPED = {"error_model": "numpy", "no_cfunc_wrapper": True}
 """Options without a C wrapper, because only Python and other compiled forms call compiled forms."""
 _COMPILING = (
-    "numba compiles the functions in use for this machine; this takes about a minute, once "
+    "numba compiles the functions in use for this machine; this takes one to three minutes, once "
     f"({_SWITCH}=0 avoids it)"
 )
 _functions: list[HotFunction[Any, Any]] = []
@@ -172,20 +174,54 @@ def _numba_is_usable() -> bool:
     return True
 
 
+@dataclass(slots=True)
+class _Compilation:
+    """Compilation in this process: time spent (ns), nesting depth, start (ns), and receiver of names."""
+
+    spent_ns: int = 0
+    depth: int = 0
+    begun_ns: int = 0
+    report: Callable[[str], None] | None = None
+
+
+_compilation = _Compilation()
+
+
+def compilation_ns() -> int:
+    """Return the time (ns) that this process has spent on compilation, without loading stored machine code.
+
+    The function is for measurements of execution times, which must not contain the compilation.
+    """
+    return _compilation.spent_ns
+
+
+def report_compilations(report: Callable[[str], None] | None) -> None:
+    """Call `report` with the name of each function that numba begins to compile; None ends the reports."""
+    _compilation.report = report
+
+
 @functools.cache
 def _announce_compilation() -> None:
-    """Log a warning when numba first compiles a function in this process, but not for cached functions."""
+    """Measure and report compilations, but not cached functions, and log a warning before the first one."""
     event = importlib.import_module("numba.core.event")
 
-    class FirstCompilation(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types
-        def on_start(self, _: object) -> None:
-            event.unregister("numba:compile", self)
-            logging.getLogger(__name__).warning(_COMPILING)
+    class Compilations(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types
+        def on_start(self, happened: Any) -> None:
+            if not _compilation.spent_ns and not _compilation.depth:
+                logging.getLogger(__name__).warning(_COMPILING)
+            _compilation.depth += 1
+            if _compilation.depth > 1:  # a function that the compiled function calls
+                return
+            _compilation.begun_ns = time.perf_counter_ns()
+            if _compilation.report is not None:
+                _compilation.report(str(happened.data["dispatcher"].__name__))
 
         def on_end(self, _: object) -> None:
-            pass
+            _compilation.depth -= 1
+            if not _compilation.depth:
+                _compilation.spent_ns += time.perf_counter_ns() - _compilation.begun_ns
 
-    event.register("numba:compile", FirstCompilation())
+    event.register("numba:compile", Compilations())
 
 
 def use_numpy_forms() -> None:

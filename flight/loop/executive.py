@@ -45,6 +45,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 from flight.loop.worker import LONGEST_BYTES, SLAB_BYTES, message_length, pack_trusted, unpack_values
 from hal.interfaces.wires import SECOND_NS, Clock
+from knightcube.compiled import compilation_ns
 from knightcube.errors import FlightError
 
 Outcome = Literal["done", "failed", "timed-out", "died"]
@@ -123,7 +124,8 @@ class JobRunner(Protocol):
 class LockStepRunner:
     """Runs jobs in lock-step with simulated time; implements JobRunner.
 
-    The attribute `borrowed_ns` is the total real time (ns) of the jobs, which run in the calling thread.
+    The attribute `borrowed_ns` is the total real time (ns) of the jobs, which run in the calling thread,
+    without the time in which numba compiles functions.
     """
 
     def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
@@ -138,14 +140,14 @@ class LockStepRunner:
             return False
         spec = self._workers[worker]
         now_ns = self._clock.now_ns()
-        begun = time.perf_counter_ns()
+        begun = time.perf_counter_ns() - compilation_ns()
         outcome: Outcome = "done"
         value, error = None, ""
         try:
             value = spec.function(argument)
         except Exception as failure:  # noqa: BLE001 - containment boundary: the worker runner
             outcome, error = "failed", f"{type(failure).__name__}: {failure}"
-        spent_ns = time.perf_counter_ns() - begun
+        spent_ns = time.perf_counter_ns() - compilation_ns() - begun
         self.borrowed_ns += spent_ns
         self._pending[worker] = JobResult(
             worker, outcome, value, error, now_ns, now_ns + spec.latency_ns, spent_ns

@@ -48,6 +48,7 @@ from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import COIL_NAMES, MOST_COILS, CoilState, ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
+from knightcube.compiled import compilation_ns
 from knightcube.gnc.estimation.estimate import ATTITUDE as ATTITUDE_ERROR
 from knightcube.gnc.estimation.estimate import RATE, Estimate
 
@@ -354,7 +355,10 @@ class FlightLoop:
         # Execution times exclude the jobs, which this thread also executes in a lock-step simulation.
         jobs = services.jobs
         self._executive = CyclicExecutive(
-            services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
+            services.clock,
+            self._groups,
+            tasks.observer,
+            lambda: time.perf_counter_ns() - jobs.borrowed_ns - compilation_ns(),
         )
 
     @property

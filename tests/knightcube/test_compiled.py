@@ -86,6 +86,29 @@ def test_compilation_is_announced_and_a_damaged_file_of_machine_code_is_left_asi
         assert list(tmp_path.rglob("*.nbc"))
 
 
+def test_the_time_of_compilation_is_measured_and_each_function_is_reported_once(tmp_path: Path) -> None:
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    places = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT), "KNIGHTCUBE_COMPILED": "1"}
+    code = (
+        "import numpy as np\nfrom knightcube import compiled\n"
+        "from tests.support.compiled_forms import sum_of_squares as hot\n"
+        "compiled.report_compilations(print)\nhot(np.arange(5.0))\nspent = compiled.compilation_ns()\n"
+        "hot(np.arange(5.0))\nassert compiled.compilation_ns() == spent\nprint(spent > 0)"
+    )
+    printed = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, **places},
+            timeout=100,
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert printed == [["sum_of_squares", "True"], ["False"]], "the second process loads the machine code"
+
+
 def test_the_process_that_compiles_a_function_computes_the_same_as_later_processes(tmp_path: Path) -> None:
     """The background of a frame is subtracted with helpers that may compute sums in any order."""
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")

@@ -35,6 +35,7 @@ from flight.schema.document import ConfigError, config_path, merged_text, names,
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import LATE_NS
+from knightcube.compiled import report_compilations
 from knightcube.errors import FlightError, UsageError
 
 if TYPE_CHECKING:  # see `flight.app.run`
@@ -198,28 +199,37 @@ def run(options: argparse.Namespace) -> int:
 
 
 def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
-    """Return a function that shows progress in one line of a terminal, or otherwise as a line every 10 s."""
+    """Return a function that shows progress in one line of a terminal, or otherwise as a line every 10 s.
+
+    The line also names the function for whose compilation a first flight waits.
+    """
     terminal = stream.isatty()
     period, before, after = (0.2, "\r\x1b[K", "") if terminal else (10.0, "", "\n")
     last = time.perf_counter()
 
-    def show(progress: FlightProgress) -> None:
+    def write(text: Callable[[], str]) -> None:
         nonlocal last
         now = time.perf_counter()
         if now - last < period:
             return
         last = now
-        of = f"/{progress.duration:.0f}"
-        currents = " ".join(f"{1e3 * current:+.1f}" for current in progress.currents)
         with suppress(OSError):  # an error such as a full disk must not affect the flight
-            stream.write(
-                f"{before}{progress.mission_time:6.0f}{of} s  {progress.attitude}  "
-                f"coils {currents} mA  {progress.state}  "
-                f"slips {progress.slips}  events {progress.events}{after}"
-            )
+            stream.write(f"{before}{text()}{after}")
             stream.flush()
 
+    def show(progress: FlightProgress) -> None:
+        write(lambda: _progress_text(progress))
+
+    report_compilations(lambda name: write(lambda: f"waits once until numba has compiled {name}"))
     return show
+
+
+def _progress_text(progress: FlightProgress) -> str:
+    currents = " ".join(f"{1e3 * current:+.1f}" for current in progress.currents)
+    return (
+        f"{progress.mission_time:6.0f}/{progress.duration:.0f} s  {progress.attitude}  "
+        f"coils {currents} mA  {progress.state}  slips {progress.slips}  events {progress.events}"
+    )
 
 
 def seed_number(text: str) -> int:
@@ -416,19 +426,38 @@ def _facts(verdict: CheckResult) -> dict[str, Any]:
         "body": config.body,
         "simulated": config.simulation is not None,
         "devices": [asdict(item) for item in verdict.devices],
+        "drivers": _drivers(config),
         "flight": flown,
         "problems": verdict.problems,
         "ready": not verdict.problems,
     }
 
 
+def _drivers(config: Config) -> dict[str, str]:
+    """Return the name of the driver of each device, and the part of each of its sensors, by dotted key."""
+    found = {}
+    for key, _, section in fitted_devices(config):
+        found[key] = str(getattr(section, "driver", None) or section.__struct_config__.tag)
+        for number, sensor in enumerate(getattr(section, "sensors", ())):
+            found[f"{key}.sensors[{number}]"] = sensor.part
+    cameras: list[tuple[str, Camera | WideCamera]] = []
+    cameras += [("camera", config.camera)] if config.camera is not None else []
+    cameras += [(f"wide_cameras[{number}]", camera) for number, camera in enumerate(config.wide_cameras)]
+    for key, camera in cameras:
+        if camera.device is not None:
+            found[key] = str(camera.device.__struct_config__.tag)
+    return found
+
+
 def _text(verdict: CheckResult) -> str:
     config, result = verdict.config, verdict.result
+    foreign = [f"{key} {name}" for key, name in _drivers(config).items() if ":" in name]
+    devices = "simulated" if config.simulation is not None else f"{len(verdict.devices)} looked for"
     lines = [
         ("configuration", f"{verdict.path}: {config.name}, valid"),
         *(("extends", name) for name in verdict.chain[1:]),
         ("to fly", f"body {config.body}, {config.duration:g} s"),
-        ("devices", "simulated" if config.simulation is not None else f"{len(verdict.devices)} looked for"),
+        ("devices", "; ".join((devices, *foreign))),
     ]
     lines += [
         ("", f"{'found' if item.found else 'MISSING':8} {item.name}, {item.place}: {item.text}")

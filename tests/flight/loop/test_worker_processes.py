@@ -262,3 +262,20 @@ def test_workers_leave_the_last_core_to_the_control_process() -> None:
         assert runner.submit("cores", None)
         assert wait(runner)[0].value == allowed[:-1]
     assert sorted(os.sched_getaffinity(0)) == allowed
+
+
+def test_the_compilation_of_functions_is_no_part_of_the_time_of_a_job(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_ns = {"clock": 0, "compilation": 0}
+
+    def job(_: object) -> None:
+        now_ns["clock"] += 60_000_000_000
+        now_ns["compilation"] += 59_000_000_000
+
+    monkeypatch.setattr("flight.loop.executive.time.perf_counter_ns", lambda: now_ns["clock"])
+    monkeypatch.setattr("flight.loop.executive.compilation_ns", lambda: now_ns["compilation"])
+    runner = LockStepRunner(SimClock(), [Worker("vision", job, 0, 0)])
+    assert runner.submit("vision", None)
+    (result,) = runner.collect()
+    assert (result.execution_ns, runner.borrowed_ns) == (1_000_000_000, 1_000_000_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,3 +141,15 @@ def test_the_smallest_and_the_largest_seed_are_accepted() -> None:
 def test_numbers_of_a_json_result_are_rounded_to_twelve_digits() -> None:
     facts = {"time_s": 618 * 0.025, "rows": [{"x": 15.450000000000001}], "utc_ns": 1774008001000000000}
     assert to_json(facts) == '{"time_s": 15.45, "rows": [{"x": 15.45}], "utc_ns": 1774008001000000000}\n'
+
+
+def test_the_line_of_progress_names_the_function_that_numba_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Callable[[str], None]] = []
+    monkeypatch.setattr("flight.app.cli.run.report_compilations", told.append)
+    times = iter([0.0, 5.0, 11.0])
+    monkeypatch.setattr("flight.app.cli.run.time.perf_counter", lambda: next(times))
+    stream = io.StringIO()
+    progress_on(stream)
+    for name in ("first", "second"):
+        told[0](name)
+    assert stream.getvalue() == "waits once until numba has compiled second\n"
