@@ -10,6 +10,7 @@ with the functions that read and check the answers.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -284,12 +285,12 @@ def _camera_lines(satellite: Satellite, values: Derived) -> str:
     half = math.radians(0.5 * (90.0 + TILT_DEG))
     side, other, sine = ("-y", "+y", 1.0) if values.sun_side else ("+y", "-y", -1.0)
     return f"""\
-camera: # star camera; its other values are those of a camera with 512 x 512 px
+camera: # star camera with 512 x 512 px: give your `columns` and `rows`, and its other values
   # The boresight is body {side}, turned by {TILT_DEG:g} deg to -z, the zenith if +z points down.
   # At the start, the Sun is {abs(values.beta_deg):.0f} deg from the plane of the orbit, \
 towards {other} [computed].
   mounting: [{sine * math.sin(half):.8f}, 0.0, 0.0, {math.cos(half):.8f}]
-  field_of_view_deg: {_text(satellite.field_of_view_deg)} # deg [given]
+  field_of_view_deg: {_text(satellite.field_of_view_deg)} # deg, across the columns [given]
 """
 
 
@@ -507,7 +508,15 @@ def _read_yes(text: str) -> bool:
     return text.lower() == "yes"
 
 
-_INCLINATION, _FIELD_OF_VIEW = _number_or("sso", 0.0, 180.0), _number_or("none", 6.0, 40.0)
+def _read_field_of_view(text: str) -> float | None:
+    """Return a field of view in deg, or None for `none`. Raises ValueError, also for a number of pixels."""
+    if re.fullmatch(r"\d+\s*x\s*\d+", text.lower()):
+        pixels = "give the pixels as `camera.columns` and `camera.rows` in the written file"
+        raise ValueError(f"give the field of view across the columns, 6 to 40 deg, or none; {pixels}")
+    return _number_or("none", 6.0, 40.0)(text)
+
+
+_INCLINATION = _number_or("sso", 0.0, 180.0)
 QUESTIONS = (
     Question("name", "NAME", "name of the satellite", _read_name, "my_satellite"),
     Question("mass", "KG", "mass, kg", number(0.1, 500.0, "kg")),
@@ -553,8 +562,8 @@ QUESTIONS = (
     Question(
         "star-camera",
         "DEG",
-        "field of view of the star camera, deg, or none",
-        _number_or("none", 6.0, 40.0),
+        "field of view of the star camera across its columns, deg, or none",
+        _read_field_of_view,
         "20",
     ),
     Question("horizon-cameras", "yes|no", "six cameras for Sun and horizon, yes or no", _read_yes, "yes"),

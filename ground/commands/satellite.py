@@ -24,7 +24,7 @@ from flight.link import commands
 from flight.link.events import Mode
 from flight.link.files.store import Store
 from flight.link.process import directives
-from flight.link.process.commanding import Report, Stage
+from flight.link.process.commanding import Report, Stage, final_mode
 from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import (
@@ -223,8 +223,21 @@ def _command_by_link(options: argparse.Namespace) -> int:
             reports = send(terminal, packet_of(options), options.spi, options.timeout, show)
     stages = [{"stage": report.stage.name.lower(), "text": explained(report)} for report in reports]
     done = obeyed(reports)
-    print_result(options, {"obeyed": done, "counter": reports[-1].counter, "stages": stages}, "")
+    print_result(
+        options,
+        {"obeyed": done, "counter": reports[-1].counter, "stages": stages},
+        _hint(options) if reports and reports[-1].stage is Stage.STARTED else "",
+    )
     return 0 if done else 1
+
+
+def _hint(options: argparse.Namespace) -> str:
+    """Return how to see the completion of a command that has started, for a command that changes the mode."""
+    if options.what not in commands.LAYOUTS:
+        return ""
+    mode = final_mode(_command_of(options))
+    shown = f"`{PROGRAM} watch --link {options.link} --keys {options.keys} --once` shows the mode"
+    return "" if mode is None else f"complete when the flight enters the mode {mode.label}: {shown}\n"
 
 
 def packet_of(options: argparse.Namespace) -> bytes:

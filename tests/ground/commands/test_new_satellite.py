@@ -200,6 +200,10 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
             "nothing was written: `coils.windings` has 7 entries: 2 to 6 coils are supported",
         ),
         (("--star-camera", "90"), "--star-camera 90: give a number from 6 to 40 deg, or none"),
+        (
+            ("--star-camera", "1280x960"),
+            "give the pixels as `camera.columns` and `camera.rows` in the written",
+        ),
         (("--name", "my satellite"), "--name my satellite: give letters, digits and underscores"),
         (("--mass", "4"), "--size, --coil are missing; on a terminal the command asks for values"),
     ],

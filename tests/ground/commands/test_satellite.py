@@ -264,6 +264,20 @@ def test_each_stage_of_a_command_by_the_link_is_printed(
     assert link.closed == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "mode"),
+    [(("mode", "point"), "point"), (("slew", "0.2"), "hold"), (("point", "nadir"), "point"), (("ping",), "")],
+)
+def test_a_command_that_has_only_started_says_how_to_see_its_completion(
+    link: Link, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], mode: str
+) -> None:
+    monkeypatch.setattr(satellite, "send", lambda *_: [report(Stage.STARTED, "b")])
+    done = command("command", *LINK, *words)
+    watch = "`knightcube watch --link 127.0.0.1:9 --keys keys --once` shows the mode"
+    expected = f"complete when the flight enters the mode {mode}: {watch}\n" if mode else ""
+    assert (done.returncode, done.stdout) == (0, expected)
+
+
 def test_the_table_of_parameters_is_shown_with_its_bounds(flight: Flight) -> None:
     flight.answers = [answer(True) + table(DEFAULTS)] * 2
     done = command("parameters", "--to", "socket")

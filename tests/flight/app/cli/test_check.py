@@ -36,6 +36,8 @@ def test_a_sound_simulation_flies_ten_seconds_and_is_ready(tmp_path: Path) -> No
     assert (done.returncode, done.stderr) == (0, "")
     facts = json.loads(done.stdout)
     assert (facts["ready"], facts["problems"], facts["simulated"]) == (True, [], True)
+    drivers = {"inertial_unit": "vn100", "coils": "pca9685", "power_monitor": "ina219"}
+    assert facts["drivers"] == drivers, "the devices are simulated, but their drivers are those of a board"
     assert facts["flight"]["mission_time_s"] == pytest.approx(10.0, abs=0.1)
     assert not Path(facts["flight"]["folder"]).exists(), "nothing is left behind"
 
