@@ -264,7 +264,7 @@ def test_workers_leave_the_last_core_to_the_control_process() -> None:
     assert sorted(os.sched_getaffinity(0)) == allowed
 
 
-def test_the_compilation_of_functions_is_no_part_of_the_time_of_a_job(
+def test_the_time_of_a_job_excludes_the_compilation_of_functions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_ns = {"clock": 0, "compilation": 0}
