@@ -621,7 +621,7 @@ def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
         path = Path(camera.structure_file)
         # Pillow is not installed on a flight computer, but a PGM file can be read without it.
         is_pgm = path.suffix == ".pgm"
-        pixels = read_raw(path, camera.columns, camera.rows, 8) if is_pgm else read_image(path)
+        pixels = read_raw(path, camera.columns, camera.rows, 8, None) if is_pgm else read_image(path)
         if pixels.shape != mask.shape:
             sizes = [f"{shape[1]} x {shape[0]}" for shape in (pixels.shape, mask.shape)]
             raise UsageError(f"{camera.structure_file}: {sizes[0]} pixels, but the camera has {sizes[1]}")

@@ -20,13 +20,16 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image, read_raw
 from knightcube.vision.frame import LEAST_SIDE
 
-_RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
+_RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)(?:\+([0-9]+))?")
 
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that name a picture file."""
     parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, BMP, FITS, or see --raw")
-    text = "IMAGE is raw pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16"
+    text = (
+        "IMAGE is raw pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16, "
+        "or 1280x960x16+512 after a header of 512 bytes"
+    )
     parser.add_argument("--raw", type=raw_shape, metavar="CxRxB", help=text)
 
 
@@ -74,13 +77,16 @@ def check_size(path: Path, pixels: Image) -> None:
         raise UsageError(f"{path}: {columns} x {rows} pixels: give {LEAST_SIDE} or more per side")
 
 
-def raw_shape(text: str) -> tuple[int, int, int]:
-    """Return columns, rows and bits from a text such as 1280x960x16. Raises ArgumentTypeError."""
+def raw_shape(text: str) -> tuple[int, int, int, int]:
+    """Return columns, rows, bits and bytes of the header from a text such as 1280x960x16 or 1280x960x16+512.
+
+    Raises ArgumentTypeError.
+    """
     found = _RAW.fullmatch(text)
-    if found is None or "0" in found.groups():
+    if found is None or "0" in found.groups()[:3]:
         raise argparse.ArgumentTypeError(f"{text!r}: give columns x rows x bits, such as 1280x960x16")
-    columns, rows, bits = found.groups()
-    return int(columns), int(rows), int(bits)
+    columns, rows, bits, header = found.groups(default="0")
+    return int(columns), int(rows), int(bits), int(header)
 
 
 def positive(text: str) -> float:

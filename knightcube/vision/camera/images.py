@@ -232,11 +232,11 @@ def read_image(path: Path | str) -> Image:
     return fits_image(content, str(path)) if content else _through_pillow(path)
 
 
-def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
+def read_raw(path: Path, columns: int, rows: int, bits: int, header: int | None = 0) -> Image:
     """Return the image (rows, columns) of a file of raw pixels, of 8 bits or of 16 bits little-endian.
 
-    The pixels are stored row by row at the end of the file. Any header before the pixels is skipped. Raises
-    UsageError if the file is missing or too short.
+    The pixels are stored row by row at the end of the file, after `header` bytes; if `header` is None, after
+    any number of bytes. Raises UsageError if the file is missing or has another size.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
     try:
@@ -244,9 +244,13 @@ def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
     wanted = columns * rows * kind.itemsize
-    if len(content) < wanted:
+    extra = len(content) - wanted
+    if extra < 0 or header not in (None, extra):
+        text = f"{path}: has {len(content)} bytes, but {columns} x {rows} pixels of {bits} bits need {wanted}"
+        text += f" after a header of {header}" if header else ""
+        shape = f"{columns}x{rows}x{bits}+{extra}"
         raise UsageError(
-            f"{path}: has {len(content)} bytes, but {columns} x {rows} pixels of {bits} bits need {wanted}"
+            f"{text}; if the file has a header of {extra}, state it: {shape}" if extra > 0 else text
         )
     pixels = np.frombuffer(content, kind, columns * rows, len(content) - wanted)
     return pixels.reshape(rows, columns).astype(kind.newbyteorder("="))

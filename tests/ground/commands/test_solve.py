@@ -126,8 +126,30 @@ def test_a_classical_method_finds_the_same_place(picture: Path) -> None:
 def test_bare_pixels_behind_a_header_are_read(resting: SkyFrame, tmp_path: Path) -> None:
     path = tmp_path / "frame.raw"
     path.write_bytes(b"a header of some bytes" + resting.pixels.astype("<u2").tobytes())
-    done = command("solve", path, "--raw", "1024x1024x16", "--fov", "12", "--json")
+    done = command("solve", path, "--raw", "1024x1024x16+22", "--fov", "12", "--json")
     assert json.loads(done.stdout)["status"] == "solved"
+
+
+@pytest.mark.parametrize(
+    ("shape", "complaint"),
+    [
+        (
+            "100x100x8",
+            "has 12000 bytes, but 100 x 100 pixels of 8 bits need 10000; if the file has a header of 2000",
+        ),
+        (
+            "100x100x8+500",
+            "need 10000 after a header of 500; if the file has a header of 2000, state it: 100x100x8+",
+        ),
+        ("100x100x16", "has 12000 bytes, but 100 x 100 pixels of 16 bits need 20000\n"),
+    ],
+)
+def test_bare_pixels_of_another_size_are_refused(tmp_path: Path, shape: str, complaint: str) -> None:
+    path = tmp_path / "frame.raw"
+    path.write_bytes(bytes(12_000))
+    done = command("solve", path, "--raw", shape, "--fov", "12")
+    assert done.returncode == 2
+    assert complaint in done.stderr
 
 
 def test_the_overlay_shows_the_stars_and_the_text_lists_them(picture: Path, tmp_path: Path) -> None:
