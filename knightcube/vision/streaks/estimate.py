@@ -662,8 +662,8 @@ def estimate_rate(
     Args:
         image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger. Raw
             counts are best, because the gain and the saturation are in the unit of the pixel values.
-        camera: pinhole model or calibrated lens. The distortion of a lens is included only as an uncertainty
-            of the pinhole model.
+        camera: pinhole model or calibrated lens. The distortion of a lens is not corrected; the covariance
+            includes its effect on the rate.
         exposure: exposure time, s.
         prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
             the rotation.
