@@ -1,4 +1,7 @@
-"""Send the new command `note` to a flight, in a source tree to which `command.diff` has been applied."""
+"""Send the new command `note` to a flight.
+
+The script needs a source tree to which `command.diff` has been applied: git apply docs/examples/command.diff
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from flight.link.commands import CommandPacker, Note
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import to_text
 from ground.link.commanding import exchange
 from ground.telemetry import decode, read_run
+
+try:
+    from flight.link.commands import CommandPacker, Note
+except ImportError:
+    sys.exit("apply the change of the page first: git apply docs/examples/command.diff")
 
 CONFIG = Path("config/step_demo.yaml")
 

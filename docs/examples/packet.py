@@ -1,18 +1,23 @@
 """Record the new packet `thermal` and read it back.
 
-Needs a source tree to which `packet.diff` has been applied.
+The script needs a source tree to which `packet.diff` has been applied: git apply docs/examples/packet.diff
 """
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 
-from flight.link.telemetry.definitions import THERMAL
 from flight.link.telemetry.log import FlightLog, Recorder
 from ground.documentation import markdown
 from ground.telemetry import export, read_run
 from sim_hal.clock import SimClock
+
+try:
+    from flight.link.telemetry.definitions import THERMAL
+except ImportError:
+    sys.exit("apply the change of the page first: git apply docs/examples/packet.diff")
 
 
 def main() -> None:

@@ -506,6 +506,7 @@ def calibrate_lens(
 
     Raises:
         UsageError: if no image is given, or if the images have different shapes.
+        ArgumentError: if an image is not an array of 16 x 16 or more finite numbers without a mask.
         InputError: if the field of view is not between 1 and 120 deg.
         CalibrationError: if the solved images do not determine a lens.
     """

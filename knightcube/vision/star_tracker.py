@@ -215,6 +215,11 @@ class StarTracker:
         _check_field_of_view(fov_deg, fov_error_deg)
         self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
         self._settings = SolveSettings() if settings is None else settings
+        if not isinstance(self._settings.lens, CameraKnowledge | None):
+            raise ArgumentError(
+                "settings.lens",
+                f"{self._settings.lens!r}: give a CameraKnowledge, as CameraKnowledge(**accuracy)",
+            )
         self._learn = learn
         self.lens: LensKnowledge | None = None
         if not isinstance(index, SkyIndex | Path | str | None):

@@ -120,6 +120,12 @@ def test_the_slew_of_its_example_keeps_off_the_moon() -> None:
     assert float(printed[5].split()[1]) >= 0.0
 
 
+@pytest.mark.parametrize("name", ["command", "packet"])
+def test_an_extension_without_its_change_names_the_change(name: str) -> None:
+    done = run([str(EXAMPLES / f"{name}.py")], ROOT, status=1)
+    assert done.stderr == f"apply the change of the page first: git apply docs/examples/{name}.diff\n"
+
+
 @pytest.mark.slow
 def test_a_new_command_is_obeyed_and_logged(tmp_path: Path) -> None:
     printed = run([str(EXAMPLES / "command.py")], patched("command", tmp_path / "tree")).stdout.splitlines()

@@ -103,7 +103,7 @@ PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.9e-4, resistance=23.0
         (lambda: DetectedObjects((), NONE, np.empty((0, 3, 3))), "<DetectedObjects: 0 objects>"),
         (
             lambda: DetectedObjects((OBJECT,), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3, 3))),
-            r"<DetectedObjects: 1 objects at pixels \(20.0, 30.0\)>",
+            r"<DetectedObjects: 1 object at pixels \(20.0, 30.0\)>",
         ),
         (lambda: SunSolution(SunStatus.NO_SUN, "all dark"), "<SunSolution no-sun: all dark>"),
         (

@@ -202,7 +202,7 @@ def find_nadir(
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
 
     Raises:
-        ValueError: if the size of image or mask differs from the camera's, or if pixels are not finite.
+        ArgumentError: if the size of image or mask differs from the camera's, or if pixels are not finite.
 
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
@@ -240,7 +240,7 @@ class _ScannedImage:
     """An image whose edges and cones are kept for further searches with other knowledge of directions."""
 
     def __init__(self, image: Image, camera: CameraModel, hidden: BoolArray | None) -> None:
-        """Keep an image and its mask. Raises ValueError as `find_nadir`."""
+        """Keep an image and its mask. Raises ArgumentError as `find_nadir`."""
         if hidden is not None:
             check_shape(hidden, camera)
         self.image = image_of_camera(image, camera)

@@ -765,7 +765,10 @@ class DetectedObjects:
             return f"<DetectedObjects: {self.reason}>"
         middles = [item.endpoints.mean(axis=0) for item in self.objects[:3]]
         pixels = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in middles)
-        return f"<DetectedObjects: {len(self.objects)} objects{' at pixels ' + pixels if pixels else ''}>"
+        plural = "" if len(self.objects) == 1 else "s"
+        return (
+            f"<DetectedObjects: {len(self.objects)} object{plural}{' at pixels ' + pixels if pixels else ''}>"
+        )
 
 
 # Number of positions along each side of an image that are tested for a star that remains in the image.

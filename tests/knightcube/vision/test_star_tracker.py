@@ -22,7 +22,7 @@ from knightcube.errors import ArgumentError, InputError
 from knightcube.vision import star_tracker
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
-from knightcube.vision.startracker.solve import FrameSolution, SolveStatus
+from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, SolveStatus
 from knightcube.vision.startracker.survey import FrameKind
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
 
@@ -326,6 +326,8 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
         StarTracker(fov_deg=10.0, camera=lens)
     with pytest.raises(ArgumentError, match="camera: 'lens': give a Pinhole or a Lens"):
         StarTracker(camera="lens")  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match=r"settings\.lens: .* as CameraKnowledge\(\*\*accuracy\)"):
+        StarTracker(camera=lens, settings=SolveSettings(lens={"centre": 0.1}))  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match="fov_error_deg: 2: give `fov_deg` or `camera` too"):
         StarTracker(fov_error_deg=2.0)
     with pytest.raises(InputError, match=r"none\.index"):
