@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.loop.flight_loop import FlightProgress
 from flight.schema.reader import replace
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
@@ -289,8 +290,10 @@ def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -
 
     The coil currents decay during the stall.
     """
+    shown: list[FlightProgress] = []
 
     def prepare(rigged: Rigged) -> None:
+        rigged.loop.watch(shown.append)
         camera, clock = rigged.lock.hardware.camera, rigged.lock.clock
         assert camera is not None
         poll, stalled = camera.poll, list[bool]()
@@ -306,6 +309,7 @@ def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -
     run = fly(config_for("testbed-demo", camera=True, duration=6.0), tmp_path, prepare)
     names = event_names(run)
     assert names.count("cycle-slip") == 1
+    assert shown[-1].slips == run["health"]["slips"][-1], "`run` and `report` count the same slips"
     cycles = run["control"]["cycle"]
     assert np.diff(cycles.astype(int)).max() in {40, 41}
     assert (np.diff(run["control"]["time_ns"]) >= 25_000_000).all()
