@@ -249,7 +249,7 @@ PLANNER_FAILED = _warn(
     44,
     "planner-failed",
     "the planner found no plan; the text gives the reason",
-    "the text gives the reason: command a target that can be reached, or relax `pointing`",
+    "command a target that can be reached with the coils and the exclusion cones",
 )
 HOLDING = _warn(
     45,
@@ -306,7 +306,7 @@ VISION_FAILED = _warn(
     54,
     "vision-failed",
     "vision found no result; the text gives the reason",
-    "none for single frames; otherwise the text gives the reason",
+    "none for single frames; otherwise remove the reason in the text",
 )
 STREAK_REFUSED = _warn(
     55,
@@ -473,7 +473,7 @@ RETURNED = _warn(
     150,
     "returned",
     "the board returned to an earlier release or configuration; the text gives the reason",
-    "the text gives the reason: correct it, and renew again",
+    "correct the reason in the text, and renew again",
 )
 COMMANDED = _info(80, "commanded", "a command was executed")
 COMMAND_REFUSED = _warn(
@@ -527,7 +527,7 @@ GPS_REFUSED = _warn(
     103,
     "gps-refused",
     "a GPS fix was refused; the text gives the reason",
-    "none for single fixes; if all are refused, compare them with the elements, and renew the elements",
+    "none for single fixes; if all are refused, the text gives the reason: renew old elements",
 )
 GPS_SET_UP = _warn(
     153,
@@ -601,7 +601,7 @@ OBJECT_ESCAPES = _warn(
     123,
     "object-escapes",
     "the torque of the coils is too small to keep an object in the field of view",
-    "none: follow a slower object, or command another target",
+    "follow a slower object, or command another target",
 )
 
 SUN_FOUND = _info(140, "sun-found", "the Sun was detected in safe mode and the body turns towards it")
