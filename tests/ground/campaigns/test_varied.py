@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flight.app.cli import main
+from flight.app.cli import main, to_json
 from ground.campaigns import varied
 from ground.campaigns.runner import Case, Result, fly
 from ground.campaigns.varied import (
@@ -187,7 +187,8 @@ def test_the_listed_command_flies_a_failed_flight_again(
     assert main(["report", str(tmp_path / "again"), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     judged = json.loads((out / "results.jsonl").read_text())["result"]["judged"]
-    assert [row["worst"] for row in judged] == [row["worst"] for row in report["thesis"]]
+    rounded = json.loads(to_json([row["worst"] for row in judged]))
+    assert rounded == [row["worst"] for row in report["thesis"]]
     assert any(row["verdict"] == "miss" for row in judged)
 
 
