@@ -242,7 +242,7 @@ def test_no_more_stars_than_asked_for_are_returned() -> None:
     ],
 )
 def test_an_array_that_is_not_a_frame_is_refused(frame: Image) -> None:
-    with pytest.raises(ValueError, match="frame"):
+    with pytest.raises(ValueError, match="image: "):
         detect(frame)
 
 
