@@ -37,6 +37,7 @@ LARGEST_RATE = math.radians(2000.0)
 """Default of the largest accepted body rate per axis, rad/s: the range of common gyros."""
 _NORM_TOLERANCE = 1e-2
 """Largest accepted deviation of a quaternion's norm from 1."""
+_SHAPES = {"quaternion": (4,), "rate": (3,), "field": (3,), "acceleration": (3,)}
 _NO_RATE = np.full(3, math.nan)
 _FREE_FALL = 1.0
 """Specific force (m/s^2) below which the vertical direction counts as unknown."""
@@ -276,31 +277,31 @@ class CheckedUnit:
 
     def _checked(self, reading: ImuReading) -> ImuReading | None:
         """Return the reading without an implausible rate, or None if another value is implausible."""
-        values: dict[str, Any] = {
-            name: np.asarray(getattr(reading, name), dtype=float)
-            for name in ("quaternion", "rate", "field", "acceleration")
-        }
+        values: dict[str, Any] = {name: np.asarray(getattr(reading, name), dtype=float) for name in _SHAPES}
         for name, value in values.items():
-            wrong = value.shape != (3 + (name == "quaternion"),)
-            if wrong or (name != "rate" and not np.isfinite(value).all()):
+            if name != "rate" and not np.isfinite(value).all():
                 self._not_finite += 1
                 self._rejection = f"{name} = {value.tolist()}"
                 return None
-        norm, field = float(np.linalg.norm(values["quaternion"])), values["field"]
-        if abs(norm - 1.0) > _NORM_TOLERANCE or np.abs(field).max() > self._field_range:
-            self._out_of_range += 1
-            self._rejection = f"field {field.tolist()} T, beyond {self._field_range:g} T"
-            if abs(norm - 1.0) > _NORM_TOLERANCE:
-                self._rejection = f"quaternion of norm {norm:.3g}, not 1"
-            return None
-        rate = values["rate"]
+        norm, field, rate = float(np.linalg.norm(values["quaternion"])), values["field"], values["rate"]
+        shapes = {name: value.shape for name, value in values.items() if value.shape != _SHAPES[name]}
+        problem = ""
+        if shapes:
+            problem = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items())
+        elif abs(norm - 1.0) > _NORM_TOLERANCE:
+            problem = f"quaternion of norm {norm:.3g}, not 1"
+        elif np.abs(field).max() > self._field_range:
+            problem = f"field {field.tolist()} T, beyond {self._field_range:g} T"
+        wrong = bool(problem)
         if not np.isfinite(rate).all():
             values["rate"] = _NO_RATE
-        elif np.abs(rate).max() > LARGEST_RATE:
+        elif not wrong and np.abs(rate).max() > LARGEST_RATE:
+            problem = f"rate {rate.tolist()} rad/s, beyond {LARGEST_RATE:.3g} rad/s"
+        if problem:
             self._out_of_range += 1
-            self._rejection = f"rate {rate.tolist()} rad/s, beyond {LARGEST_RATE:.3g} rad/s"
+            self._rejection = problem
             values["rate"] = _NO_RATE
-        return reading._replace(**values)
+        return None if wrong else reading._replace(**values)
 
 
 def level_attitude(field: FloatArray, acceleration: FloatArray) -> FloatArray:

@@ -156,7 +156,7 @@ class ForeignUnit:
     [
         ({"field": np.array([0.0, np.nan, 0.0])}, (1, 3), "field = [0.0, nan, 0.0]"),
         ({"acceleration": np.array([np.inf, 0.0, 0.0])}, (1, 3), "acceleration = [inf"),
-        ({"field": np.zeros(4)}, (1, 3), "field = [0.0, 0.0, 0.0, 0.0]"),
+        ({"field": np.zeros(4)}, (2, 2), "field of shape (4,)"),
         ({"field": np.array([0.0, 45.0, 0.0])}, (2, 2), "field [0.0, 45.0, 0.0] T, beyond 0.0006 T"),
         ({"quaternion": np.array([0.0, 0.0, 0.0, 2.0])}, (2, 2), "quaternion of norm 2, not 1"),
     ],
@@ -175,7 +175,7 @@ def test_implausible_readings_of_a_foreign_driver_are_counted_and_omitted(
 
 
 def test_a_rate_in_counts_counts_as_no_rate() -> None:
-    foreign = ForeignUnit({"rate": np.array([310, -2, 7])}, {"rate": np.full(3, np.nan)}, {"rate": [1, 2, 3]})
+    foreign = ForeignUnit({"rate": np.array([310, -2, 7])}, {"rate": [1.0, np.nan, 0.0]}, {"rate": [1, 2, 3]})
     unit = CheckedUnit(foreign, 6e-4)
     unit.configure()
     in_counts, invalid, fast = unit.poll()
