@@ -23,7 +23,7 @@ from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
 from ground.telemetry import decode, scan
 from knightcube.astro.quaternion import angle_between
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -45,7 +45,10 @@ class PacketSource(Protocol):
         """Time (s) since the last packet."""
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name that arrived since the last call, or raise FlightError or UsageError."""
+        """Return the packets by name that arrived since the last call.
+
+        Raises KnightCubeError or UsageError.
+        """
 
 
 class LogTail:
@@ -133,7 +136,7 @@ def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAn
             (row,) = packets[COMMAND.name]
         except UsageError:
             raise
-        except (FlightError, TelemetryError, ValueError):
+        except (KnightCubeError, TelemetryError, ValueError):
             if time.monotonic() - answered > patience or ended.wait(min(1.0, patience)):
                 return
             continue

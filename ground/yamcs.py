@@ -39,7 +39,7 @@ from ground.documentation import foreign_modes, layouts_for
 from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, TELECOMMANDS, UNUSED, document, spread
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 if TYPE_CHECKING:
     from ground.documentation import Body
@@ -328,7 +328,7 @@ def class_path() -> str:
 def compile_link(folder: Path) -> None:
     """Write the source of the data link into a folder and compile it.
 
-    Raises UsageError if the folder cannot be written, and FlightError with the compiler's text.
+    Raises UsageError if the folder cannot be written, and KnightCubeError with the compiler's text.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -340,7 +340,7 @@ def compile_link(folder: Path) -> None:
     command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise FlightError(f"the data link cannot be compiled:\n{done.stdout}{done.stderr}")
+        raise KnightCubeError(f"the data link cannot be compiled:\n{done.stdout}{done.stderr}")
 
 
 def command_line(folder: Path) -> list[str]:

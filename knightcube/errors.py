@@ -10,10 +10,6 @@ class KnightCubeError(Exception):
     """
 
 
-FlightError = KnightCubeError
-"""Name of the base class in the flight application."""
-
-
 class UsageError(KnightCubeError):
     """Error made by the user, such as a file that is not an image or an argument that is out of range.
 

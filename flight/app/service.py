@@ -72,7 +72,7 @@ from hal.guardian import GuardianLine
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Ticker
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 if TYPE_CHECKING:  # see `flight.app.run`
     from flight.loop.flight_loop import FlightLoop
@@ -86,7 +86,7 @@ J = TypeVar("J")
 T = TypeVar("T")
 
 
-class StoppedError(FlightError):
+class StoppedError(KnightCubeError):
     """A signal arrived before the flight or the link had begun."""
 
 
@@ -148,7 +148,7 @@ def retried_start(
                     result = attempt(judged, trial)
                     stack.push(trial.pop_all())
                     return result
-            except (FlightError, DeviceError, OSError) as error:
+            except (KnightCubeError, DeviceError, OSError) as error:
                 problem = str(error)
         retry.wait(problem, pause)
     raise AssertionError("the pauses do not end")
@@ -165,7 +165,7 @@ def pauses() -> Iterator[float]:
 _LARGEST_POWERED = 64
 
 
-class InhibitedError(FlightError):
+class InhibitedError(KnightCubeError):
     """Raised while the separation inhibit lasts. The error text states the remaining time."""
 
 

@@ -38,7 +38,7 @@ from flight.link.telemetry.packets import (
     crc16,
     to_text,
 )
-from knightcube.errors import FlightError, UsageError, shown
+from knightcube.errors import KnightCubeError, UsageError, shown
 from knightcube.gnc.guidance.plant import Q2_LIMIT
 from knightcube.gnc.guidance.pointing_target import NUMBERS, Goal, PointingTarget
 
@@ -139,7 +139,7 @@ LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
 """Layouts of the command packets by name."""
 
 
-class CommandError(FlightError):
+class CommandError(KnightCubeError):
     """Raised for bytes or values that are not a valid command. The error text states the reason."""
 
 

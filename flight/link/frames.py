@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, UNSEGMENTED, crc16
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 TELECOMMAND_HEADER = struct.Struct(">HHB")
 LONGEST_FRAME = 1024
@@ -31,7 +31,7 @@ _BYPASS = 1 << 13
 _CHANNEL_BITS = 10
 
 
-class FrameError(FlightError):
+class FrameError(KnightCubeError):
     """Raised for bytes that are not a frame of this link. The error text states the reason."""
 
 

@@ -49,7 +49,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from flight.link.files.store import locked, overwrite, read_regular
 from flight.link.frames import FrameError
 from flight.link.telemetry.packets import crc16
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 SPI_BYTES = 2
 IV_BYTES = 12
@@ -190,14 +190,16 @@ class Vault:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against writes by other processes. Raises FlightError if that is impossible."""
+        """Lock the folder against writes by other processes. Raises KnightCubeError if that is impossible."""
         with ExitStack() as stack:
             try:
                 file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
                 stack.callback(os.close, file)
                 fcntl.flock(file, fcntl.LOCK_EX)
             except OSError as error:
-                raise FlightError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
+                raise KnightCubeError(
+                    f"{self._folder}: cannot be written: {error.strerror or error}"
+                ) from error
             yield
 
     @contextmanager
@@ -239,7 +241,7 @@ class Vault:
                 if newest is not None and newest >= association:
                     return self.copies(association.spi)
                 return self.write(association)
-        except FlightError:
+        except KnightCubeError:
             return 0
 
     def remove(self, name: int | str) -> None:
@@ -342,7 +344,7 @@ class Refusal(Enum):
     UNSTORED = "its counter could not be stored"
 
 
-class RefusedError(FlightError):
+class RefusedError(KnightCubeError):
     """Raised for a refused frame. The attribute `counter` is None unless the frame is authentic."""
 
     def __init__(self, cause: Refusal, spi: int = 0, counter: int | None = None) -> None:
@@ -508,7 +510,10 @@ class Sealer:
         return True
 
     def seal(self, header: bytes, data: bytes) -> tuple[bytes, int]:
-        """Return a protected frame, without CRC, and its counter. Raises FlightError without a counter."""
+        """Return a protected frame, without CRC, and its counter.
+
+        Raises KnightCubeError without a counter.
+        """
         if self._next == self._end or (self._shared and self._is_overtaken()):
             self._reserve()
         assert self._cipher is not None
@@ -526,14 +531,14 @@ class Sealer:
         with self._vault.locked():
             entry = self._vault.read(self._name)
             if entry is None:
-                raise FlightError(
+                raise KnightCubeError(
                     f"both copies of the counter of SPI {self._spi} are lost: use the reserve SPI"
                 )
             reserved = replace(entry, unused=entry.unused + self._block)
             if reserved.unused > HIGHEST_COUNTER:
-                raise FlightError(f"the counters of SPI {self._spi} are used up: change its key")
+                raise KnightCubeError(f"the counters of SPI {self._spi} are used up: change its key")
             if self._vault.write(reserved, self._name) == 0:
-                raise FlightError(f"the counter of SPI {self._spi} cannot be stored")
+                raise KnightCubeError(f"the counter of SPI {self._spi} cannot be stored")
         self._next, self._end, self._generation = entry.unused, reserved.unused, entry.generation
         self._cipher = entry.cipher
 

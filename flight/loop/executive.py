@@ -46,7 +46,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 from flight.loop.worker import LONGEST_BYTES, SLAB_BYTES, message_length, pack_trusted, unpack_values
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.compiled import compilation_ns
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 Outcome = Literal["done", "failed", "timed-out", "died"]
 
@@ -187,7 +187,7 @@ class RateGroup:
 
     def __init__(self, name: str, period_ns: int, task: Task) -> None:
         if period_ns <= 0:
-            raise FlightError(f"rate group {name}: a period of {period_ns} ns is not positive")
+            raise KnightCubeError(f"rate group {name}: a period of {period_ns} ns is not positive")
         self.name, self.period_ns, self.task = name, period_ns, task
         self.cycles = self.completed = self.slips = self.overruns = self.total_execution_ns = 0
         self.max_execution_ns = self._slot = self._epoch_ns = self.due_ns = 0
@@ -389,21 +389,24 @@ class WorkerProcess:
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
-        """Submit a job. Raises FlightError if the job is too large, and EOFError if the process has ended."""
+        """Submit a job.
+
+        Raises KnightCubeError if the job is too large, and EOFError if the process has ended.
+        """
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
-            raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
+            raise KnightCubeError(f"a job for {self._name} of {len(message)} bytes is too large")
         try:
             sent = self._socket.send(message)
         except ConnectionError as error:
             raise EOFError(self._name) from error
         if sent != len(message):
-            raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
+            raise KnightCubeError(f"a job for {self._name} of {len(message)} bytes is too large")
 
     def receive(self) -> JobAnswer | None:
         """Return an answer, or None if no answer has arrived.
 
-        Raises EOFError if the process has ended, and FlightError for a damaged answer.
+        Raises EOFError if the process has ended, and KnightCubeError for a damaged answer.
         """
         try:
             while chunk := self._socket.recv(1 << 16):
@@ -422,7 +425,7 @@ class WorkerProcess:
                 case ("done" | "failed" as outcome, value, str(text), int(execution_ns)):
                     return outcome, value, text, execution_ns
                 case _:
-                    raise FlightError("the answer does not belong to a job")
+                    raise KnightCubeError("the answer does not belong to a job")
         return None
 
     def end(self) -> str:

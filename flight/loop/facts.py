@@ -30,7 +30,7 @@ from flight.loop.executive import JobRunner
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import COIL_NAMES
 from hal.interfaces.wires import Clock, Ticker
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 THROTTLE_NS = 5_000_000_000
 
@@ -200,7 +200,7 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 
 
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
-    """Check the table of monitored conditions, and raise FlightError with the name of an invalid row.
+    """Check the table of monitored conditions, and raise KnightCubeError with the name of an invalid row.
 
     `modes_of` is a function that returns the modes in which a reaction has an effect. A condition is invalid
     if the reaction to its event has no effect in any mode in which the condition is monitored.
@@ -208,12 +208,12 @@ def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]
     seen: set[str] = set()
     for fact in facts:
         if fact.name in seen:
-            raise FlightError(f"condition {fact.name} is listed twice in the table")
+            raise KnightCubeError(f"condition {fact.name} is listed twice in the table")
         seen.add(fact.name)
         if fact.after < 1 or fact.mended_after < 1:
-            raise FlightError(f"condition {fact.name}: the numbers of updates must be at least 1")
+            raise KnightCubeError(f"condition {fact.name}: the numbers of updates must be at least 1")
         if not fact.modes & modes_of(fact.begins.reaction):
-            raise FlightError(
+            raise KnightCubeError(
                 f"condition {fact.name}: its reaction {fact.begins.reaction.name.lower()} has no effect "
                 "in any mode in which the condition is monitored"
             )

@@ -26,7 +26,7 @@ from flight.loop.state import CRASH_WINDOW
 from flight.loop.steering import Steering
 from flight.schema.document import ConfigError
 from flight.schema.sections import Detumble, Modes
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.guidance.pointing_target import SUN, PointingTarget
 
@@ -147,32 +147,32 @@ TRANSITIONS: Table = {
 
 
 def check(table: Table) -> None:
-    """Check a transition table, and raise FlightError for the first error."""
+    """Check a transition table, and raise KnightCubeError for the first error."""
     for mode in Mode:
         row = table.get(mode)
         if row is None:
-            raise FlightError(f"mode table: {mode.label} has no row")
+            raise KnightCubeError(f"mode table: {mode.label} has no row")
         for trigger in Trigger:
             if trigger not in row:
-                raise FlightError(f"mode table: {mode.label} has no entry for {trigger.value!r}")
+                raise KnightCubeError(f"mode table: {mode.label} has no entry for {trigger.value!r}")
         for trigger in SAFING:
             if row[trigger] is not Mode.SAFE and not (
                 mode is Mode.SAFE and row[trigger] is TriggerAnswer.STAY
             ):
-                raise FlightError(
+                raise KnightCubeError(
                     f"mode table: trigger {trigger.value!r} does not change {mode.label} to safe"
                 )
         if not any(isinstance(to, Mode) and to is not mode for to in row.values()):
-            raise FlightError(f"mode table: {mode.label} is a dead end")
+            raise KnightCubeError(f"mode table: {mode.label} is a dead end")
         if mode is not Mode.BOOT and Mode.BOOT in row.values():
-            raise FlightError(f"mode table: {mode.label} leads back to boot, which is for the start only")
+            raise KnightCubeError(f"mode table: {mode.label} leads back to boot, which is for the start only")
     reached, ahead = {Mode.BOOT}, [Mode.BOOT]
     while ahead:
         found = {to for to in table[ahead.pop()].values() if isinstance(to, Mode)} - reached
         reached |= found
         ahead += found
     if lost := set(Mode) - reached:
-        raise FlightError(f"mode table: {min(lost).label} cannot be reached from boot")
+        raise KnightCubeError(f"mode table: {min(lost).label} cannot be reached from boot")
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ class ModeMachine:
     """
 
     def __init__(self, table: Table = TRANSITIONS) -> None:
-        """Begin in BOOT. Raises FlightError for an invalid transition table."""
+        """Begin in BOOT. Raises KnightCubeError for an invalid transition table."""
         check(table)
         self._table = table
         self.mode = Mode.BOOT
@@ -372,7 +372,7 @@ class ModeControl:
     ) -> None:
         """Connect the machine with body and steering; `stop`, given a reason, ends the flight.
 
-        Raises FlightError and ConfigError.
+        Raises KnightCubeError and ConfigError.
         """
         facts.check(facts.FACTS, modes_moved_by)
         self._settings, self._stop = modes, stop

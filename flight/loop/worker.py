@@ -44,7 +44,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 Array = npt.NDArray[Any]
 _PLAIN = (bool, int, float, str, bytes, type(None))
@@ -55,13 +55,13 @@ _MOST_DIMENSIONS = 32
 
 
 def encode_values(value: Any) -> tuple[bytes, list[Array]]:
-    """Return the encoded bytes of a value, and its arrays. Raises FlightError for an unsupported type."""
+    """Return the encoded bytes of a value, and its arrays. Raises KnightCubeError for an unsupported type."""
     arrays: list[Array] = []
     tree = _tree(value, arrays)
     try:
         return msgspec.msgpack.encode(tree), arrays
     except (OverflowError, UnicodeError) as error:
-        raise FlightError(f"no value to be sent: {error}") from error
+        raise KnightCubeError(f"no value to be sent: {error}") from error
 
 
 def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:
@@ -92,7 +92,7 @@ def _tree_of_class(value: Any, name: str, arrays: list[Array]) -> list[Any]:
     if isinstance(value, enum.Enum):
         return ["enum", name, value.name]
     if (parts := _field_names(type(value))) is None:
-        raise FlightError(f"a worker cannot send this value of class {name!r}")
+        raise KnightCubeError(f"a worker cannot send this value of class {name!r}")
     return ["fields", name, [_tree(getattr(value, part), arrays) for part in parts]]
 
 
@@ -124,20 +124,20 @@ class _Reader:
                 return _array(dtype, [], next(self._buffers))[()]
             case ["flag" | "enum" as tag, str(name), member]:
                 return _member(name, tag, member)
-        raise FlightError(f"{str(tree)[:80]!r} does not encode a value")
+        raise KnightCubeError(f"{str(tree)[:80]!r} does not encode a value")
 
 
 def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
     """Return a writable array of numbers, which must have the size of its buffer."""
     if dtype not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
-        raise FlightError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
+        raise KnightCubeError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
     if not all(type(length) is int and length >= 0 for length in shape):
-        raise FlightError("the shape of an array is not a list of lengths")
+        raise KnightCubeError("the shape of an array is not a list of lengths")
     kind = np.dtype(dtype)
     if math.prod(shape) * kind.itemsize != len(buffer):
-        raise FlightError(f"an array of {dtype} and shape {shape} does not fill {len(buffer)} bytes")
+        raise KnightCubeError(f"an array of {dtype} and shape {shape} does not fill {len(buffer)} bytes")
     if kind.kind == "b" and buffer.translate(None, b"\0\1"):
-        raise FlightError("a boolean is neither 0 nor 1")
+        raise KnightCubeError("a boolean is neither 0 nor 1")
     return np.frombuffer(buffer, kind).reshape(shape) if buffer else np.zeros(shape, kind)
 
 
@@ -145,7 +145,7 @@ def _built(name: str, items: list[Any]) -> Any:
     kind: Any = _class(name)
     parts = _field_names(kind)
     if parts is None or len(parts) != len(items):
-        raise FlightError(f"{name!r} is not a class with {len(items)} fields")
+        raise KnightCubeError(f"{name!r} is not a class with {len(items)} fields")
     if issubclass(kind, tuple):
         return tuple.__new__(kind, items)
     value = object.__new__(kind)
@@ -157,7 +157,7 @@ def _built(name: str, items: list[Any]) -> Any:
 def _member(name: str, tag: str, member: Any) -> Any:
     kind = _class(name)
     if not issubclass(kind, enum.Enum) or issubclass(kind, enum.Flag) != (tag == "flag"):
-        raise FlightError(f"{name!r} is not a class of kind {tag!r}")
+        raise KnightCubeError(f"{name!r} is not a class of kind {tag!r}")
     if tag == "flag":
         return kind(operator.index(member))
     return kind[member]
@@ -167,7 +167,7 @@ def _class(name: str) -> type:
     module, _, qualified = name.partition(":")
     found = getattr(sys.modules.get(module), qualified, None)
     if not isinstance(found, type):
-        raise FlightError(f"{name!r} is not a class that the control process has defined")
+        raise KnightCubeError(f"{name!r} is not a class that the control process has defined")
     return found
 
 
@@ -188,7 +188,10 @@ _HEADER = struct.Struct("<QQI")
 
 
 def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
-    """Pickle a value, with large buffers in the memory `slab`. Raises FlightError for a too small `slab`."""
+    """Pickle a value, with large buffers in the memory `slab`.
+
+    Raises KnightCubeError for a too small `slab`.
+    """
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
     return _framed(body, [buffer.raw() for buffer in buffers], slab)
@@ -201,34 +204,40 @@ def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
 
 
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
-    """Encode a value for a receiver that does not trust the sender. Raises FlightError for another type."""
+    """Encode a value for a receiver that does not trust the sender.
+
+    Raises KnightCubeError for another type.
+    """
     body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
 
 
 def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
-    """Return the value in a message from `pack_values`. Raises FlightError for a damaged message."""
+    """Return the value in a message from `pack_values`. Raises KnightCubeError for a damaged message."""
     try:
         return decode_values(*_parts(message, slab))
-    except FlightError:
+    except KnightCubeError:
         raise
     except Exception as error:  # damaged data may raise any exception
-        raise FlightError(f"unreadable: {type(error).__name__}: {str(error)!r}") from error
+        raise KnightCubeError(f"unreadable: {type(error).__name__}: {str(error)!r}") from error
 
 
 def message_length(data: bytes | bytearray) -> int | None:
-    """Return the length of the message at the start of `data`, or None if incomplete. Raises FlightError."""
+    """Return the length of the message at the start of `data`, or None if incomplete.
+
+    Raises KnightCubeError.
+    """
     if len(data) < _HEADER.size:
         return None
     head_length, body_length, _ = _HEADER.unpack_from(data)
     if (length := _HEADER.size + int(head_length) + int(body_length)) > LONGEST_BYTES:
-        raise FlightError(f"a message of {length} bytes is damaged")
+        raise KnightCubeError(f"a message of {length} bytes is damaged")
     return length
 
 
 def _framed(body: bytes, views: Sequence[memoryview], slab: mmap.mmap) -> bytes:
     if sum(view.nbytes for view in views) > len(slab):
-        raise FlightError(f"a job's arrays exceed the {len(slab)} bytes that a worker's memory holds")
+        raise KnightCubeError(f"a job's arrays exceed the {len(slab)} bytes that a worker's memory holds")
     offset = 0
     for view in views:
         slab[offset : offset + view.nbytes] = view
@@ -241,7 +250,7 @@ def _parts(message: bytes, slab: mmap.mmap) -> tuple[bytes, list[bytearray]]:
     head_length, body_length, crc = _HEADER.unpack_from(message)
     head_end = _HEADER.size + head_length
     if zlib.crc32(message[_HEADER.size : head_end + body_length]) != crc:
-        raise FlightError("a message with a wrong checksum is damaged")
+        raise KnightCubeError("a message with a wrong checksum is damaged")
     buffers = []
     offset = 0
     with memoryview(slab) as view:
@@ -275,7 +284,7 @@ def _answer(function: Any, argument: Any, slab: mmap.mmap) -> bytes:
     outcome = _run(function, argument)
     try:
         return pack_values(outcome, slab)
-    except FlightError as error:
+    except KnightCubeError as error:
         return pack_values(("failed", None, str(error), outcome[3]), slab)
 
 

@@ -26,7 +26,7 @@ from ground.report import drawing, summarise
 from ground.telemetry import read_run
 from hal.interfaces.errors import DeviceError
 from knightcube.astro.arrays import FloatArray
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from sim_hal.settings import Simulation
 
 _DRAWS = 100
@@ -140,7 +140,7 @@ def _case(
         try:
             configuration.parse(text, "drawn values")
             configuration.simulation_section(text, "drawn values", Simulation)
-        except FlightError as error:
+        except KnightCubeError as error:
             refusal = str(error)
             continue
         parameters = {"config": text, "drawn": drawn, "duration": duration}
@@ -215,7 +215,7 @@ def fly_case(case: Case) -> Result:
         try:
             flown = fly(request)
             report = summarise(read_run(request.out))
-        except (FlightError, DeviceError) as error:
+        except (KnightCubeError, DeviceError) as error:
             return found | {"error": str(error), "config": given["config"]}
     if flown.interrupted:  # Ctrl-C also reaches the worker processes
         raise KeyboardInterrupt

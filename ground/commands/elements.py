@@ -28,7 +28,7 @@ from knightcube.astro.earth.omm import NamedElements, read_elements
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from knightcube.gnc.guidance.pointing_target import Goal
 from sim_hal.settings import OrbitSection, Simulation
 from sim_hal.worlds.orbit import elements, julian_date, propagate
@@ -396,7 +396,7 @@ def predicted(
         from ground.passes import OrbitPrediction, read_stations, station_of  # noqa: PLC0415
     except ModuleNotFoundError as error:
         needed = "pip install 'knightcube-flight[ground]'"
-        raise FlightError(f"predicting passes needs {error.name}: {needed}") from error
+        raise KnightCubeError(f"predicting passes needs {error.name}: {needed}") from error
     if options.days > _LONGEST_DAYS:
         raise UsageError(f"--days {options.days:g}: must be at most {_LONGEST_DAYS:g}")
     stations = tuple(map(station_of, options.station))

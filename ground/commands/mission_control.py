@@ -29,7 +29,7 @@ from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.link.terminal import DEFAULTS
 from ground.telemetry import decode
 from ground.xtce import EPOCH
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 if TYPE_CHECKING:
     from flight.schema.sections import Link
@@ -79,7 +79,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run Yamcs, and the gateway unless a run is replayed, until a signal arrives or Yamcs ends."""
     if problem := yamcs.missing():
-        raise FlightError(problem)
+        raise KnightCubeError(problem)
     if options.speed is not None and options.recorded is None:
         raise UsageError("--speed: replays a recorded run: give --recorded RUN")
     packets = None if options.recorded is None else _packets(options.recorded)
@@ -122,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
             time.sleep(_ASK_S) if gateway is None else gateway.turn(_ASK_S)
         if not signals.received:
             name, process = next(one for one in running.items() if one[0] == "Yamcs" or _failed(one[1]))
-            raise FlightError(f"{name} has ended with status {process.wait()}: see the logs in {folder}")
+            raise KnightCubeError(f"{name} has ended with status {process.wait()}: see the logs in {folder}")
     return 0
 
 
@@ -135,7 +135,7 @@ def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess
     until = time.monotonic() + _START_S
     while link.poll() is None and "link open" not in (folder / "link.log").read_text(encoding="utf-8"):
         if time.monotonic() > until:
-            raise FlightError(f"the link could not be opened: see {folder / 'link.log'}")
+            raise KnightCubeError(f"the link could not be opened: see {folder / 'link.log'}")
         time.sleep(_ASK_S)
     words = ["run", str(config), "--realtime", "--archive", str(runs)]
     return {"the link": link, _FLIGHT: _process([*command, *words], folder / "flight.log", stack)}
@@ -144,14 +144,17 @@ def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess
 def _first_packets(
     folder: Path, earlier: Sequence[Path], running: Mapping[str, subprocess.Popen[bytes]]
 ) -> list[bytes]:
-    """Wait for the first packets of the flight and return them. Raises FlightError if no packets arrive."""
+    """Wait for the first packets of the flight and return them.
+
+    Raises KnightCubeError if no packets arrive.
+    """
     until = time.monotonic() + _START_S
     while time.monotonic() < until and running[_FLIGHT].poll() is None:
         new = [run for run in find_runs(folder / _RUNS) if run not in earlier]
         if new and find_segments(new[0], "flight") and (packets := _packets(new[0])):
             return packets
         time.sleep(_ASK_S)
-    raise FlightError(f"the flight did not begin: see {folder / 'flight.log'}")
+    raise KnightCubeError(f"the flight did not begin: see {folder / 'flight.log'}")
 
 
 def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
@@ -262,7 +265,7 @@ def _started(port: int, folder: Path, forecast: _Forecast | None, ended: Callabl
         try:
             yamcs.add_passes(session, yamcs.INSTANCE, *forecast)
         except OSError as error:
-            raise FlightError(f"Yamcs refuses the passes: {error}: see {folder / 'log'}") from error
+            raise KnightCubeError(f"Yamcs refuses the passes: {error}: see {folder / 'log'}") from error
     return True
 
 

@@ -28,7 +28,7 @@ from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
 from ground.commands.options import positive
 from ground.link.commanding import add_link_options, command, explained, failed, sha256_of, terminal_of
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
 """Expiry date of metadata that never expire, so that a wrong clock on board does not matter."""
@@ -211,7 +211,7 @@ def _command(options: argparse.Namespace) -> int:
     if failed(reports) or has_begun(reports):
         return int(bool(failed(reports)))
     if not reports[-1].stage.final:
-        raise FlightError(
+        raise KnightCubeError(
             f"no result of the renewal within {timeout:g} s: look at the telemetry, and send `confirm` or "
             "`withdraw`; the reply to either states whether a trial is running"
         )

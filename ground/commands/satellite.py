@@ -54,7 +54,7 @@ from ground.link.commanding import (
 from ground.link.commanding import command as send
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, text_of
-from knightcube.errors import FlightError, UsageError, shown
+from knightcube.errors import KnightCubeError, UsageError, shown
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 Object = dict[str, Any]
@@ -200,7 +200,7 @@ def run_command(options: argparse.Namespace) -> int:
         (row,) = decode(raw)[COMMAND.name]
         mode = Mode(int(row["mode"]))
     except (TelemetryError, ValueError) as error:
-        raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
+        raise KnightCubeError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
     done, text = bool(row["obeyed"]), text_of(row["text"])
     facts = {"obeyed": done, "mode": mode.label, "text": text, "count": int(row["count"])}
     print_result(options, facts, f"{'obeyed' if done else 'refused'}: {text}; mode {mode.label}\n")
@@ -328,7 +328,7 @@ def run_parameters(options: argparse.Namespace) -> int:
     changes = dict(map(_change, options.changes))
     before, _ = _ask(options, commands.DumpParameters())
     if before is None:
-        raise FlightError("the flight sent no table of parameters: repeat it or use a longer --timeout")
+        raise KnightCubeError("the flight sent no table of parameters: repeat it or use a longer --timeout")
     wanted = {**(file or before.values), **changes}
     if problem := commands.problem_of(wanted):
         raise UsageError(problem)
@@ -340,7 +340,7 @@ def run_parameters(options: argparse.Namespace) -> int:
         flown = (_ask(options, commands.DumpParameters())[0] or before) if not refused else before
         if not refused and flown.crc != commands.crc_of([wanted[key] for key in PARAMETER_KEYS]):
             problem = f"the flight uses table {flown.crc:08x}, not the one that was sent"
-            raise FlightError(f"{problem}: check it with another call")
+            raise KnightCubeError(f"{problem}: check it with another call")
     _show(flown, before, refused, options.json)
     if options.save is not None:
         sections: dict[str, dict[str, float]] = {}
@@ -359,7 +359,7 @@ def _ask(options: argparse.Namespace, command: commands.Command) -> tuple[Parame
     found = decode(exchange(options.to, packet, options.timeout))
     answers, tables = found[COMMAND.name], found[PARAMETERS.name]
     if not len(answers):
-        raise FlightError(f"{options.to}: its answer has no report on the command")
+        raise KnightCubeError(f"{options.to}: its answer has no report on the command")
     refused = "" if answers[-1]["obeyed"] else text_of(answers[-1]["text"])
     return (ParameterTable.of(tables[-1]) if len(tables) else None), refused
 
@@ -388,7 +388,7 @@ def _ask_by_link(
             if refused or (refused is not None and (table is not None or not wants_table)):
                 break
     if refused is None:
-        raise FlightError(f"{options.link}: no answer within {options.timeout:g} s")
+        raise KnightCubeError(f"{options.link}: no answer within {options.timeout:g} s")
     return table, refused
 
 
@@ -517,7 +517,7 @@ class _FileWork:
         self._shown_s = 0.0
 
     def obey(self, options: argparse.Namespace) -> Object:
-        """Return the result of the file command. Raises FlightError."""
+        """Return the result of the file command. Raises KnightCubeError."""
         match options.what:
             case "list":
                 path = self._get(directives.ListFiles(options.under), LISTING)
@@ -574,16 +574,16 @@ class _FileWork:
         return {"text": f"completed: {directive}"}
 
     def _turn(self, name: str) -> None:
-        """Transfer for a moment. Raises FlightError after a signal or a long silence."""
+        """Transfer for a moment. Raises KnightCubeError after a signal or a long silence."""
         if select.select([self._terminal], [], [], _TURN_S)[0]:
             self._session.take(self._terminal.take(), time.monotonic_ns())
         now_ns = time.monotonic_ns()
         self._session.transmit(now_ns)
         kept = "; the received data is kept: run the same command again to continue" if name else ""
         if self._ended():
-            raise FlightError(f"ended by a signal{kept}")
+            raise KnightCubeError(f"ended by a signal{kept}")
         if now_ns - self._session.received_ns > self._patience_s * 1e9:
-            raise FlightError(f"no packet for {self._patience_s:g} s{kept}")
+            raise KnightCubeError(f"no packet for {self._patience_s:g} s{kept}")
         if name and now_ns * 1e-9 - self._shown_s >= _SHOW_S:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():

@@ -37,7 +37,7 @@ from ground.watch import (
     panel,
     state_line,
 )
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from knightcube.vision.camera import images
 
 if TYPE_CHECKING:
@@ -307,7 +307,7 @@ def run_console(options: argparse.Namespace) -> int:
         from ground.console.server import Access, application  # noqa: PLC0415
     except ModuleNotFoundError as error:
         needed = "pip install 'knightcube-flight[ground]'"
-        raise FlightError(f"the console needs {error.name}: {needed}") from error
+        raise KnightCubeError(f"the console needs {error.name}: {needed}") from error
     if (options.run is None) == (options.link is None):
         raise UsageError("give RUN, the folder of a run (with --fly: a new folder), or --link ADDRESS")
     address = _listening(options.port)

@@ -39,12 +39,12 @@ from ground.documentation import Body, commands_for, foreign_modes, layouts_for
 from ground.link.commanding import FileSession, exchange, explained, no_answer, obeyed, sha256_of
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, scan
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 Object = dict[str, Any]
 Send = Callable[[bytes], Object]
 """Function that sends a command packet and returns the answer with `obeyed` and `text`. Raises
-FlightError."""
+KnightCubeError."""
 _TIMEOUT_S = 3.0  # longest time (s) to wait for an answer from a socket
 _LISTEN_S = 0.02  # longest time (s) for which one read of a link waits
 _PING_AFTER_S = 2.0
@@ -65,7 +65,7 @@ def by_socket(to: str) -> Send:
     def send(packet: bytes) -> Object:
         answers = decode(exchange(to, packet, _TIMEOUT_S))["command"]
         if not len(answers):
-            raise FlightError(f"{to}: the answer has no report on the command")
+            raise KnightCubeError(f"{to}: the answer has no report on the command")
         return values(answers[-1])
 
     return send
@@ -101,7 +101,7 @@ class CommandForms:
     def obey(self, name: str, given: Object) -> Object:
         """Send a command and return the answer.
 
-        Raises UsageError for invalid values, and FlightError if no answer arrives.
+        Raises UsageError for invalid values, and KnightCubeError if no answer arrives.
         """
         if self._send is None:
             raise UsageError("this console is read-only: start it with --to or --link to send commands")
@@ -207,7 +207,7 @@ class LinkFeed:
         return time.monotonic() - self._received
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name received since the last call. Raises FlightError."""
+        """Return the packets by name received since the last call. Raises KnightCubeError."""
         with self.lock:
             now = time.monotonic()
             if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
@@ -232,7 +232,10 @@ class LinkFeed:
         return found
 
     def send(self, packet: bytes) -> Object:
-        """Send a command and return its state after acceptance. Raises FlightError if no report arrives."""
+        """Send a command and return its state after acceptance.
+
+        Raises KnightCubeError if no report arrives.
+        """
         with self.lock:
             counter = self._terminal.send(packet, _SPI)
         until = time.monotonic() + _ANSWER_S
@@ -250,7 +253,7 @@ class LinkFeed:
     def transferring(self, store: Store, rate: float) -> Iterator[FileSession]:
         """Yield a session of file transfers, to which `new` passes the received packets.
 
-        Raises FlightError.
+        Raises KnightCubeError.
         """
         with self.lock:
             session = FileSession(self._terminal, store, _SPI, rate, time.monotonic_ns())
@@ -271,7 +274,7 @@ class LinkFeed:
 def flying(config: Path, out: Path) -> Iterator[str]:
     """Fly a simulated configuration in real time with logs in `out`, and yield the command socket.
 
-    The flight ends when the context is left. Raises FlightError if the flight does not start.
+    The flight ends when the context is left. Raises KnightCubeError if the flight does not start.
     """
     text = merged_text(read_text(config), str(config))
     parsed = parse(text, str(config))
@@ -290,9 +293,9 @@ def flying(config: Path, out: Path) -> Iterator[str]:
             until = time.monotonic() + _START_S
             while not (out.is_dir() and find_segments(out, "flight")):
                 if flight.poll() is not None:
-                    raise FlightError(f"the flight did not start: {flight.communicate()[1].strip()}")
+                    raise KnightCubeError(f"the flight did not start: {flight.communicate()[1].strip()}")
                 if time.monotonic() > until:
-                    raise FlightError(f"{out}: no flight log after {_START_S:g} s")
+                    raise KnightCubeError(f"{out}: no flight log after {_START_S:g} s")
                 time.sleep(0.05)
             yield socket
         finally:
@@ -319,13 +322,13 @@ class Files(Protocol):
     puts: bool
 
     def listing(self) -> Object:
-        """Return the files as {"files": [{"name", "bytes"}, ...]}. Raises FlightError."""
+        """Return the files as {"files": [{"name", "bytes"}, ...]}. Raises KnightCubeError."""
 
     def get(self, name: str) -> Path:
-        """Return the local copy of a file. Raises FlightError, and UsageError for an invalid name."""
+        """Return the local copy of a file. Raises KnightCubeError, and UsageError for an invalid name."""
 
     def put(self, kind: str, name: str, data: bytes) -> Object:
-        """Upload a file to the satellite. Raises FlightError, and UsageError for an invalid name."""
+        """Upload a file to the satellite. Raises KnightCubeError, and UsageError for an invalid name."""
 
 
 class RunFiles:
@@ -366,18 +369,21 @@ class LinkFiles:
         self._one = threading.Lock()
 
     def listing(self) -> Object:
-        """Request the list of files and return it. Raises FlightError."""
+        """Request the list of files and return it. Raises KnightCubeError."""
         found: Object = json.loads(self._request(ListFiles(), LISTING).read_bytes())
         return found
 
     def get(self, name: str) -> Path:
-        """Request a file and return its local copy. Raises UsageError for a wrong name, and FlightError."""
+        """Request a file and return its local copy.
+
+        Raises UsageError for a wrong name, and KnightCubeError.
+        """
         if problem := problem_of_name(name):
             raise UsageError(f"{name!r:.80}: {problem}")
         return self._request(SendFile(name), name)
 
     def put(self, kind: str, name: str, data: bytes) -> Object:
-        """Upload a file to the satellite and return its name, size and SHA-256. Raises FlightError."""
+        """Upload a file to the satellite and return its name, size and SHA-256. Raises KnightCubeError."""
         full = f"{kind}/{name}"
         problem = problem_of_name(full) or ("" if kind in KINDS else f"the kind is one of {', '.join(KINDS)}")
         if problem:
@@ -412,11 +418,11 @@ class LinkFiles:
             return work(session)
 
     def _wait(self, done: Callable[[], bool]) -> None:
-        """Wait until `done` returns true. Raises FlightError after a long silence."""
+        """Wait until `done` returns true. Raises KnightCubeError after a long silence."""
         while True:
             with self._feed.lock:
                 if done():
                     return
             if self._feed.silence > _SILENCE_S:
-                raise FlightError(f"no telemetry for {_SILENCE_S:g} s; the received data is kept")
+                raise KnightCubeError(f"no telemetry for {_SILENCE_S:g} s; the received data is kept")
             time.sleep(_POLL_S)

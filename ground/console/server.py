@@ -34,7 +34,7 @@ from ground.console.history import MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
 from ground.documentation import Body, add_components, database, endings
 from ground.watch import PacketSource
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
@@ -114,7 +114,7 @@ class Console:
         """Read the new packets. A failure is stored in `trouble`, and the next read tries again."""
         try:
             packets = self.feed.new()
-        except FlightError as error:
+        except KnightCubeError as error:
             self.trouble = str(error)
             return
         self.trouble = ""
@@ -251,7 +251,7 @@ async def _errors_as_json(request: web.Request, handler: _Handler) -> web.Stream
         raise web.HTTPNotFound(text="there is no such page")
     try:
         return await handler(request)
-    except (FlightError, TelemetryError) as error:
+    except (KnightCubeError, TelemetryError) as error:
         status = 400 if isinstance(error, UsageError) else 502
         return web.json_response({"error": str(error)}, status=status)
 

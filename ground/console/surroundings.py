@@ -19,7 +19,7 @@ from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, sunlit_share
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.images import facts_of
 
 Object = dict[str, Any]
@@ -58,7 +58,7 @@ class FlightSurroundings:
         """Return orbit and devices from a configuration file, or `UNKNOWN` if the file cannot be read."""
         try:
             config: Any = load(path)
-        except FlightError:
+        except KnightCubeError:
             return UNKNOWN
         lines, camera, dipole = getattr(config, "elements", None), getattr(config, "camera", None), None
         view = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))

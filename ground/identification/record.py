@@ -16,7 +16,7 @@ import numpy as np
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 MIN_SAMPLES = 200
 MAX_STEP = 0.025
@@ -35,7 +35,7 @@ _MAX_VALUES = {
 """Largest plausible values of recorded quantities, in SI units."""
 
 
-class IdentificationError(FlightError):
+class IdentificationError(KnightCubeError):
     """Error for a record that does not determine the constants; the message says what is missing."""
 
 

@@ -36,7 +36,7 @@ from ground.link.terminal import (
     report_of,
 )
 from ground.telemetry import text_of
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 Show = Callable[[Report], object]
 _BLOCK = 64  # number of frame counters reserved at once, because each reservation takes two disk writes
@@ -51,7 +51,7 @@ _TRANSFER = LAYOUTS[TRANSFER.name]
 def exchange(to: str, data: bytes, timeout: float) -> bytes:
     """Send a packet to a flight process at a UNIX socket or UDP address HOST:PORT, and return the answer.
 
-    Raises FlightError if no answer arrives within `timeout` s, and UsageError for an invalid address or
+    Raises KnightCubeError if no answer arrives within `timeout` s, and UsageError for an invalid address or
     timeout.
     """
     if not 0.0 < timeout < float("inf"):
@@ -79,13 +79,13 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
     try:
         line.sendto(data, address)
     except OSError as error:
-        raise FlightError(f"{to}: no flight listens there: {error.strerror or error}") from error
+        raise KnightCubeError(f"{to}: no flight listens there: {error.strerror or error}") from error
     except OverflowError as error:
         raise UsageError(f"{to}: {error}") from error
     try:
         return line.recv(LONGEST_PACKET)
     except OSError as error:
-        raise FlightError(f"{to}: no answer within {timeout:g} s") from error
+        raise KnightCubeError(f"{to}: no answer within {timeout:g} s") from error
 
 
 def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExclusiveGroup) -> None:
@@ -114,7 +114,7 @@ def ground_files_folder(keys: Path) -> Path:
 def terminal_of(options: argparse.Namespace) -> Terminal:
     """Return the link to the satellite that the command-line options describe.
 
-    Raises UsageError for invalid options, and FlightError if the link cannot be opened.
+    Raises UsageError for invalid options, and KnightCubeError if the link cannot be opened.
     """
     if options.keys is None:
         raise UsageError("--link needs --keys, the ground's folder of `knightcube keys`")
@@ -150,9 +150,9 @@ def explained(report: Report) -> str:
     )
 
 
-def no_answer(seconds: float) -> FlightError:
+def no_answer(seconds: float) -> KnightCubeError:
     """Return the error of a command on which no report arrived for `seconds` s."""
-    return FlightError(
+    return KnightCubeError(
         f"no answer over the link within {seconds:g} s: the command or its reports were lost; look at the "
         "telemetry before you send the command again, because it may have been executed"
     )
@@ -166,7 +166,7 @@ def command(
     show: Show,
     ended: Callable[[list[Report]], bool] = lambda _: False,
 ) -> list[Report]:
-    """Send a command, `show` its reports and return them. Raises FlightError if no report arrives.
+    """Send a command, `show` its reports and return them. Raises KnightCubeError if no report arrives.
 
     The call ends with the final report, when `ended` is true for the list of received reports, or after
     `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
@@ -198,8 +198,8 @@ def change_key(
 
     The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
     confirmed it. If the result of an earlier change is unknown, a ping protected with that change's new key
-    is sent first. Raises UsageError if the satellite would refuse the change, and FlightError if no answer
-    arrives.
+    is sent first. Raises UsageError if the satellite would refuse the change, and KnightCubeError if no
+    answer arrives.
     """
     if not may_change(spi, changed):
         raise UsageError(
@@ -247,7 +247,7 @@ class FileSession:
     """
 
     def __init__(self, terminal: Terminal, store: Store, spi: int, rate: float, now_ns: int) -> None:
-        """Send at most `rate` bytes/s of frames. Raises FlightError."""
+        """Send at most `rate` bytes/s of frames. Raises KnightCubeError."""
         self._terminal = terminal
         self._rate = rate
         self._sealer = terminal.sealer(spi, _BLOCK)
@@ -279,7 +279,7 @@ class FileSession:
         self._counters.add(self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns())))
 
     def put(self, path: Path, name: str, now_ns: int) -> Progress:
-        """Start or continue the transfer of a file to the satellite. Raises FlightError."""
+        """Start or continue the transfer of a file to the satellite. Raises KnightCubeError."""
         return self.entity.send(path, name, SATELLITE, CRC32, utc_ns(), now_ns, NOBODY)
 
     def take(self, packets: Iterable[tuple[int, bytes]], now_ns: int) -> None:
@@ -303,7 +303,7 @@ class FileSession:
                 self._texts[int(row["source"]), int(row["number"])] = text_of(row["text"])
 
     def transmit(self, now_ns: int) -> None:
-        """Send the commands and PDUs that are due, within the rate limit. Raises FlightError."""
+        """Send the commands and PDUs that are due, within the rate limit. Raises KnightCubeError."""
         if self._asked is not None and now_ns >= self._asked[1]:
             self._send(self._asked[0], now_ns)
         self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9
@@ -333,25 +333,30 @@ class FileSession:
     def ended(self, name: str, number: int | None = None) -> bool:
         """Return whether a transfer of a file has ended, and forget all ended transfers.
 
-        If `number` is given, only the transfer with this number is considered. Raises FlightError with the
-        reason if the transfer has failed.
+        If `number` is given, only the transfer with this number is considered. Raises KnightCubeError with
+        the reason if the transfer has failed.
         """
         found = [one for one in self.entity.ended if one.name == name and number in {None, one.number}]
         self.entity.ended.clear()
         for one in found:
             if one.condition != 0:
-                raise FlightError(f"{one.name}: {self.reason_of(one)}")
+                raise KnightCubeError(f"{one.name}: {self.reason_of(one)}")
         return bool(found)
 
     def completed(self) -> bool:
-        """Return whether the satellite has completed a command. Raises FlightError for a failed command."""
+        """Return whether the satellite has completed a command.
+
+        Raises KnightCubeError for a failed command.
+        """
         reports = self.reports()
         if problem := failed(reports):
-            raise FlightError(problem)
+            raise KnightCubeError(problem)
         return any(report.stage is Stage.COMPLETED for report in reports)
 
     def received_file(self, name: str) -> bool:
-        """Return whether a file has been received completely. Raises FlightError if the transfer has failed.
+        """Return whether a file has been received completely.
+
+        Raises KnightCubeError if the transfer has failed.
 
         The satellite reports a transfer as completed after the ground has received the file.
         """
@@ -364,9 +369,9 @@ class FileSession:
 
 
 def sha256_of(path: Path) -> bytes:
-    """Return the SHA-256 of a file. Raises FlightError if the file cannot be read."""
+    """Return the SHA-256 of a file. Raises KnightCubeError if the file cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").digest()
     except OSError as error:
-        raise FlightError(f"{path}: {error.strerror or error}") from error
+        raise KnightCubeError(f"{path}: {error.strerror or error}") from error

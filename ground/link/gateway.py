@@ -32,7 +32,7 @@ from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, SECONDARY_BYTES, crc16
 from ground.link.terminal import FRAME_OVERHEAD_BYTES, Terminal, report_of
 from ground.xtce import TELECOMMANDS
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 ADDRESS = "127.0.0.1:5013"
 
@@ -58,7 +58,7 @@ _LONGEST_PACKET = LONGEST_FRAME - FRAME_OVERHEAD_BYTES
 _SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES
 
 
-class StreamError(FlightError):
+class StreamError(KnightCubeError):
     """Error for a byte that belongs neither to the token nor to a command packet."""
 
 
@@ -161,7 +161,8 @@ def token_path(keys: Path, port: int) -> Path:
 def token_file(path: Path, token: str) -> Iterator[None]:
     """Write a token to a file that only its user can read, and remove the file at the end.
 
-    An old file of a gateway that was killed is replaced. Raises FlightError if the file cannot be written.
+    An old file of a gateway that was killed is replaced. Raises KnightCubeError if the file cannot be
+    written.
     """
     new = path.with_name(f"{path.name}.{os.getpid()}")
     try:
@@ -171,7 +172,7 @@ def token_file(path: Path, token: str) -> Iterator[None]:
             out.write(f"{token}\n")
         new.replace(path)
     except OSError as error:
-        raise FlightError(f"{path}: the token cannot be written: {error.strerror or error}") from error
+        raise KnightCubeError(f"{path}: the token cannot be written: {error.strerror or error}") from error
     try:
         yield
     finally:
@@ -228,7 +229,7 @@ class Gateway:
     def run(self, ended: Callable[[], bool]) -> None:
         """Relay packets until `ended` returns true.
 
-        Raises FlightError if the line to the satellite was closed.
+        Raises KnightCubeError if the line to the satellite was closed.
         """
         while not ended():
             self.turn(0.2)

@@ -26,7 +26,7 @@ from flight.link.telemetry.definitions import LINK, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS
 from flight.schema.sections import Link, LinkCoding
 from ground.telemetry import text_of
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 DEFAULTS = Link(keys="-")
 """Link settings that are used without a configuration."""
@@ -96,10 +96,10 @@ class GroundLine(Protocol):
         """Return the file descriptor for `select`."""
 
     def receive(self) -> list[bytes]:
-        """Return the received frames. Raises FlightError if the line was closed."""
+        """Return the received frames. Raises KnightCubeError if the line was closed."""
 
     def send(self, frame: bytes) -> None:
-        """Send a frame. Raises FlightError."""
+        """Send a frame. Raises KnightCubeError."""
 
     def close(self) -> None:
         """Close."""
@@ -145,7 +145,7 @@ class Terminal:
         return self._line.fileno()
 
     def send(self, packet: bytes, spi: int = 1) -> int:
-        """Send a command packet and return the counter of its frame. Raises FlightError."""
+        """Send a command packet and return the counter of its frame. Raises KnightCubeError."""
         sealer = self._sealers.setdefault(spi, security.Sealer(self._vault, spi, frames.TELECOMMAND_MASK))
         return self.send_by(sealer, packet)
 
@@ -157,7 +157,7 @@ class Terminal:
         """Send a packet in a frame authenticated by `sealer`, and return the counter of the frame.
 
         A packet that is too long for a frame is sent in portions; the counter is that of the last portion.
-        Raises FlightError if the packet is longer than any command, or if a frame cannot be sent.
+        Raises KnightCubeError if the packet is longer than any command, or if a frame cannot be sent.
         """
         if len(packet) > self.packet_bytes:
             return [self.send_by(sealer, portion) for portion in portions(packet, utc_ns())][-1]
@@ -260,7 +260,7 @@ class UdpGround:
     """UDP line with one frame per datagram."""
 
     def __init__(self, address: str, codes: LinkCodes | None = None) -> None:
-        """Open a socket that sends to HOST:PORT and receives at any free port. Raises FlightError."""
+        """Open a socket that sends to HOST:PORT and receives at any free port. Raises KnightCubeError."""
         self._codes = codes or LinkCodes()
         self._address = host_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -307,11 +307,11 @@ class StreamGround:
         return self._file
 
     def receive(self) -> list[bytes]:
-        """Return the received frames. Raises FlightError at the end of the stream."""
+        """Return the received frames. Raises KnightCubeError at the end of the stream."""
         with _reaching(self._name):
             data = os.read(self._file, _READ_BYTES)
         if not data:
-            raise FlightError(f"{self._name}: the line was closed")
+            raise KnightCubeError(f"{self._name}: the line was closed")
         return self._stream.add(data)
 
     def send(self, frame: bytes) -> None:
@@ -331,7 +331,7 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
 
     The TNC speaks KISS on HOST:PORT (TCP) or /dev/FILE@BAUD.
 
-    Raises UsageError for an invalid address or key folder, and FlightError if the line cannot be opened.
+    Raises UsageError for an invalid address or key folder, and KnightCubeError if the line cannot be opened.
     """
     settings = settings or TerminalSettings()
     vault, codes = security.Vault(keys), settings.codes()
@@ -382,4 +382,4 @@ def _reaching(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise FlightError(f"{name}: cannot be reached: {error.strerror or error}") from error
+        raise KnightCubeError(f"{name}: cannot be reached: {error.strerror or error}") from error

@@ -26,7 +26,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, tangent_basis
 from knightcube.astro.chi_square import bound
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 _LONGEST_STEP = 10.0
 _SMOOTHING_ROUNDS = 3
@@ -114,7 +114,7 @@ _MISFIT = 1e-6
 is not in free fall, or that the sightings have larger errors than their standard deviations."""
 
 
-class ArcError(FlightError):
+class ArcError(KnightCubeError):
     """Error raised if the sightings do not determine an orbit; the message states the reason with values."""
 
 

@@ -48,7 +48,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.reference.corner_streaks import StreakResult, StreakSettings
 from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole
@@ -107,8 +107,8 @@ def estimate_rate(
         prior_sigma: standard deviation of each component of the prior rate, rad/s.
         previous_checksum: checksum of the previous frame, by which a frozen camera is detected, or None.
 
-    Raises FlightError for an invalid frame, exposure or prior. A failed estimation is reported by the status
-    of the result.
+    Raises KnightCubeError for an invalid frame, exposure or prior. A failed estimation is reported by the
+    status of the result.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = saturation_level(pixels, settings.saturation)
@@ -483,10 +483,10 @@ def attitudes_of_ends(
 
     The `endpoints` (n, 2, 2), px, are corrected for bias and have the standard deviations `sigma` (n,), px.
     The unit vectors `reference` (n, 3) point to the stars. Raises AttitudeError if the stars do not determine
-    an attitude, FlightError for an invalid exposure.
+    an attitude, KnightCubeError for an invalid exposure.
     """
     if not (np.isfinite(exposure) and exposure > 0.0):
-        raise FlightError(f"exposure of {exposure} s: must be finite and positive")
+        raise KnightCubeError(f"exposure of {exposure} s: must be finite and positive")
     vectors = pinhole.unit_vectors(endpoints)
     errors = sigma / pinhole.focal_length
     start = SOLVERS["esoq2"](vectors[:, 0], reference, errors)

@@ -35,7 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.horizon.edges import RUN, run_filtered
 from knightcube.vision.horizon.initial_guess import shortest_turn
@@ -66,7 +66,7 @@ def horizon_points(lines: Image) -> IntArray:
     return first_edges(run_filtered(lines >= 0.5 * high_average(lines)[:, None], RUN))
 
 
-class NoCircleError(FlightError):
+class NoCircleError(KnightCubeError):
     """Raised if the points do not define a circle: fewer than three points, or collinear points."""
 
 
@@ -110,7 +110,7 @@ _ON_AXIS = 1e-6
 axis."""
 
 
-class NoHorizonError(FlightError):
+class NoHorizonError(KnightCubeError):
     """Raised if the scan lines contain too few edges, or if the edges define no circle."""
 
 
@@ -174,7 +174,7 @@ _MINIMUM_SINE = 0.1
 """Minimum sine of the angle between the planes through the centre columns of the two cameras."""
 
 
-class GraphicMethodError(FlightError):
+class GraphicMethodError(KnightCubeError):
     """Raised if the cameras point in nearly the same or opposite directions."""
 
 

@@ -63,7 +63,7 @@ from knightcube.astro.attitude.wahba import (
     upright,
 )
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.reference.star_tables import (
     BUFFER,
     KnownSky,
@@ -122,7 +122,7 @@ class ClassicalSettings:
 DEFAULT = ClassicalSettings()
 
 
-class FieldUnknown(FlightError):
+class FieldUnknown(KnightCubeError):
     """Raised if the image scale is too uncertain for the classical methods.
 
     The default method can identify a field of uncertain image scale.

@@ -27,7 +27,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.frame import FrameState, frame_state, raw_counts, saturation_count
@@ -286,7 +286,7 @@ def _sky(tracker: TrackerSettings | None) -> tuple[SkyIndex | None, str]:
         return None, ""
     try:
         return (default_index() if tracker.index is None else load_once(tracker.index)), ""
-    except (FlightError, OSError) as error:
+    except (KnightCubeError, OSError) as error:
         return None, f"stars are not identified: {error}"
 
 

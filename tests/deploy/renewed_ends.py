@@ -13,7 +13,7 @@ from flight.link.events import Mode
 from flight.link.process.directives import Activate, Listing
 from flight.schema.reader import parse
 from ground.link.commanding import sha256_of
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from tests.deploy.renewed_board import RenewedBoard
 from tests.flight.link.process.filed_ends import FiledEnds
 from tests.support.flights import CONFIG
@@ -96,7 +96,7 @@ class RenewedEnds(FiledEnds):
             path.write_text(chosen.text.replace(SOCKET, str(state / "socket")), encoding="utf-8")
             run = state / f"run-{len(list(state.iterdir()))}"
             fly(RunRequest(path, run, duration=0.1))
-        except (FlightError, UsageError):
+        except (KnightCubeError, UsageError):
             return ""
         FlownConfig(chosen.text, state).keep()
         return parse(chosen.text, str(path)).name
@@ -106,6 +106,6 @@ class RenewedEnds(FiledEnds):
         try:
             chosen = accepted_config(self.board.config, {"STATE_DIRECTORY": str(self.board.place / "state")})
             link = parse(chosen.text, "flight.yaml").link
-        except (FlightError, UsageError):
+        except (KnightCubeError, UsageError):
             return False
         return link is not None and link.keys == KEYS

@@ -19,7 +19,7 @@ import yaml
 
 from ground import yamcs
 from ground.passes import Pass, Station
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 BEGIN = datetime(2026, 3, 20, 12, 0, 0, tzinfo=UTC)
 BERLIN = Station(name="Berlin", latitude_deg=52.5, longitude_deg=13.4)
@@ -220,7 +220,7 @@ def test_the_data_link_is_compiled_into_the_folder(
     monkeypatch.setattr("ground.yamcs.subprocess.run", run)
     folder = tmp_path / "new" / "mc"
     if status:
-        with pytest.raises(FlightError, match="the data link cannot be compiled:\nout wrong line"):
+        with pytest.raises(KnightCubeError, match="the data link cannot be compiled:\nout wrong line"):
             yamcs.compile_link(folder)
     else:
         yamcs.compile_link(folder)

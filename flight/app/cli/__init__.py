@@ -20,7 +20,7 @@ from typing import Any
 
 from flight import __version__
 from hal.interfaces.errors import DeviceError
-from knightcube.errors import FlightError, PlanningError, UsageError, shown
+from knightcube.errors import KnightCubeError, PlanningError, UsageError, shown
 
 _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _obey(words)
-    except (FlightError, DeviceError) as error:
+    except (KnightCubeError, DeviceError) as error:
         # That a planner finds no path is a failure of the command and not a usage error.
         misused = isinstance(error, UsageError) and not isinstance(error, PlanningError)
         return _complain(str(error), 2 if misused else 1)
@@ -140,7 +140,7 @@ def _obey(words: Sequence[str]) -> int:
         try:
             parser = _parser(_typed() or words)
         except OSError as error:  # a module that cannot be imported is not a mistake of the user
-            raise FlightError(str(error)) from error
+            raise KnightCubeError(str(error)) from error
         _complete(parser)
         options = parser.parse_args(words)
         if "numpy" in sys.modules:
@@ -167,7 +167,7 @@ def _complete(parser: argparse.ArgumentParser) -> None:
         import argcomplete  # noqa: PLC0415 - an extra
     except ModuleNotFoundError as error:
         needed = "pip install 'knightcube-flight[watch]'"
-        raise FlightError(f"completion needs {error.name}: {needed}") from error
+        raise KnightCubeError(f"completion needs {error.name}: {needed}") from error
     argcomplete.autocomplete(parser)
 
 

@@ -60,7 +60,7 @@ from flight.schema.sections import Config, Link
 from hal.buses.linux_wires import PySerialPort
 from hal.buses.system import ServiceManager, SystemClock
 from hal.interfaces.wires import SECOND_NS
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 _NICE = 10
 _WRITE_TIMEOUT_S = 0.5  # maximum wait for a radio that is slower than the configured rate
@@ -85,7 +85,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def link(options: argparse.Namespace) -> int:
-    """Run the link until a signal arrives. Raises ConfigError, and FlightError for other errors."""
+    """Run the link until a signal arrives. Raises ConfigError, and KnightCubeError for other errors."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -98,7 +98,7 @@ def link(options: argparse.Namespace) -> int:
     except ConfigError:
         raise
     except (UsageError, OSError) as error:
-        raise FlightError(str(error)) from error
+        raise KnightCubeError(str(error)) from error
     return 0
 
 
@@ -224,7 +224,7 @@ class _LoopbackLine:
 
 
 def self_test() -> None:
-    """Test a release: run a link until it has executed one command. Raises FlightError after 20 s."""
+    """Test a release: run a link until it has executed one command. Raises KnightCubeError after 20 s."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as name:
         folder = Path(name)
         keys = [folder / "satellite" / "keys", folder / "ground"]
@@ -247,7 +247,7 @@ def self_test() -> None:
             if station.obeyed and line.answers:
                 return
             clock.sleep_until_ns(clock.now_ns() + SECOND_NS // 50)
-    raise FlightError("self-test: the link executed no command")
+    raise KnightCubeError("self-test: the link executed no command")
 
 
 def _say(text: str) -> None:

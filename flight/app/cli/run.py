@@ -36,7 +36,7 @@ from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import LATE_NS
 from knightcube.compiled import report_compilations
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 if TYPE_CHECKING:  # see `flight.app.run`
     from flight.loop.flight_loop import FlightEnding, FlightProgress
@@ -184,7 +184,7 @@ def run(options: argparse.Namespace) -> int:
     except OSError as error:
         if options.archive is None:
             raise
-        raise FlightError(str(error)) from error  # the service manager restarts the service
+        raise KnightCubeError(str(error)) from error  # the service manager restarts the service
     if sys.stderr.isatty():
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun

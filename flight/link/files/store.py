@@ -26,7 +26,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.link.files.units import HIGHEST_NUMBER
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 
 def read_regular(path: Path, most: int) -> bytes | None:
@@ -128,7 +128,7 @@ _Stretch = tuple[_Long, _Long]
 T = TypeVar("T")
 
 
-class FileError(FlightError):
+class FileError(KnightCubeError):
     """Raised if a file operation or transfer is not possible. The error text states the reason."""
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES, UNSEGMENTED, crc16
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 SEGMENT_BYTES = 900
 """Maximum file data (bytes) in one PDU, chosen so that the PDU fits into a telecommand frame."""
@@ -34,7 +34,7 @@ _FAULT_LOCATION = 6  # TLV type of a fault location
 _MOST_NAME_BYTES = 255
 
 
-class PduError(FlightError):
+class PduError(KnightCubeError):
     """Raised for bytes that are not a CFDP PDU of class 2. The error text states the reason."""
 
 

@@ -37,7 +37,7 @@ from flight.link.security import COPIES
 from flight.link.telemetry.definitions import COMMAND, HEALTH, MODE
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk
 from hal.interfaces.wires import SECOND_NS
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 _ARRIVED = "arrived"  # trigger in the mode packet at the end of a slew (flight.loop.modes)
 
@@ -254,7 +254,7 @@ _LONGEST_FILE = 1 << 16
 _Count = Annotated[int, Meta(ge=0, le=HIGHEST)]
 
 
-class TimetableError(FlightError):
+class TimetableError(KnightCubeError):
     """Raised if a schedule entry cannot be added, found or removed. The error text states the reason."""
 
 

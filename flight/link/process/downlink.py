@@ -295,7 +295,7 @@ class Downlink:
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:
-        """Return the frames that are due at `now_ns`. Raises FlightError if no frame can be protected."""
+        """Return the frames that are due at `now_ns`. Raises KnightCubeError if no frame can be protected."""
         before = now_ns if self._credit_ns is None else self._credit_ns
         most = max(2.0 * self._frame_bytes, self._rate * _BURST_S)
         self._credit = min(most, self._credit + self._rate * (now_ns - before) * 1e-9)

@@ -71,7 +71,7 @@ from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION,
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 AT_MOST = 512
 """Maximum number of datagrams read per call, so that a flood of frames does not delay the telemetry."""
@@ -558,7 +558,7 @@ class Station:
         try:
             frames = self._downlink.frames(now_ns)
             self._problem = ""
-        except FlightError as error:  # commands are still accepted, such as a command that sets a new key
+        except KnightCubeError as error:  # commands are still accepted, such as a command that sets a new key
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)
@@ -702,14 +702,14 @@ class Station:
         return self._clock.now_ns() + self._utc_offset_ns
 
     def _seal(self, header: bytes, data: bytes) -> bytes:
-        """Protect a frame with the primary SPI, or else the reserve SPI. Raises FlightError."""
-        problem: FlightError | None = None
+        """Protect a frame with the primary SPI, or else the reserve SPI. Raises KnightCubeError."""
+        problem: KnightCubeError | None = None
         for sealer in self._sealers.values():
             try:
                 return sealer.seal(header, data)[0]
-            except FlightError as error:
+            except KnightCubeError as error:
                 problem = problem or error
-        raise problem or FlightError("no SPI is configured for telemetry")
+        raise problem or KnightCubeError("no SPI is configured for telemetry")
 
     def _report(self, *reports: Report) -> None:
         for one in reports:

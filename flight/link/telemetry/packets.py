@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.link.telemetry.definitions import PACKETS, Field, Packet
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 PacketArray = Any
 """Structured array (n,) with a column for each field of a packet. numpy's type of a structured array does not
@@ -43,7 +43,7 @@ UNSEGMENTED = 0b11 << 14  # sequence flags in the second word of the primary hea
 _STRUCT_CODES = {"f8": "d", "f4": "f", "u1": "B", "u2": "H", "u4": "I", "u8": "Q", "i8": "q"}
 
 
-class TelemetryError(FlightError):
+class TelemetryError(KnightCubeError):
     """Raised for values that do not fit the packet definition and for bytes that are not a packet."""
 
 

@@ -25,7 +25,7 @@ from knightcube.astro.quaternion import (
     multiply,
     normalise,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 _MINIMUM_SPREAD = 1e-12
 """Determinant of the information matrix below which the directions do not determine an attitude.
@@ -47,7 +47,7 @@ _CLOSE_FIT = 1e-2
 Rows = list[list[float]]
 
 
-class AttitudeError(FlightError):
+class AttitudeError(KnightCubeError):
     """Raised for directions that are invalid or do not determine an attitude."""
 
 

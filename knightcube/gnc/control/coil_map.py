@@ -26,7 +26,7 @@ from itertools import combinations
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 _PERMEABILITY = 1e-7
 """Vacuum permeability divided by 4 pi, T m/A."""
@@ -307,11 +307,11 @@ def allocate(
     `free` (3,) marks the axes about which the body can rotate, because a suspension thread may prevent
     rotation about the other axes. Of all currents that produce the torque, the currents with the least heat
     in the coil resistances `resistance` (n,), ohm, are chosen. Without the argument `resistance`, the
-    resistances are assumed to be equal. Raises FlightError for an input that is not finite.
+    resistances are assumed to be equal. Raises KnightCubeError for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):
-        raise FlightError(f"allocation: torque {wanted} or field {field} is not finite")
+        raise KnightCubeError(f"allocation: torque {wanted} or field {field} is not finite")
     turns = np.ones(3) if free is None else np.asarray(free, dtype=np.float64)
     usable = np.ones(dipoles.shape[1]) if available is None else np.asarray(available, dtype=np.float64)
     # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.

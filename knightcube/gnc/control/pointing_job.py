@@ -491,7 +491,7 @@ def run(job: PointingJob) -> PointingTable | None:
 
     The result is None if the remaining part of a slew was replanned without a better plan than the present
     plan. The computation takes about one second, two seconds with a slew, and a tenth of a second for the
-    remaining part of a slew. Raises FlightError if the magnetic field is unknown, and UsageError if the
+    remaining part of a slew. Raises KnightCubeError if the magnetic field is unknown, and UsageError if the
     target does not define an attitude.
     """
     if job.running is not None and job.slew is not None:

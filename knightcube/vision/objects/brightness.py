@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 SHAPE_ERROR = 0.1
 """Error of a bright streak's modelled counts, as a fraction, due to errors of ends, PSF and uniformity."""
@@ -122,14 +122,16 @@ def brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[F
 
     The argument `normal` (k, k) contains the scalar products of the weighted images with one another, and
     `right` (k,) their scalar products with the weighted pixels of the frame. The argument `power` is the sum
-    of the squares of the weighted pixels. Raises FlightError if the equations are not positive definite, or
-    if the solver does not converge.
+    of the squares of the weighted pixels. Raises KnightCubeError if the equations are not positive definite,
+    or if the solver does not converge.
     """
     brightness, decrease, failure = _non_negative(normal, right)
     if failure == _NOT_DEFINITE:
-        raise FlightError(f"brightnesses of {len(right)} streaks: the equations are not positive definite")
+        raise KnightCubeError(
+            f"brightnesses of {len(right)} streaks: the equations are not positive definite"
+        )
     if failure == _NOT_CONVERGED:
-        raise FlightError(f"brightnesses of {len(right)} streaks: the fit does not converge")
+        raise KnightCubeError(f"brightnesses of {len(right)} streaks: the fit does not converge")
     return brightness, max(power - decrease, 0.0)
 
 

@@ -44,7 +44,7 @@ from knightcube.astro.arrays import (
 )
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.compiled import compiled_form_of
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera
 from knightcube.vision.frame import gain_in_counts, line_of, positions, raw_counts
@@ -420,7 +420,7 @@ class Judge:
                 return self._stars_or_unclear(self._light(ends))
             light = self._light(ends)
             candidate = self._candidate(ends, fired, light, (), self.objects.improvement)
-        except FlightError:
+        except KnightCubeError:
             return Judgement(Verdict.UNCLEAR)
         if candidate is not None:
             return Judgement(Verdict.OBJECT, candidate)
@@ -441,7 +441,7 @@ class Judge:
             light = self._light(corners)
             hopeless = light.chi_square - light.pixels < enough
             tried = [] if hopeless else [light.chi_square_with(ends) for ends in lines]
-        except FlightError:
+        except KnightCubeError:
             return Judgement(Verdict.UNCLEAR)
         if not tried:
             return self._stars_or_unclear(light)
@@ -524,7 +524,7 @@ class Judge:
                 if few.chi_square - few.chi_square_with(ends) < enough:
                     return None
             return self._candidate(ends, (), self._light(ends, stars), stars, enough)
-        except FlightError:
+        except KnightCubeError:
             return None
 
     def _only_stars(self, few: StarLight, enough: float) -> bool:

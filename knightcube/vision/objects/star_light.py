@@ -126,7 +126,7 @@ class StarLight:
         expected: expected chi-square of a correct model. In bright regions, `expected` is less than `pixels`,
             because the weights of bright pixels also allow for model errors.
 
-    Raises FlightError if the least-squares solution of the brightnesses does not converge.
+    Raises KnightCubeError if the least-squares solution of the brightnesses does not converge.
     """
 
     def __init__(

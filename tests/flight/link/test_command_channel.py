@@ -36,7 +36,7 @@ from flight.link.events import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 from ground.link.commanding import exchange
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 
 @pytest.fixture
@@ -236,7 +236,7 @@ def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
 
         thread = threading.Thread(target=serve)
         thread.start()
-        with pytest.raises(FlightError, match="no answer"):
+        with pytest.raises(KnightCubeError, match="no answer"):
             exchange(f"{folder}/commands", BEGINS, 0.2)
         thread.join()
         channel.close()

@@ -28,7 +28,7 @@ from flight.link.security import (
     new_key,
     unprotect,
 )
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.vaults import Ground, frame_with, gate, parse, vault
 
 KEYS = {1: bytes(range(32)), 2: bytes(range(32, 64))}
@@ -208,7 +208,7 @@ def test_a_counter_that_cannot_be_stored_lets_nothing_in(
     with monkeypatch.context() as full:
         full.setattr(os, "fsync", fail)
         assert cause(entrance, frame) is Refusal.UNSTORED
-        with pytest.raises(FlightError, match="cannot be stored"):
+        with pytest.raises(KnightCubeError, match="cannot be stored"):
             Ground(ground).frame(b"two")
     assert entrance.admit(frame).data == b"one"
 
@@ -253,7 +253,7 @@ def test_the_last_counter_is_2_to_the_63_less_one_both_ways(sky: Vault, ground: 
         vault_.write(replace(entry, unused=HIGHEST_COUNTER - 1))
     entrance = gate(sky)
     assert entrance.admit(maker.frame(b"last")).counter == 2**63 - 1
-    with pytest.raises(FlightError, match="used up: change its key"):
+    with pytest.raises(KnightCubeError, match="used up: change its key"):
         maker.frame(b"one more")
     assert cause(entrance, frame_with(ground, HIGHEST_COUNTER, b"")) is Refusal.BEYOND
     assert (sky.read(1) or pytest.fail("it was written")).unused == HIGHEST_COUNTER
@@ -318,7 +318,7 @@ def test_a_sender_uses_its_reserved_counters_although_both_copies_are_lost(groun
     for path in ground.folder.glob("spi-1.*"):
         path.unlink()
     assert [sealer.seal(bytes(5), b"x")[1] for _ in range(2)] == [1, 2]
-    with pytest.raises(FlightError, match="both copies of the counter of SPI 1 are lost"):
+    with pytest.raises(KnightCubeError, match="both copies of the counter of SPI 1 are lost"):
         sealer.seal(bytes(5), b"x")
 
 

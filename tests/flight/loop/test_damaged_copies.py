@@ -13,7 +13,7 @@ from hypothesis import given
 
 from flight.loop.state import Learned, StoredState, UncleanShutdown, decode, encode
 from flight.loop.worker import message_length, pack_values, unpack_values
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from tests.support.damaged import Files, chances, line_and_crc, offer
 
 STATES = (
@@ -65,4 +65,4 @@ def test_a_resealed_message_of_a_worker_brings_nothing_to_call(chance: Random) -
         head = min(head, len(body))
         return HEAD.pack(head, len(body) - head, zlib.crc32(body)) + body
 
-    offer(chance, [{"message": pack_values(one, slab)} for one in values], read, (FlightError,), reseal)
+    offer(chance, [{"message": pack_values(one, slab)} for one in values], read, (KnightCubeError,), reseal)

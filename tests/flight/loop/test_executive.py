@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from sim_hal.clock import SimClock
 
 PERIOD = 25_000_000
@@ -83,7 +83,7 @@ def test_execution_times_and_overruns_are_accounted() -> None:
 
 
 def test_a_period_of_zero_is_refused() -> None:
-    with pytest.raises(FlightError, match="not positive"):
+    with pytest.raises(KnightCubeError, match="not positive"):
         RateGroup("control", 0, lambda _: None)
 
 

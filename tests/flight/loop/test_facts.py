@@ -29,7 +29,7 @@ from flight.loop.facts import (
     streams_of,
 )
 from flight.loop.modes import SAFING_REACTIONS, Trigger, modes_moved_by
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from tests.flight.loop.records import EventRecord
 from tests.support.flights import demo_config
 
@@ -208,7 +208,7 @@ def test_every_event_beyond_a_note_is_reacted_to_even_while_the_throttle_holds_i
     ],
 )
 def test_a_table_that_cannot_work_is_refused(broken: tuple[facts.Fact, ...], problem: str) -> None:
-    with pytest.raises(FlightError, match=problem):
+    with pytest.raises(KnightCubeError, match=problem):
         check(broken, modes_moved_by)
 
 

@@ -24,7 +24,7 @@ from flight.loop.modes import (
     check,
     modes_moved_by,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 
 
 @pytest.mark.parametrize("mode", list(Mode))
@@ -106,14 +106,14 @@ def test_boot_is_for_the_start_only() -> None:
 def test_a_table_with_a_hole_is_refused_by_name(mode: Mode, trigger: Trigger) -> None:
     table = copied()
     del table[mode][trigger]
-    with pytest.raises(FlightError, match=f"{mode.label} has no entry for '{trigger.value}'"):
+    with pytest.raises(KnightCubeError, match=f"{mode.label} has no entry for '{trigger.value}'"):
         ModeMachine(table=table)
 
 
 def test_a_table_without_a_row_is_refused() -> None:
     table = copied()
     del table[Mode.SLEW]
-    with pytest.raises(FlightError, match="slew has no row"):
+    with pytest.raises(KnightCubeError, match="slew has no row"):
         check(table)
 
 
@@ -122,14 +122,14 @@ def test_a_table_that_keeps_a_mode_from_safe_is_refused(mode: Mode, trigger: Tri
     for wrong in (TriggerAnswer.STAY, TriggerAnswer.REFUSE, Mode.HOLD):
         table = copied()
         table[mode][trigger] = wrong
-        with pytest.raises(FlightError, match=f"does not change {mode.label} to safe"):
+        with pytest.raises(KnightCubeError, match=f"does not change {mode.label} to safe"):
             check(table)
 
 
 def test_a_dead_end_is_refused() -> None:
     table = copied()
     row: Row = {t: (TriggerAnswer.STAY if isinstance(to, Mode) else to) for t, to in table[Mode.SAFE].items()}
-    with pytest.raises(FlightError, match="safe is a dead end"):
+    with pytest.raises(KnightCubeError, match="safe is a dead end"):
         check({**table, Mode.SAFE: row})
 
 
@@ -137,14 +137,14 @@ def test_a_mode_that_nothing_leads_to_is_refused() -> None:
     def without_slew(row: Row) -> Row:
         return {t: (TriggerAnswer.STAY if to is Mode.SLEW else to) for t, to in row.items()}
 
-    with pytest.raises(FlightError, match="slew cannot be reached"):
+    with pytest.raises(KnightCubeError, match="slew cannot be reached"):
         check({mode: without_slew(row) for mode, row in TRANSITIONS.items()})
 
 
 def test_a_way_back_to_boot_is_refused() -> None:
     table = copied()
     table[Mode.HOLD][Trigger.ARRIVED] = Mode.BOOT
-    with pytest.raises(FlightError, match="hold leads back to boot"):
+    with pytest.raises(KnightCubeError, match="hold leads back to boot"):
         check(table)
 
 

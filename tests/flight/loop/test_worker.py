@@ -22,7 +22,7 @@ from flight.loop.worker import (
     pack_values,
     unpack_values,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.lens import Lens
 from knightcube.vision.startracker.detect import Quality
 from knightcube.vision.streaks.streak_result import StreakStatus
@@ -84,7 +84,7 @@ def test_a_value_that_is_not_a_number_arrives() -> None:
     ids=["function", "class", "object", "deep", "objects", "texts"],
 )
 def test_values_of_other_classes_are_not_sent(value: Any) -> None:
-    with pytest.raises(FlightError, match="a worker cannot send"):
+    with pytest.raises(KnightCubeError, match="a worker cannot send"):
         pack_values(value, slab())
 
 
@@ -110,7 +110,7 @@ def test_bytes_that_do_not_encode_a_permitted_value_are_refused(tree: Any) -> No
     head = (8).to_bytes(8, "little")
     slab()[:8] = b"\xff" * 8
     message = struct.pack("<QQI", 8, len(body), zlib.crc32(head + body)) + head + body
-    with pytest.raises(FlightError) as refusal:
+    with pytest.raises(KnightCubeError) as refusal:
         unpack_values(message, slab())
     assert "\n" not in str(refusal.value)
 
@@ -130,7 +130,7 @@ def test_a_class_is_built_without_a_call_of_its_own_code(monkeypatch: pytest.Mon
 def test_a_damaged_message_is_refused_or_read_and_nothing_else(noise: bytes, place: int) -> None:
     message = bytearray(pack_values(("done", LENS, np.arange(9.0), 7), slab()))
     message[place : place + len(noise)] = noise
-    with suppress(FlightError):
+    with suppress(KnightCubeError):
         length = message_length(message)
         if length is not None:
             unpack_values(bytes(message[:length]), slab())

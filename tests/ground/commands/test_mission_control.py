@@ -20,7 +20,7 @@ from flight.link.telemetry.packets import Packer
 from ground import yamcs
 from ground.commands import mission_control
 from ground.commands.mission_control import Replay, configure
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 
 DEMO = Path(__file__).parents[3] / "config" / "step_demo.yaml"
@@ -211,7 +211,7 @@ def test_a_link_that_does_not_open_is_reported_after_a_minute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
     started = processes(monkeypatch, "starting\n", None)
-    with pytest.raises(FlightError, match=r"the link could not be opened: see .*link\.log"):
+    with pytest.raises(KnightCubeError, match=r"the link could not be opened: see .*link\.log"):
         mission_control._flown(DEMO, tmp_path, ExitStack())
     assert len(started) == 1
     assert 160.0 < clock.now < 160.5
@@ -246,7 +246,7 @@ def test_a_flight_without_packets_is_reported(
     status: int | None, waits: float, tmp_path: Path, clock: Clock
 ) -> None:
     running: Any = {"the flight": Process(status)}
-    with pytest.raises(FlightError, match=r"the flight did not begin: see .*flight\.log"):
+    with pytest.raises(KnightCubeError, match=r"the flight did not begin: see .*flight\.log"):
         mission_control._first_packets(tmp_path, [], running)
     assert clock.now - 100.0 == pytest.approx(waits, abs=0.21)
 
@@ -300,7 +300,7 @@ def test_yamcs_is_asked_until_it_runs_and_then_shows_the_passes(
     assert mission_control._started(8090, tmp_path, None, lambda: False)
     assert len(http.passes) == 1
     http.refusal = OSError("HTTP 403")
-    with pytest.raises(FlightError, match=r"Yamcs refuses the passes: HTTP 403: see .*log"):
+    with pytest.raises(KnightCubeError, match=r"Yamcs refuses the passes: HTTP 403: see .*log"):
         mission_control._started(8090, tmp_path, forecast, lambda: False)
 
 
@@ -399,7 +399,7 @@ def test_a_recorded_run_is_replayed_until_yamcs_ends(
         "print('read'); sys.exit(3)"
     )
     stage = Stage(monkeypatch, code)
-    with pytest.raises(FlightError, match=f"Yamcs has ended with status 3: see the logs in {out}"):
+    with pytest.raises(KnightCubeError, match=f"Yamcs has ended with status 3: see the logs in {out}"):
         mission_control.run(options("--recorded", str(run), "--out", str(out), "--port", "8123"))
     assert (out / "recorded" / "run-000001.ccsds").read_bytes() == (run / "flight-0001.ccsds").read_bytes()
     assert (out / "log").read_text() == "read\n"
@@ -468,7 +468,7 @@ def test_a_flown_satellite_gives_the_epoch_and_its_failure_ends_mission_control(
     monkeypatch.setattr(mission_control, "_forecast", lambda given: begins.append(given.begin))
     given = options("--fly", "--out", str(tmp_path / "out"))
     given.link = "127.0.0.1:9"
-    with pytest.raises(FlightError, match="the flight has ended with status 5: see the logs in"):
+    with pytest.raises(KnightCubeError, match="the flight has ended with status 5: see the logs in"):
         mission_control.run(given)
     assert begins == [ZERO]
     assert epoch_of(tmp_path / "out") == "2026-03-20T12:00:01.500000Z"
@@ -483,6 +483,6 @@ def test_wrong_use_is_refused_before_anything_starts(run: Path, monkeypatch: pyt
     with pytest.raises(UsageError, match="has no section `link`"):
         mission_control.run(options())
     monkeypatch.setattr(yamcs, "missing", lambda: "Java is missing")
-    with pytest.raises(FlightError, match="Java is missing"):
+    with pytest.raises(KnightCubeError, match="Java is missing"):
         mission_control.run(options("--recorded", str(run)))
     assert stage.compiled == []

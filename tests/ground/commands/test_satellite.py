@@ -44,7 +44,7 @@ from flight.link.telemetry.definitions import (
 from flight.link.telemetry.packets import Packer
 from ground.commands import satellite
 from ground.link.commanding import FileSession
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from knightcube.gnc.guidance.pointing_target import Goal
 from tests.ground.commands.in_process import command
 
@@ -386,7 +386,7 @@ def test_the_table_arrives_before_or_after_its_verification(link: Link) -> None:
     assert by_link(options) == (None, "why")
     for other in ([], [verified(Stage.COMPLETED, counter=2)], [verified(Stage.COMPLETED, spi=2)]):
         link.received, link.sent = list(other), []
-        with pytest.raises(FlightError, match=r"within 0\.5 s"):
+        with pytest.raises(KnightCubeError, match=r"within 0\.5 s"):
             by_link(options)
 
 
@@ -502,15 +502,15 @@ def test_a_file_on_board_is_deleted_before_it_is_replaced(tmp_path: Path, on_boa
 @pytest.mark.usefixtures("quiet")
 def test_a_failed_transfer_is_an_error_with_its_reason(tmp_path: Path) -> None:
     options = cast(Any, SimpleNamespace(what="get", names=["a"]))
-    with pytest.raises(FlightError, match="a: no room"):
+    with pytest.raises(KnightCubeError, match="a: no room"):
         work(Session(tmp_path, ([], [ending("a", condition=4)]))).obey(options)
-    with pytest.raises(FlightError, match="text"):
+    with pytest.raises(KnightCubeError, match="text"):
         work(Session(tmp_path, ([report(Stage.FAILED)], []))).obey(options)
-    with pytest.raises(FlightError, match="signal"):
+    with pytest.raises(KnightCubeError, match="signal"):
         work(Session(tmp_path, ([], [])), ended=True).obey(options)
     silent = Session(tmp_path, ([], []))
     silent.received_ns = -(10**30)
-    with pytest.raises(FlightError, match="no packet"):
+    with pytest.raises(KnightCubeError, match="no packet"):
         work(silent).obey(options)
 
 
@@ -527,7 +527,7 @@ def test_commands_on_files_end_when_they_are_completed(
     found = work(session).obey(options)
     assert session.asked == [directive]
     assert found["text"].startswith("completed: ")
-    with pytest.raises(FlightError, match="text"):
+    with pytest.raises(KnightCubeError, match="text"):
         work(Session(tmp_path, ([report(Stage.REFUSED)], []))).obey(options)
 
 

@@ -15,7 +15,7 @@ from flight.link.events import Mode
 from ground.console import commanding
 from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles
 from ground.xtce import TELECOMMANDS
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
 
@@ -91,7 +91,7 @@ def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite:
 
 def test_without_an_answer_it_says_so(satellite: Satellite, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commanding, "_ANSWER_S", 0.05)
-    with pytest.raises(FlightError, match=r"no answer over the link within 0\.05 s"):
+    with pytest.raises(KnightCubeError, match=r"no answer over the link within 0\.05 s"):
         satellite.feed.send(CommandPacker().pack(ChangeMode(Mode.SAFE), 7))
 
 
@@ -119,13 +119,13 @@ def console(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[E
 
 
 def during(feed: LinkFeed, request: Callable[[], Any]) -> Any:
-    """Run a request while the feed is read; return the result of the request, or its FlightError."""
+    """Run a request while the feed is read; return the result of the request, or its KnightCubeError."""
     found: list[Any] = []
 
     def work() -> None:
         try:
             found.append(request())
-        except FlightError as error:
+        except KnightCubeError as error:
             found.append(error)
 
     thread = threading.Thread(target=work)

@@ -25,7 +25,7 @@ from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Packer
 from ground.link import commanding
 from ground.link.terminal import FRAME_OVERHEAD_BYTES, TerminalSettings, make_keys
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 
 S = 1_000_000_000
 LONGEST_PACKET = TerminalSettings().command_frame_bytes - FRAME_OVERHEAD_BYTES
@@ -91,7 +91,7 @@ def test_each_report_is_shown_and_none_is_an_error() -> None:
     shown: list[Report] = []
     answers = [report(Stage.ACCEPTED), report(Stage.COMPLETED)]
     assert commanding.command(terminal(None, answers), b"x", 1, 2.0, shown.append) == answers == shown
-    with pytest.raises(FlightError, match=r"within 2\.5 s"):
+    with pytest.raises(KnightCubeError, match=r"within 2\.5 s"):
         commanding.command(terminal(), b"x", 1, 2.5, shown.append)
 
 
@@ -264,7 +264,7 @@ def test_units_of_an_unknown_kind_are_ignored(tmp_path: Path) -> None:
 def test_a_checksum_is_that_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     assert commanding.sha256_of(tmp_path / "a") == hashlib.sha256(b"abc").digest()
-    with pytest.raises(FlightError, match="missing"):
+    with pytest.raises(KnightCubeError, match="missing"):
         commanding.sha256_of(tmp_path / "missing")
 
 
@@ -291,7 +291,7 @@ def test_a_packet_is_exchanged_over_udp_and_over_a_unix_socket(tmp_path: Path) -
         thread = _answering(server, b"unix ")
         assert commanding.exchange(str(tmp_path / "s"), b"ping", 20.0) == b"unix ping"
         thread.join(20.0)
-        with pytest.raises(FlightError, match=r"within 0\.01 s"):
+        with pytest.raises(KnightCubeError, match=r"within 0\.01 s"):
             commanding.exchange(str(tmp_path / "s"), b"ping", 0.01)
 
 
@@ -302,9 +302,9 @@ def test_a_timeout_is_a_positive_number(timeout: float) -> None:
 
 
 def test_an_address_without_a_flight_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match="no flight"):
+    with pytest.raises(KnightCubeError, match="no flight"):
         commanding.exchange(str(tmp_path / "none"), b"x", 1.0)
-    with pytest.raises((UsageError, FlightError), match="99999"):
+    with pytest.raises((UsageError, KnightCubeError), match="99999"):
         commanding.exchange("127.0.0.1:99999", b"x", 1.0)
 
 

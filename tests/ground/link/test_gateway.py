@@ -25,7 +25,7 @@ from flight.link.telemetry.packets import Packer
 from ground.link import gateway as module
 from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.link.terminal import Terminal, make_keys
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from tests.flight.link.telemetry.samples import plain_contents
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -199,7 +199,7 @@ def test_the_file_with_the_token_is_its_users_alone_and_goes_with_the_gateway(tm
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert list(tmp_path.iterdir()) == []
     with (
-        pytest.raises(FlightError, match="the token cannot be written"),
+        pytest.raises(KnightCubeError, match="the token cannot be written"),
         token_file(tmp_path / "no" / "x", "a"),
     ):
         pytest.fail("no such folder")

@@ -21,7 +21,7 @@ from flight.link.telemetry.definitions import HEALTH, VERIFICATION
 from flight.link.telemetry.packets import Packer
 from ground.link import terminal as terminal_module
 from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, make_keys, open_terminal, report_of
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.telemetry.samples import plain_contents
 
 
@@ -127,13 +127,13 @@ def test_a_tcp_line_waits_for_its_bytes_and_ends_with_its_peer(keys: Path) -> No
             peer.sendall(b"no frame")
             assert list(terminal.take()) == []
             peer.shutdown(socket.SHUT_WR)
-            with pytest.raises(FlightError, match="the line was closed"):
+            with pytest.raises(KnightCubeError, match="the line was closed"):
                 list(terminal.take())
 
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp:1.2.3.4", "127.0.0.1:x", "/dev/null@fast"])
 def test_an_address_of_another_form_is_refused(keys: Path, address: str) -> None:
-    with pytest.raises((UsageError, FlightError)):
+    with pytest.raises((UsageError, KnightCubeError)):
         open_terminal(address, keys)
 
 

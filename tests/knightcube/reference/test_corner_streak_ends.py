@@ -18,7 +18,7 @@ from knightcube.astro.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.reference.corner_streak_rate import attitudes_of_ends, estimate_rate, solve_ends
 from knightcube.reference.corner_streaks import DetectorName, StreakResult, StreakSettings
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, SolveSettings, SolveStatus
@@ -252,5 +252,5 @@ def test_an_impossible_exposure_is_refused() -> None:
     stars = _field(8)
     ends = true_endpoints(_CAMERA, stars, rate_at(1.0, 0.02))
     for exposure in (0.0, -1.0, float("nan")):
-        with pytest.raises(FlightError, match="exposure"):
+        with pytest.raises(KnightCubeError, match="exposure"):
             attitudes_of_ends(ends, stars, np.full(12, 0.1), _CAMERA.pinhole, exposure)

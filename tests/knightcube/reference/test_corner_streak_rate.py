@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.reference.corner_streak_rate import estimate_rate, rotation_angles, rotation_axis
 from knightcube.reference.corner_streaks import (
     DETECTOR_NAMES,
@@ -256,15 +256,15 @@ def test_the_result_is_the_same_each_time_and_travels_between_processes() -> Non
 def test_nonsense_is_refused_with_its_value() -> None:
     frame = np.zeros((512, 512), dtype=np.uint16)
     settings = StreakSettings()
-    with pytest.raises(FlightError, match="shape"):
+    with pytest.raises(KnightCubeError, match="shape"):
         estimate_rate(frame[:100], _SMALL.pinhole, 1.0, settings)
-    with pytest.raises(FlightError, match="float64"):
+    with pytest.raises(KnightCubeError, match="float64"):
         estimate_rate(frame.astype(float), _SMALL.pinhole, 1.0, settings)
-    with pytest.raises(FlightError, match="exposure"):
+    with pytest.raises(KnightCubeError, match="exposure"):
         estimate_rate(frame, _SMALL.pinhole, 0.0, settings)
-    with pytest.raises(FlightError, match="prior_rate"):
+    with pytest.raises(KnightCubeError, match="prior_rate"):
         estimate_rate(frame, _SMALL.pinhole, 1.0, settings, np.array([0.0, np.nan, 0.0]), 1.0)
-    with pytest.raises(FlightError, match="prior_sigma"):
+    with pytest.raises(KnightCubeError, match="prior_sigma"):
         estimate_rate(frame, _SMALL.pinhole, 1.0, settings, np.zeros(3), float("nan"))
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.gnc.control.coil_map import allocate
 
 DIPOLE = 0.648
@@ -97,5 +97,5 @@ def test_no_torque_and_no_coil_ask_for_no_current() -> None:
 
 
 def test_what_is_not_finite_is_refused() -> None:
-    with pytest.raises(FlightError, match="not finite"):
+    with pytest.raises(KnightCubeError, match="not finite"):
         allocate(np.array([np.nan, 0, 0]), np.ones(3), COILS, LIMITS)

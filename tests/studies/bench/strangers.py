@@ -28,7 +28,7 @@ from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from ground.link.commanding import failed, obeyed
 from ground.link.terminal import open_terminal
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from tests.studies.command import command, say, scratch
 from tests.support.flooded_flight import lateness, process, wait_for
 from tests.support.link_attacker import attackers_frames
@@ -117,7 +117,7 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
                     reports = list(terminal.follow(counter, 1, _ANSWER_S))
                     if not obeyed(reports):
                         failures.append(f"{number}: {failed(reports) or 'no answer'}")
-            except FlightError as error:
+            except KnightCubeError as error:
                 failures.append(f"{number}: {error}")
             time.sleep(_PAUSE_S)
     return failures

@@ -23,7 +23,7 @@ import numpy as np
 
 from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.reference.corner_streak_rate import attitudes_of_ends, cornerness, estimate_rate
 from knightcube.reference.corner_streaks import DETECTOR_NAMES, DetectorName, StreakSettings
 from knightcube.vision.camera.lens import EXACT
@@ -196,7 +196,7 @@ def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float 
             camera.pinhole,
             scene.exposure,
         )
-    except FlightError:
+    except KnightCubeError:
         return None, None
     pairs = zip((fixes.start, fixes.end), scene.attitudes, strict=True)
     errors = np.mean([attitude_error(fix.quaternion, truth) for fix, truth in pairs], axis=0)

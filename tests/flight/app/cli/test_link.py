@@ -44,7 +44,7 @@ from ground.link.terminal import (
 )
 from ground.xtce import TELECOMMANDS
 from hal.buses.system import SystemClock
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.vaults import frame_with
 from tests.support.flights import CONFIG
 from tests.support.linked_board import ROOT, free_ports, write_linked_config
@@ -264,7 +264,7 @@ def test_a_release_tests_its_link_without_a_network(monkeypatch: pytest.MonkeyPa
 def test_a_release_whose_link_obeys_nothing_fails_its_test(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flight.app.cli.link.close_frame", lambda frame: frame + b"\0\0")
     monkeypatch.setattr(SystemClock, "sleep_until_ns", lambda *_: None)
-    with pytest.raises(FlightError, match="executed no command"):
+    with pytest.raises(KnightCubeError, match="executed no command"):
         self_test()
 
 

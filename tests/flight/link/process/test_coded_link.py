@@ -31,7 +31,7 @@ from flight.link.telemetry.definitions import LINK, PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS
 from flight.schema.sections import LinkCoding
 from ground.link.terminal import StreamGround, TerminalSettings, UdpGround
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
 
@@ -206,7 +206,7 @@ def test_a_portion_without_the_portion_before_it_is_refused(short: BothEnds, por
     counter = short.terminal.send(directives.pack(portion, 1))
     short.turn()
     assert short.stages(counter) == ["refused"]
-    with pytest.raises(FlightError, match="600 bytes exceed the longest command"):
+    with pytest.raises(KnightCubeError, match="600 bytes exceed the longest command"):
         short.terminal.send(bytes(600))
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize
 
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import KnightCubeError, UsageError
 from knightcube.gnc.control.coil_map import CoilMap, allocate, coil_field, limited
 
 TILTED = np.array([[0.8, 0.2, 0.0], [0.1, 0.5, 0.3], [0.0, 0.0, 0.2]])
@@ -258,9 +258,9 @@ def test_only_the_free_axis_is_turned() -> None:
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 def test_a_torque_or_a_field_that_is_not_finite_is_refused(wrong: float) -> None:
-    with pytest.raises(FlightError, match="not finite"):
+    with pytest.raises(KnightCubeError, match="not finite"):
         allocate(np.array([wrong, 0.0, 0.0]), FIELD, COILS, AMPLE)
-    with pytest.raises(FlightError, match="not finite"):
+    with pytest.raises(KnightCubeError, match="not finite"):
         allocate(np.zeros(3), np.array([0.0, wrong, 0.0]), COILS, AMPLE)
 
 

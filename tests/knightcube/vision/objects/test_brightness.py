@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.objects import brightness
 from knightcube.vision.objects.brightness import (
     brightnesses,
@@ -49,7 +49,7 @@ def test_all_forms_return_the_same_counts_and_weights(saturation: float) -> None
 
 def test_equations_that_are_not_positive_definite_are_refused() -> None:
     normal = np.array([[1.0, 2.0], [2.0, 1.0]])
-    with pytest.raises(FlightError, match="not positive definite"):
+    with pytest.raises(KnightCubeError, match="not positive definite"):
         brightnesses(normal, np.ones(2), 2.0)
     assert brightness._non_negative.loop_form(normal, np.ones(2))[-1] == brightness._NOT_DEFINITE
 
@@ -123,5 +123,5 @@ def test_a_fit_that_does_not_converge_is_refused(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(brightness, "nnls", give_up)
     monkeypatch.setattr(brightness, "_non_negative", brightness._non_negative.numpy_form)
-    with pytest.raises(FlightError, match="does not converge"):
+    with pytest.raises(KnightCubeError, match="does not converge"):
         brightnesses(normal, right, 2.0)

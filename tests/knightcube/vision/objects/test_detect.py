@@ -19,7 +19,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import rotation_between
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
-from knightcube.errors import ArgumentError, FlightError
+from knightcube.errors import ArgumentError, KnightCubeError
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run
 from knightcube.vision.objects import detect as detect_module
@@ -475,7 +475,7 @@ def test_the_report_can_be_sent_between_processes() -> None:
 
 def test_pixels_that_cannot_be_solved_for_leave_the_streak_unclear(monkeypatch: pytest.MonkeyPatch) -> None:
     def give_up(*_: object, **__: object) -> None:
-        raise FlightError("the fit does not converge")
+        raise KnightCubeError("the fit does not converge")
 
     monkeypatch.setattr("knightcube.vision.objects.star_light.brightnesses", give_up)
     report, _ = _see(motion_across(_PLACE, 60.0 / _FOCAL, 2.4), 4.0)

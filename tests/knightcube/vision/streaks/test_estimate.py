@@ -17,7 +17,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.errors import ArgumentError, FlightError
+from knightcube.errors import ArgumentError, KnightCubeError
 from knightcube.vision.camera.lens import CameraKnowledge, Lens
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import chained_stars, estimate_motion, estimate_rate
@@ -345,9 +345,9 @@ def test_the_result_is_deterministic_and_can_be_pickled() -> None:
 
 
 def test_invalid_arguments_raise_an_error() -> None:
-    with pytest.raises(FlightError, match="shape"):
+    with pytest.raises(KnightCubeError, match="shape"):
         estimate_motion(np.zeros((5, 5), np.uint16), CAMERA.pinhole, 1.0, _SETTINGS)
-    with pytest.raises(FlightError, match="exposure"):
+    with pytest.raises(KnightCubeError, match="exposure"):
         estimate_motion(np.zeros((1024, 1024), np.uint16), CAMERA.pinhole, 0.0, _SETTINGS)
 
 

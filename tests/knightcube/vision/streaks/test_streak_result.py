@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.errors import FlightError
+from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.streak_result import (
     REASONS,
@@ -94,7 +94,7 @@ def test_invalid_arguments_are_named(
     shape: tuple[int, int], exposure: float, prior: np.ndarray | None, sigma: float, named: str
 ) -> None:
     pinhole = Pinhole(40, 40, 100.0)
-    with pytest.raises(FlightError, match=named):
+    with pytest.raises(KnightCubeError, match=named):
         validate(np.zeros(shape, np.uint16), pinhole, exposure, prior, sigma)
-    with pytest.raises(FlightError, match="unsigned"):
+    with pytest.raises(KnightCubeError, match="unsigned"):
         validate(np.zeros((40, 40)), pinhole, 1.0, None, 0.0)
