@@ -771,6 +771,9 @@ class DetectedObjects:
         )
 
 
+# Median deviation (standard deviations) of the streaks from stars' streaks above which the rate is wrong.
+# With the right rate the median is about 1. With a rate wrong by 10 % it is 20 for bright streaks.
+_WRONG_RATE = 10.0
 # Number of positions along each side of an image that are tested for a star that remains in the image.
 _TESTED_STARS = 33
 
@@ -784,6 +787,18 @@ def _keeps_stars(rotation: FloatArray, pinhole: Pinhole) -> bool:
     turns = attitude_matrix(from_rotation_vector(np.array([[-0.5], [0.5]]) * rotation))
     ends = [pinhole.contains(pinhole.project(middles @ turn.T)) for turn in turns]
     return bool(np.any(ends[0] & ends[1]))
+
+
+def _problem_of_rate(report: ObjectReport) -> str:
+    """Return why the assumed rate is wrong, or an empty text.
+
+    With a wrong rate, the streaks of stars would be mistaken for objects.
+    """
+    deviation = float(np.median(np.abs(report.indicators.deviations).max(axis=1)))
+    if deviation <= _WRONG_RATE:
+        return ""
+    cure = "give the rate in rad/s, camera axes, and the exposure in s"
+    return f"the streaks deviate from the rate by {deviation:.0f} standard deviations (median): {cure}"
 
 
 def detect_objects(
@@ -804,7 +819,8 @@ def detect_objects(
             from the streaks of the image. If the sign of the rate is unknown, the directions of motion of all
             objects may have the wrong sign.
         exposure: exposure time, s. If the camera rotates so far during the exposure that no star remains in
-            the image, the result has no objects, and its `reason` states the rotation.
+            the image, the result has no objects, and its `reason` states the rotation. The same holds if most
+            streaks contradict the rate.
         settings: thresholds, gain and saturation, or None for the defaults.
 
     Raises:
@@ -818,19 +834,28 @@ def detect_objects(
     exposure = checked_number("exposure", exposure, "seconds")
     rotation = finite_array("rate", rate, (3,)) * exposure
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
+    none = DetectedObjects((), np.empty((0, 3)), np.empty((0, 3, 3)))
     if not _keeps_stars(rotation, camera.ideal):
-        none, angle = np.empty((0, 3)), float(np.linalg.norm(rotation))
+        angle = float(np.linalg.norm(rotation))
         reason = f"no star remains in the image during a rotation by {angle:.3g} rad: check rate and exposure"
-        return DetectedObjects((), none, np.empty((0, 3, 3)), reason)
+        return replace(none, reason=reason)
     saturation = None if settings.saturation is None else (settings.saturation - zero) / unit
     settings = replace(settings, gain=gain_in_counts(settings.gain, unit), saturation=saturation)
     ends = EndpointSettings(gain=settings.gain, saturation=settings.saturation)
     report = detect(pixels, camera.ideal, rotation, exposure, ends, settings)
-    objects = () if report is None else tuple(replace(each, flux=unit * each.flux) for each in report.objects)
+    if report is None:
+        return replace(none, reason=f"fewer than {ends.least_streaks} significant streaks")
+    if problem := _problem_of_rate(report):
+        return replace(none, reason=problem)
+    objects = tuple(replace(each, flux=unit * each.flux) for each in report.objects)
+    return DetectedObjects(objects, *_directions(objects, camera))
+
+
+def _directions(objects: tuple[SpaceObject, ...], camera: CameraModel) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors (n, 3) to n objects at mid-exposure, and their covariances (n, 3, 3), rad^2."""
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
     # A pixel subtends the largest angle on the boresight; that angle is used for all directions.
     sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""
-    return DetectedObjects(objects, directions, sigma[:, None, None] ** 2 * across, reason)
+    return directions, sigma[:, None, None] ** 2 * across

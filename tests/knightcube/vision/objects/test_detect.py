@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -431,14 +430,26 @@ def test_the_public_search_refuses_a_wrong_rate_or_exposure(rate: Any, exposure:
 
 
 @pytest.mark.parametrize("turn", [1_000.0 * _ROTATION, np.array([0.0, 0.0, 3.2]), np.array([0.7, 0.0, 0.0])])
-def test_a_rotation_that_leaves_no_star_in_the_image_is_answered_at_once(turn: FloatArray) -> None:
+def test_a_rotation_that_leaves_no_star_in_the_image_is_answered_without_a_search(
+    turn: FloatArray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [], _FAINTEST)
-    begin = time.monotonic()
+    monkeypatch.setattr(detect_module, "detect", lambda *_: pytest.fail("the image was searched"))
     found = detect_objects(pixels, _FRAME_CAMERA.pinhole, turn, 1.0)
-    assert time.monotonic() - begin < 2.0
     assert not found
     assert "no star remains in the image" in found.reason
     assert found.directions.shape == (0, 3)
+
+
+@pytest.mark.parametrize("wrong", [0.5, 1.3, 3.0, -2.0])
+def test_a_wrong_rate_is_named_and_gives_no_false_objects(wrong: float) -> None:
+    path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 25.0 / _FOCAL, 0.3), _ROTATION)
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 0.5, 5, [(path, 4.0)], _FAINTEST)
+    settings = ObjectSettings(gain=_SETTINGS.gain, saturation=_SETTINGS.saturation)
+    rate = wrong * _turn(pixels, _ROTATION, 0.5) / 0.5
+    found = detect_objects(pixels, _FRAME_CAMERA.pinhole, rate, 0.5, settings)
+    assert found.objects == ()
+    assert "the streaks deviate from the rate by" in found.reason
 
 
 def test_the_public_search_accepts_numbers_of_every_type() -> None:
