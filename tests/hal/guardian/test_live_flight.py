@@ -1,6 +1,14 @@
-"""Tests that the coils carry no current within half a second after any end of the flight process."""
+"""Tests that the coils carry no current within half a second after any end of the flight process.
+
+The processes run in real time, and a busy machine can delay each of them. A trial whose duration exceeds its
+limit is therefore repeated, at most twice; a fault of the guardian delays every trial.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from math import inf
 
 import numpy as np
 import pytest
@@ -11,10 +19,29 @@ from tests.support.flights import event_names
 
 pytestmark = pytest.mark.slow
 
+_TRIALS = 3
+Trials = Callable[[int], Campaign]
+
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
-    return hurt_in_every_way(tmp_path_factory.mktemp("hurt"))
+def trials(tmp_path_factory: pytest.TempPathFactory) -> Trials:
+    """Return a function that runs the trial of a number once, and returns its result."""
+    return cache(lambda _: hurt_in_every_way(tmp_path_factory.mktemp("hurt")))
+
+
+@pytest.fixture(scope="module")
+def campaign(trials: Trials) -> Campaign:
+    return trials(0)
+
+
+def _shortest(trials: Trials, duration: Callable[[Campaign], float], limit: float) -> float:
+    """Return the shortest duration (s) of the trials up to the first within the `limit`."""
+    shortest = inf
+    for number in range(_TRIALS):
+        shortest = min(shortest, duration(trials(number)))
+        if shortest <= limit:
+            break
+    return shortest
 
 
 def _hurt(campaign: Campaign, act: str) -> Hurt:
@@ -24,35 +51,45 @@ def _hurt(campaign: Campaign, act: str) -> Hurt:
 
 
 @pytest.mark.parametrize("act", ["SIGSTOP", "hang, other threads alive", "hang, interpreter held", "kill -9"])
-def test_the_coils_are_at_zero_half_a_second_after(campaign: Campaign, act: str) -> None:
-    assert _hurt(campaign, act).zero_after <= 0.5
+def test_the_coils_are_at_zero_half_a_second_after(trials: Trials, act: str) -> None:
+    assert _shortest(trials, lambda campaign: _hurt(campaign, act).zero_after, 0.5) <= 0.5
 
 
-def test_a_killed_flight_is_seen_at_once_and_not_after_the_time_out(campaign: Campaign) -> None:
-    assert _hurt(campaign, "kill -9").zero_after < 0.25
+def test_a_killed_flight_is_seen_at_once_and_not_after_the_time_out(trials: Trials) -> None:
+    assert _shortest(trials, lambda campaign: _hurt(campaign, "kill -9").zero_after, 0.25) <= 0.25
 
 
 def test_without_its_guardian_a_stopped_flight_drives_the_coils_on(campaign: Campaign) -> None:
     after = [_hurt(campaign, act).zero_after for act in UNGUARDED]
-    assert float("inf") in after, "the coil current stays, so the other tests of this file can fail"
+    assert inf in after, "the coil current stays, so the other tests of this file can fail"
 
 
 @pytest.mark.parametrize("act", ["SIGSTOP", "hang, other threads alive", "hang, interpreter held"])
-def test_control_comes_back_by_itself_within_two_seconds(campaign: Campaign, act: str) -> None:
-    recovered = _hurt(campaign, act).recovered
-    assert recovered is not None
-    assert recovered <= 2.0
+def test_control_comes_back_by_itself_within_two_seconds(trials: Trials, act: str) -> None:
+    def recovered(campaign: Campaign) -> float:
+        found = _hurt(campaign, act).recovered
+        return inf if found is None else found
+
+    assert _shortest(trials, recovered, 2.0) <= 2.0
 
 
 def test_a_guardian_that_is_killed_or_hangs_is_replaced_and_reported(campaign: Campaign) -> None:
     assert len(set(campaign.guardians)) == 3
     assert event_names(campaign.truth.run).count("guardian-ready") >= 2
-    events = campaign.truth.run["event"]
-    reported = events["time_ns"][events["name"] == b"guardian-lost"] + campaign.truth.epoch_ns
-    # On a busy machine, a new guardian can be replaced too, because it does not read its line yet.
-    killed, stopped = ((reported[reported > lost] - lost)[0] * 1e-9 for lost in campaign.guardian_lost_ns)
-    assert killed < 0.5, "a death is seen at once"
-    assert stopped < 2.0, "a line that is not read fills up"
+
+
+@pytest.mark.parametrize(("number", "limit"), [(0, 0.5), (1, 2.0)])
+def test_a_death_is_seen_at_once_and_a_hang_when_the_line_fills_up(
+    trials: Trials, number: int, limit: float
+) -> None:
+    def seen(campaign: Campaign) -> float:
+        events = campaign.truth.run["event"]
+        reported = events["time_ns"][events["name"] == b"guardian-lost"] + campaign.truth.epoch_ns
+        # On a busy machine, a new guardian can be replaced too, because it does not read its line yet.
+        lost = campaign.guardian_lost_ns[number]
+        return float((reported[reported > lost] - lost).min(initial=np.iinfo(np.int64).max)) * 1e-9
+
+    assert _shortest(trials, seen, limit) <= limit
 
 
 def test_a_lost_guardian_does_not_disturb_the_flight(campaign: Campaign) -> None:
