@@ -149,7 +149,7 @@ GYRO_RECOVERED = _info(156, "gyro-recovered", "the inertial unit measures the ra
 CONTROL_LOST = _fault(
     20,
     "control-lost",
-    "the coils are set to zero because there is no valid estimate",
+    "the coils are set to zero because the estimate is not valid",
     "restore a sensor: read the events of inertial unit, camera and magnetometer before this event",
     Reaction.COILS_OFF,
 )

@@ -84,6 +84,20 @@ MODULES = "KNIGHTCUBE_MODULES"
 configuration may import, in addition to the known objects."""
 
 
+_IMPORT_MISTAKES = (
+    ImportError,
+    AttributeError,
+    SyntaxError,
+    NameError,
+    TypeError,
+    ValueError,
+    LookupError,
+    ArithmeticError,
+    OSError,
+)
+"""Exceptions that mistakes in a module usually raise while it is imported."""
+
+
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
     """Return the object `module:object`; `known` maps short names to such objects. Raises ConfigError.
 
@@ -98,7 +112,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
         raise ConfigError(key, f"is {named!r}, which is not permitted: add it as a line to {file} as root")
     try:
         return getattr(importlib.import_module(module), name)
-    except Exception as error:  # the module may raise any exception while it is imported
+    except _IMPORT_MISTAKES as error:
         problem = _import_problem(module, name, error, on_board=file is not None)
         raise ConfigError(key, f"is {named!r}, which cannot be imported: {problem}") from error
 

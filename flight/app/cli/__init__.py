@@ -100,7 +100,7 @@ examples:
 
 
 def to_json(facts: Any, *, allow_nan: bool = True) -> str:
-    """Return the result of a command as one line of JSON, with numbers rounded to twelve digits.
+    """Return the result of a command as one line of JSON, with numbers rounded to 15 digits.
 
     Otherwise, times that are computed from integers in ns would be printed as 15.450000000000001.
     """
@@ -112,7 +112,7 @@ def _rounded(value: Any) -> Any:
         return {key: _rounded(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_rounded(each) for each in value]
-    return float(f"{value:.12g}") if isinstance(value, float) else value
+    return float(f"{value:.15g}") if isinstance(value, float) else value
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -213,7 +213,8 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
         if now - last < period:
             return
         last = now
-        with suppress(OSError):  # an error such as a full disk must not affect the flight
+        # A full disk, or a stream that was closed before a later compilation, must not affect the flight.
+        with suppress(OSError, ValueError):
             stream.write(f"{before}{text()}{after}")
             stream.flush()
 

@@ -138,18 +138,23 @@ def test_the_smallest_and_the_largest_seed_are_accepted() -> None:
     assert (seed_number("0"), seed_number(str(2**64 - 1))) == (0, 2**64 - 1)
 
 
-def test_numbers_of_a_json_result_are_rounded_to_twelve_digits() -> None:
+def test_numbers_of_a_json_result_are_rounded_to_15_digits() -> None:
     facts = {"time_s": 618 * 0.025, "rows": [{"x": 15.450000000000001}], "utc_ns": 1774008001000000000}
     assert to_json(facts) == '{"time_s": 15.45, "rows": [{"x": 15.45}], "utc_ns": 1774008001000000000}\n'
+    # A Julian date keeps its fraction of a millisecond.
+    assert to_json(2461119.50000123) == "2461119.50000123\n"
 
 
 def test_the_line_of_progress_names_the_function_that_numba_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[Callable[[str], None]] = []
-    monkeypatch.setattr("flight.app.cli.run.report_compilations", told.append)
+    reports: list[Callable[[str], None]] = []
+    monkeypatch.setattr("flight.app.cli.run.report_compilations", reports.append)
     times = iter([0.0, 5.0, 11.0])
     monkeypatch.setattr("flight.app.cli.run.time.perf_counter", lambda: next(times))
     stream = io.StringIO()
     progress_on(stream)
     for name in ("first", "second"):
-        told[0](name)
+        reports[0](name)
     assert stream.getvalue() == "waits once until numba has compiled second\n"
+    stream.close()
+    monkeypatch.setattr("flight.app.cli.run.time.perf_counter", lambda: 30.0)
+    reports[0]("third")
