@@ -11,9 +11,9 @@ with the configuration and the drop-ins of its units. For orbital elements or a 
 configuration in FOLDER/set is a copy of the configuration PRESENT with one value replaced. KEPT is the folder
 in which the star catalogue is installed later. UTC is the mission time (s since 1970) with which expiry dates
 are compared. With an empty UTC the mission time is unknown, and expiry dates are not checked, because the
-system clock of a board may be wrong. The program prints the version, the permission to replace a newer
-version, and the SHA-256 as one JSON object. For a refused bundle, the program prints one line and exits with
-status 1.
+system clock of a board may be wrong. PRESENT, KEPT and UTC may be omitted for a release. The program prints
+the version, the permission to replace a newer version, and the SHA-256 as one JSON object. For a refused
+bundle, the program prints one line and exits with status 1.
 """
 
 from __future__ import annotations
@@ -182,7 +182,11 @@ def write_set(text: str, folder: Path) -> None:
 
 def main(words: Sequence[str]) -> int:
     """Check the bundle and prepare its content; return the exit status."""
-    trusted, root, bundle, kind, folder, present, kept, utc = words
+    if not 5 <= len(words) <= 8:
+        sys.stderr.write("usage: open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER [PRESENT [KEPT [UTC]]]\n")
+        return 2
+    trusted, root, bundle, kind, folder = words[:5]
+    present, kept, utc = (*words[5:], *("-", "-", "")[len(words) - 5 :])
     place = Path(folder)
     now = datetime.fromtimestamp(int(utc), UTC) if utc else datetime.min.replace(tzinfo=UTC)
     try:

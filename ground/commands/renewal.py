@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import lzma
 import os
 import re
 import sys
@@ -18,6 +19,7 @@ from securesystemslib.signer import CryptoSigner
 from tuf.api.exceptions import RepositoryError
 from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, TargetFile, Targets, Timestamp
 
+from flight.app.cli import PROGRAM
 from flight.app.run import utc_ns
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
@@ -28,7 +30,9 @@ from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
 from ground.commands.options import positive
 from ground.link.commanding import add_link_options, command, explained, failed, sha256_of, terminal_of
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.errors import KnightCubeError, UsageError
+from knightcube.vision.startracker import index
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
 """Expiry date of metadata that never expire, so that a wrong clock on board does not matter."""
@@ -36,6 +40,9 @@ _FOLDERS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config")
 PARTS = (*_FOLDERS, "pyproject.toml", "README.md", "LICENSE", "wheels")
 """Source files and folders that a release contains."""
 _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
+_LAST_VERSION = 10**12 - 1
+"""Highest version that is signed: 12 digits, enough for a date with hours and minutes."""
+_TARGETS = tuple(f"targets/{kind}" for kind in KINDS)  # names of the artefacts in a bundle
 _TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0
 """Default times (s) to wait for the privileged part, which runs every 10 s, and for a release to be built."""
 
@@ -104,6 +111,7 @@ def run(options: argparse.Namespace) -> int:
             data = artefact(options.kind, options.path)
             if options.version is None:
                 options.version = _release_version(options.kind, options.path)
+            _check_permanent(options)
             bundle = sign(options, data)
             sys.stdout.write(f"{bundle}: {bundle.stat().st_size} bytes\n")
         case _:
@@ -153,6 +161,20 @@ def replace_signing_key(folder: Path, also_root: bool) -> int:
     return root.version
 
 
+def _check_permanent(options: argparse.Namespace) -> None:
+    """Raise UsageError for an option whose effect on board cannot be undone, and for an unusable folder."""
+    for name in ("version", "least"):
+        if not 1 <= (value := getattr(options, name)) <= _LAST_VERSION:
+            problem = f"must be 1 to {_LAST_VERSION}, because the board never accepts a lower version again"
+            raise UsageError(f"--{name} {value}: {problem}")
+    if options.expires is not None and _date(options.expires) <= datetime.now(UTC):
+        raise UsageError(f"--expires {options.expires}: has passed: give a later date, or omit the option")
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--out {options.out}: cannot be made: {error.strerror or error}") from error
+
+
 def sign(options: argparse.Namespace, data: bytes) -> Path:
     """Sign the bytes of an artefact, and return the path of their bundle. Raises UsageError."""
     folder, kind = options.folder, options.kind
@@ -190,6 +212,7 @@ def _command(options: argparse.Namespace) -> int:
     if options.what == "activate":
         if not 0.0 < options.hours < float("inf"):
             raise UsageError(f"--hours {options.hours}: must be a positive number")
+        _check_bundle(options.path, options.kind)
         name = f"received/{options.kind}/{options.path.name}"
         directive = Activate(name, sha256_of(options.path), options.hours, int(options.despite_faults))
     else:
@@ -226,25 +249,49 @@ def artefact(kind: str, path: Path) -> bytes:
         text = read_text(path)
         if parse(text, str(path)).link is None:
             raise UsageError(f"{path}: has no `link`, so its flight could not be reached")
+        if len(read_document(text, str(path)).chain) > 1:
+            cure = f"merge the files by `{PROGRAM} check {path} --merged NEW`, and sign NEW"
+            raise UsageError(f"{path}: `extends` names a file that the board does not have: {cure}")
         return text.encode()
     data = LinuxFiles().read(path)
     if data is None:
         raise UsageError(f"{path}: there is no such file")
-    return _two_lines(data, path) if kind == "elements" else data
+    if kind == "elements":
+        return _two_lines(data, path)
+    index.load(path)  # raises InputError for a file that is not a sky index
+    return data
+
+
+def _check_bundle(path: Path, kind: str) -> None:
+    """Raise UsageError if a file is not a bundle with an artefact of this kind."""
+    try:
+        with tarfile.open(path) as archive:
+            kinds = [name.removeprefix("targets/") for name in archive.getnames() if name in _TARGETS]
+    except (OSError, EOFError, lzma.LZMAError, tarfile.TarError) as error:
+        problem = (isinstance(error, OSError) and error.strerror) or "is not a bundle"
+        raise UsageError(f"{path}: {problem}: give the local copy of a bundle of `renewal sign`") from error
+    if kinds != [kind]:
+        found = ", ".join(kinds) or "no artefact"
+        raise UsageError(f"{path}: contains {found}, not {kind}: give the kind of the bundle")
 
 
 def _two_lines(data: bytes, path: Path) -> bytes:
-    """Return the two-line elements in a text or YAML file. Raises UsageError if the file has none."""
+    """Return the two-line elements in a text or YAML file. Raises UsageError for invalid elements."""
     lines = [line.rstrip() for line in data.decode(errors="replace").splitlines() if line.strip()]
-    if [len(line) for line in lines] == [69, 69]:
-        return data
-    lines = []
-    with suppress(UsageError):
-        found = read_document(read_text(path), str(path)).values.get("elements")
-        lines = [str(line) for line in found] if isinstance(found, list) else []
-    if [len(line) for line in lines] != [69, 69]:
-        raise UsageError(f"{path}: give two lines of 69 characters, or a YAML file with them as `elements`")
-    return "".join(f"{line}\n" for line in lines).encode()
+    plain = [len(line) for line in lines] == [69, 69]
+    if not plain:
+        lines = []
+        with suppress(UsageError):
+            found = read_document(read_text(path), str(path)).values.get("elements")
+            lines = [str(line) for line in found] if isinstance(found, list) else []
+        if [len(line) for line in lines] != [69, 69]:
+            problem = "give two lines of 69 characters, or a YAML file with them as `elements`"
+            raise UsageError(f"{path}: {problem}")
+    try:
+        TwoLineElements(lines[0], lines[1])
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from error
+    return data if plain else "".join(f"{line}\n" for line in lines).encode()
 
 
 def _release_version(kind: str, source: Path) -> int:
@@ -312,7 +359,10 @@ def _read_key(path: Path) -> CryptoSigner:
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
         return CryptoSigner(key)
-    except (OSError, ValueError, TypeError) as error:
+    except OSError as error:
+        cure = "give the folder that `renewal keys` has made"
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}: {cure}") from error
+    except (ValueError, TypeError) as error:
         raise UsageError(f"{path}: is not a readable key: {error}") from error
 
 

@@ -9,10 +9,17 @@ from unittest.mock import Mock
 import pytest
 
 from flight.link.process.commanding import Report, Stage
+from flight.schema.document import merged_text
 from tests.deploy.scripts import changed_testbed, script
 from tests.ground.commands.in_process import command
 
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000'}"
+
+
+LINES = (
+    "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05\n"
+    "2 99999  97.4059   0.3561 0012106 297.0955  63.0523 15.24067538    03\n"
+)
 
 
 @pytest.fixture
@@ -52,29 +59,21 @@ def test_a_release_is_signed_under_the_version_of_its_sources(
     assert (done.returncode, done.stderr) == (0, "")
     root, folder = signing / "metadata/1.root.json", tmp_path / "opened"
     folder.mkdir()
-    words = [
-        tmp_path / "trusted",
-        root,
-        tmp_path / f"release-{number}.renewal",
-        "release",
-        folder,
-        "-",
-        "-",
-        "",
-    ]
+    words = [tmp_path / "trusted", root, tmp_path / f"release-{number}.renewal", "release", folder]
     assert script("open_bundle").main([str(word) for word in words]) == 0
     with tarfile.open(folder / "artefact") as archive:
         assert {"deploy/build_release.py", "pyproject.toml"} < set(archive.getnames())
 
 
 @pytest.mark.parametrize(
-    ("kind", "version"), [("release", "1.2"), ("release", "0.100.0"), ("catalogue", "1.2.3")]
+    ("kind", "version"), [("release", "1.2"), ("release", "0.100.0"), ("elements", "1.2.3")]
 )
 def test_without_a_usable_version_the_option_is_asked_for(
     signing: Path, tmp_path: Path, kind: str, version: str
 ) -> None:
     source = _sources(tmp_path / "source", version)
-    path = source if kind == "release" else source / "pyproject.toml"
+    path = source if kind == "release" else tmp_path / "elements"
+    (tmp_path / "elements").write_text(LINES)
     done = command("renewal", "sign", signing, kind, path, "--out", tmp_path)
     assert done.returncode == 2
     assert "--version N" in done.stderr
@@ -96,11 +95,11 @@ def test_one_root_key_is_enough_to_replace_all_keys(signing: Path, tmp_path: Pat
     (signing / "root-1.pem").unlink()
     assert command("renewal", "new-key", signing, "--root").returncode == 0
     assert command("renewal", "new-key", signing).returncode == 0
-    index = tmp_path / "index"
-    index.write_bytes(b"stars")
-    done = command("renewal", "sign", signing, "catalogue", index, "--version", "1", "--out", tmp_path)
+    elements = tmp_path / "elements"
+    elements.write_text(LINES)
+    done = command("renewal", "sign", signing, "elements", elements, "--version", "1", "--out", tmp_path)
     assert done.returncode == 0
-    with tarfile.open(tmp_path / "catalogue-1.renewal") as archive:
+    with tarfile.open(tmp_path / "elements-1.renewal") as archive:
         assert {"metadata/1.root.json", "metadata/2.root.json", "metadata/3.root.json"} < set(
             archive.getnames()
         )
@@ -130,7 +129,14 @@ def test_elements_are_signed_as_the_command_elements_prints_them(signing: Path, 
         ("elements", "elements: [1 25544U, 2 25544]\n", [], "two lines of 69 characters"),
         ("elements", "name: lark\n", [], "two lines of 69 characters"),
         ("release", "", [], "is not the folder of this software's sources"),
-        ("catalogue", "x", ["--expires", "soon"], "--expires soon: is not a date"),
+        ("elements", LINES, ["--expires", "soon"], "--expires soon: is not a date"),
+        ("elements", LINES, ["--expires", "2020-01-01"], "--expires 2020-01-01: has passed"),
+        ("elements", LINES, ["--least", "0"], "--least 0: must be 1 to 999999999999"),
+        ("elements", LINES, ["--version", "-3"], "--version -3: must be 1 to 999999999999"),
+        ("elements", LINES, ["--version", str(10**12)], "--version 1000000000000: must be 1"),
+        ("elements", LINES.replace("26079", "26078"), [], "line 1, column 69: checksum 5"),
+        ("elements", f"elements: {LINES.replace('297.0955', '297.0965').splitlines()}", [], "checksum 3"),
+        ("catalogue", "x", [], "the file is not a sky index"),
         ("catalogue", None, [], "there is no such file"),
     ],
 )
@@ -146,12 +152,52 @@ def test_what_the_board_would_refuse_is_not_signed(
     assert not list(tmp_path.glob("*.renewal"))
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("extends: base.yaml\nname: derived\n", "--merged NEW`, and sign NEW"),
+        ("extends: orbit.yaml\nname: silent\n", "has no `link`"),
+    ],
+)
+def test_a_configuration_that_the_board_could_not_use_is_not_signed(
+    signing: Path, tmp_path: Path, text: str, words: str
+) -> None:
+    own = "commands: {socket: x.socket}\nlink: {keys: k, udp: '127.0.0.1:5010'}\n"
+    (tmp_path / "base.yaml").write_text(f"extends: orbit.yaml\n{own}")
+    (tmp_path / "flight.yaml").write_text(text)
+    done = command("renewal", "sign", signing, "configuration", tmp_path / "flight.yaml", "--version", "1")
+    assert (done.returncode, words in done.stderr) == (2, True), done.stderr
+    merged = tmp_path / "merged.yaml"
+    merged.write_text(merged_text((tmp_path / "base.yaml").read_text(), str(tmp_path / "base.yaml")))
+    out = tmp_path / "new/folder"
+    done = command("renewal", "sign", signing, "configuration", merged, "--version", "1", "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (out / "configuration-1.renewal").exists()
+
+
+def test_an_unusable_folder_does_not_use_up_a_version(signing: Path, tmp_path: Path) -> None:
+    (tmp_path / "elements").write_text(LINES)
+    words = [
+        "renewal",
+        "sign",
+        str(signing),
+        "elements",
+        str(tmp_path / "elements"),
+        "--version",
+        "1",
+        "--out",
+    ]
+    done = command(*words, tmp_path / "elements/below")
+    assert (done.returncode, "cannot be made" in done.stderr) == (2, True)
+    assert command(*words, tmp_path).returncode == 0
+
+
 def test_versions_rise_unless_going_back_is_signed(signing: Path, tmp_path: Path) -> None:
-    index = tmp_path / "index"
-    index.write_bytes(b"stars")
-    words = ["renewal", "sign", str(signing), "catalogue", str(index), "--out", str(tmp_path), "--version"]
+    (tmp_path / "elements").write_text(LINES)
+    words = ["renewal", "sign", str(signing), "elements", str(tmp_path / "elements")]
+    words += ["--out", str(tmp_path), "--version"]
     assert command(*words, "3").returncode == 0
-    assert "catalogue 3 is signed already" in command(*words, "3").stderr
+    assert "elements 3 is signed already" in command(*words, "3").stderr
     assert command(*words, "2", "--back").returncode == 0
     assert command(*words, "3").returncode == 0
 
@@ -174,7 +220,8 @@ def test_activate_succeeds_only_if_the_trial_has_begun(
     reports = [Report(1, 7, Stage[stage], "activate", "text") for stage in stages]
     terminal.follow.side_effect = [reports, *[[]] * 1000]
     monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: terminal)
-    (tmp_path / "bundle").write_bytes(b"bundle")
+    with tarfile.open(tmp_path / "bundle", "w:xz") as archive:
+        archive.addfile(tarfile.TarInfo(f"targets/{kind}"))
     done = command(
         "renewal", "activate", "--link", "127.0.0.1:1", "--keys", "k", kind, "bundle", folder=tmp_path
     )
@@ -183,3 +230,29 @@ def test_activate_succeeds_only_if_the_trial_has_begun(
     assert shown == [stage.lower() for stage in stages]
     assert error in done.stderr
     assert bool(error) == bool(done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("targets/release", "contains release, not elements: give the kind of the bundle"),
+        ("other", "contains no artefact, not elements"),
+        (None, "is not a bundle: give the local copy of a bundle of `renewal sign`"),
+    ],
+)
+def test_only_a_bundle_of_the_stated_kind_is_activated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str | None, words: str
+) -> None:
+    monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: pytest.fail("a frame was sent"))
+    (tmp_path / "bundle").write_text(LINES)
+    if content is not None:
+        with tarfile.open(tmp_path / "bundle", "w:xz") as archive:
+            archive.addfile(tarfile.TarInfo(content))
+    link = ["--link", "127.0.0.1:1", "--keys", "k"]
+    done = command("renewal", "activate", *link, "elements", "bundle", folder=tmp_path)
+    assert (done.returncode, words in done.stderr) == (2, True), done.stderr
+
+
+def test_the_program_of_the_board_states_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    assert script("open_bundle").main(["trusted", "root", "bundle"]) == 2
+    assert "TRUSTED ROOT BUNDLE KIND FOLDER" in capsys.readouterr().err
