@@ -250,8 +250,9 @@ class Hypothesis:
         breadth: ratio of the median width of the edges on the horizon to the width expected from the
             brightness profile of the atmosphere.
         not_space: why the image beyond the horizon is not space, or an empty string if it may be space.
-        altitude_off: distance of a fitted altitude from the range `HorizonSettings.altitudes`, in standard
-            deviations of the altitude; 0 if the altitude is known.
+        altitude_off: distance of the altitude that the edges imply from the known altitude, or from the range
+            `HorizonSettings.altitudes` if the altitude is unknown, in standard deviations.
+        implied_altitude: altitude that the edges imply, m; NaN if they do not determine it.
     """
 
     fit: FittedLimb
@@ -268,6 +269,7 @@ class Hypothesis:
     breadth: float
     not_space: str
     altitude_off: float
+    implied_altitude: float
 
     @property
     def covariance(self) -> FloatArray:
@@ -324,7 +326,7 @@ def examine(
         chance + math.log10(stand.share),
         float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma),
         why_not_space(view, sun, observation.samples, pixel),
-        0.0 if altitude_known else _altitude_off(fit, settings.altitudes),
+        *_altitude_off(fit, limb, prior, settings.altitudes),
     )
 
 
@@ -335,10 +337,24 @@ def _night_share(view: LimbView, rays: FloatArray, sun: FloatArray | None) -> fl
     return float(np.mean(sun_elevation(view, rays, sun) < _NIGHT))
 
 
-def _altitude_off(fit: FittedLimb, altitudes: tuple[float, float]) -> float:
-    """Return the distance of the fitted altitude from the range `altitudes` (m), in standard deviations."""
-    (low, high), altitude = altitudes, fit.view.surface.height_of(fit.view.position)
-    return max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
+def _altitude_off(
+    fit: FittedLimb, limb: LimbPoints, prior: Prior, altitudes: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the distance (sigma) of the altitude that the edges imply from prior knowledge, and that altitude.
+
+    A known altitude is compared with the altitude of a fit without it; otherwise the fitted altitude is
+    compared with the range `altitudes`, m.
+    """
+    if prior.altitude >= UNKNOWN:
+        (low, high), altitude = altitudes, fit.view.surface.height_of(fit.view.position)
+        off = max(low - altitude, altitude - high, 0.0)
+        return off / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA), altitude
+    free = fit_limb(fit.view, limb.rays, limb.sigma, replace(prior, altitude=UNKNOWN))
+    if free is None:
+        return 0.0, math.nan
+    known, altitude = (each.view.surface.height_of(each.view.position) for each in (fit, free))
+    sigma = math.hypot(free.altitude_sigma(SPHERE_ALTITUDE_SIGMA), prior.altitude)
+    return abs(altitude - known) / sigma, altitude
 
 
 def _fitted(

@@ -157,7 +157,7 @@ class HorizonSolution:
 _WIDER = 2.0
 """Factor that widens the altitude range in the search for cones. A cone through three edges is inaccurate."""
 _MOST_ALTITUDE = 3.0
-"""Largest distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations."""
+"""Largest distance (standard deviations) of the altitude that the edges imply from prior knowledge."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 """Thresholds of three tests that a horizon must pass.
 
@@ -554,8 +554,11 @@ def _contradiction(one: Hypothesis) -> str:
     if one.guess.orientation.mismatch > MOST_MISMATCH:
         return f"the nadir contradicts a coarse direction by {one.guess.orientation.mismatch:.1f} sigma"
     if one.altitude_off > _MOST_ALTITUDE:
-        altitude = one.fit.view.surface.height_of(one.fit.view.position)
-        return f"the limb implies an altitude of {1e-3 * altitude:.0f} km: if it is right, pass it explicitly"
+        implied = f"the limb implies an altitude of {1e-3 * one.implied_altitude:.0f} km"
+        if one.guess.place.altitude_sigma >= UNKNOWN:
+            return f"{implied}: if it is right, pass it explicitly"
+        known = one.guess.place.surface.height_of(one.guess.place.position)
+        return f"{implied}, not {1e-3 * known:.0f} km: correct the altitude or the field of view"
     return ""
 
 

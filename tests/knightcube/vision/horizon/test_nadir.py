@@ -229,6 +229,20 @@ def test_a_horizon_of_few_edges_is_read_more_closely_where_it_runs() -> None:
     assert _error_deg(twice, scene) < 3.0 * np.degrees(twice.nadir.sigma)
 
 
+@pytest.mark.parametrize("altitude", [400e3, 450e3, 800e3])
+def test_a_wrong_altitude_is_refused_with_the_altitude_of_the_limb(
+    day: tuple[EarthScene, Image], altitude: float
+) -> None:
+    """The scene is at 600 km. The nadir of a limb that is fitted at another altitude is degrees off."""
+    found = find_nadir(day[1], MODEL.lens, HorizonKnowledge(altitude=altitude), SETTINGS)
+    assert found.status is HorizonStatus.REFUSED
+    assert f"not {1e-3 * altitude:.0f} km: correct the altitude or the field of view" in found.reason
+    implied = float(found.reason.split("an altitude of ")[1].split(" km")[0])
+    assert abs(implied - 600.0) < 60.0
+    right = find_nadir(day[1], MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
+    assert right.status is HorizonStatus.FOUND
+
+
 @pytest.mark.parametrize("level", [0.0, 90.0])
 def test_sky_alone_and_noise_alone_show_no_horizon(level: float) -> None:
     frame = np.random.default_rng(2).normal(10.0 + level, 1.2, (512, 512)).clip(0, 255).astype(np.uint8)
