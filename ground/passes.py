@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from skyfield.api import EarthSatellite, Time, load, wgs84
 from skyfield.nutationlib import iau2000b_radians
 from skyfield.toposlib import GeographicPosition
 
-from flight.schema.document import read_document, read_text
+from flight.schema.document import ConfigError, Document, convert, read_document, read_text
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
@@ -32,6 +32,15 @@ _SEARCH_S = 3600.0
 """Time (s) by which the search extends beyond the span, so that passes at its ends are found completely."""
 _STEP_S = 10.0  # interval (s) between computed positions; begin and end of an eclipse are interpolated
 _SPEED = 7.6e3  # typical speed (m/s) in a low orbit, which converts an along-track error to a timing error
+NEWER = "give newer elements (`knightcube elements` with --fixes or --read)"
+"""Remedy for elements whose predicted times are uncertain."""
+_KNOWN_SHARE = 0.25
+"""Standard deviation of the predicted times, as a fraction of the orbital period, above which the revolution
+that passes over a station is unknown."""
+_BETWEEN = timedelta(seconds=1)
+"""Time between two commands of different passes, because scheduled commands are due at whole seconds."""
+_LOW_PERIOD_S = 9000.0
+"""Longest period of an orbit in which each pass is shorter than `_SEARCH_S`."""
 LEAD_S = 120.0
 """Default time (s) for the slew, from the command to point to the station until the rise."""
 _RISE, _CULMINATION, _SET = range(3)
@@ -110,26 +119,36 @@ def facts_of(one: Pass) -> dict[str, object]:
     }
 
 
-def scheduled_targets(one: Pass, lead: float = LEAD_S) -> list[tuple[datetime, PointingTarget]]:
-    """Return UTC and pointing target of the commands for a pass: to the station, and back to nadir.
+def scheduled_targets(
+    passes: Sequence[Pass], lead: float = LEAD_S
+) -> list[list[tuple[datetime, PointingTarget]]]:
+    """Return UTC and pointing target of the commands for each pass: to the station, and back to nadir.
 
-    The first command is due `lead` s before the rise.
+    The passes are in order of rise. The first command of a pass is due `lead` s before the rise, but after
+    the last command of the pass before: the satellite points to a station until the pass over this station
+    ends. A pass that ends during an earlier pass has no commands.
     """
-    place = (math.radians(one.station.latitude_deg), math.radians(one.station.longitude_deg))
-    begin = one.rise - timedelta(seconds=lead)
-    return [(begin, PointingTarget(Goal.GROUND, place)), (one.set, PointingTarget(Goal.NADIR))]
+    found: list[list[tuple[datetime, PointingTarget]]] = []
+    free: datetime | None = None  # end of the latest pass that has commands
+    for one in passes:
+        place = (math.radians(one.station.latitude_deg), math.radians(one.station.longitude_deg))
+        begin = one.rise - timedelta(seconds=lead)
+        if free is not None:
+            begin = max(begin, free + _BETWEEN)
+        if begin >= one.set:
+            found.append([])
+            continue
+        found.append([(begin, PointingTarget(Goal.GROUND, place)), (one.set, PointingTarget(Goal.NADIR))])
+        free = one.set
+    return found
 
 
 def read_stations(path: Path) -> tuple[Station, ...]:
     """Return the stations in a YAML file with the list `stations`.
 
-    Raises ConfigError for a file that cannot be read, and UsageError for a wrong value.
+    Raises ConfigError for a file that cannot be read, and for a wrong value.
     """
-    values = read_document(read_text(path), str(path)).values
-    try:
-        return msgspec.convert(values, _Stations).stations
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{path}: {error}") from error
+    return convert(read_document(read_text(path), str(path)), _Stations).stations
 
 
 def station_of(text: str) -> Station:
@@ -143,10 +162,11 @@ def station_of(text: str) -> Station:
     if not 2 <= len(numbers) <= len(keys):
         raise UsageError(f"station {text!r}: {form}")
     try:
-        values = dict(zip(keys, map(float, numbers), strict=False))
-        return msgspec.convert({"name": name.strip(), **values}, Station)
-    except ValueError as error:  # also the error of msgspec
-        raise UsageError(f"station {text!r}: {error}; {form}") from error
+        values: dict[str, Any] = dict(zip(keys, map(float, numbers), strict=False))
+        return convert(Document({"name": name.strip(), **values}, f"station {text!r}", {}), Station)
+    except (ValueError, ConfigError) as error:
+        problem = str(error) if isinstance(error, ConfigError) else f"station {text!r}: {error}"
+        raise UsageError(f"{problem}; {form}") from error
 
 
 class OrbitPrediction:
@@ -172,9 +192,22 @@ class OrbitPrediction:
             raise UsageError(f"the elements describe no orbit from {begin:%Y-%m-%d} on: {error}") from error
 
     @property
+    def period_s(self) -> float:
+        """Duration (s) of a revolution."""
+        return 60.0 * math.tau / float(self._satellite.model.no_kozai)
+
+    @property
     def timing_error_s(self) -> float:
         """Standard deviation (s) of predicted times at the end of the span due to the age of the elements."""
         return self._elements.at(julian_date(self.end)).sigma / _SPEED
+
+    def check_age(self) -> None:
+        """Raise UsageError if the error of the predicted times is a considerable part of a revolution."""
+        if self.timing_error_s > _KNOWN_SHARE * self.period_s:
+            epoch = f"{self._satellite.epoch.utc_datetime():%Y-%m-%d}"
+            problem = f"the times at the end have a standard deviation of {self.timing_error_s:.0f} s"
+            cure = f"{NEWER}, or a time near {epoch}"
+            raise UsageError(f"the elements of {epoch} are too old: {problem}: {cure}")
 
     def _times(self, at: Sequence[datetime]) -> Time:
         """Return times with the nutation model IAU 2000B.
@@ -187,15 +220,23 @@ class OrbitPrediction:
         return times
 
     def passes(self, stations: Sequence[Station]) -> list[Pass]:
-        """Return the passes over all stations that overlap the span, in order of rise."""
+        """Return the passes over all stations that overlap the span, in order of rise.
+
+        Raises UsageError if the satellite does not set at a station, as a geostationary satellite, and if the
+        elements are too old to predict which revolution passes over a station.
+        """
+        self.check_age()
         found = [one for station in stations for one in self._over(station)]
         return sorted(found, key=lambda one: (one.rise, one.station.name))
 
     def _over(self, station: Station) -> Iterator[Pass]:
         place = station.on_earth()
-        around = timedelta(seconds=_SEARCH_S)
+        around = timedelta(seconds=_SEARCH_S if self.period_s < _LOW_PERIOD_S else self.period_s)
         first, last = (self._scale.from_datetime(at) for at in (self.begin - around, self.end + around))
         times, events = self._satellite.find_events(place, first, last, altitude_degrees=station.mask_deg)
+        if _SET not in events and self._seen_from(place, [self.end])[0][0] > station.mask_deg:
+            problem = f"the satellite stays above {station.mask_deg:g} deg, so that no pass begins or ends"
+            raise UsageError(f"station {station.name}: {problem}: omit this station")
         own: list[datetime] = []
         for time, event in zip(times, events, strict=True):
             at = time.utc_datetime()

@@ -26,6 +26,7 @@ import sys
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
@@ -40,6 +41,7 @@ from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, TELECOMMANDS, UNUSED, document, spread
 from knightcube.errors import KnightCubeError, UsageError
+from knightcube.gnc.guidance.pointing_target import PointingTarget
 
 if TYPE_CHECKING:
     from ground.documentation import Body
@@ -458,6 +460,8 @@ def add_passes(
 
     A view of the timeline is added at the first call. Raises OSError if Yamcs refuses a request.
     """
+    from ground.passes import scheduled_targets  # noqa: PLC0415 - Skyfield is large
+
     timeline = f"/timeline/{instance}"
     if not session.ask(f"{timeline}/views").get("views"):
         common = {"shared": True, "source": "rdb"}
@@ -467,8 +471,9 @@ def add_passes(
         session.ask(f"{timeline}/views", {"name": "passes", "bands": bands})
     for old in list(_shown(session, timeline, prediction)):
         session.ask(f"{timeline}/items/{old}", method="DELETE")
-    for one in prediction.passes(stations):
-        session.ask(f"{timeline}/items", _item(one))
+    found = prediction.passes(stations)
+    for one, schedule in zip(found, scheduled_targets(found), strict=True):
+        session.ask(f"{timeline}/items", _item(one, schedule))
 
 
 def _shown(session: Session, timeline: str, prediction: OrbitPrediction) -> Iterator[str]:
@@ -482,14 +487,12 @@ def _shown(session: Session, timeline: str, prediction: OrbitPrediction) -> Iter
         query["next"] = found["continuationToken"]
 
 
-def _item(one: Pass) -> dict[str, Any]:
+def _item(one: Pass, schedule: list[tuple[datetime, PointingTarget]]) -> dict[str, Any]:
     """Return a pass as a timeline item, with sunlight or shadow, and arguments for the command `schedule`."""
-    from ground.passes import scheduled_targets  # noqa: PLC0415 - Skyfield is large
-
     begin = one.rise.replace(microsecond=0)
     azimuths = " to ".join(f"{azimuth:.0f}" for azimuth in one.azimuths_deg)
     light = "sunlight" if one.sunlit > 0.5 else "shadow"
-    words = [f"{at:%Y-%m-%dT%H:%M:%S} {words_of(Point(target))}" for at, target in scheduled_targets(one)]
+    words = [f"{at:%Y-%m-%dT%H:%M:%S} {words_of(Point(target))}" for at, target in schedule]
     facts = [
         f"azimuths {azimuths} deg",
         f"satellite in {light}",

@@ -11,13 +11,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 
 from flight.app.cli import PROGRAM, to_json
+from flight.link.process.commanding import MOST_ENTRIES
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, as_orbit
-from flight.schema.document import config_path, read_text
+from flight.schema.document import Document, config_path, convert, read_text
 from ground.commands.options import finite, positive, print_result, utc
 from ground.report.text import number, table
 from ground.satellite_description import check_values, read_value
@@ -192,10 +192,7 @@ def _given_orbit(options: argparse.Namespace) -> tuple[OrbitSection, float]:
         "true_anomaly_deg": options.anomaly,
     }
     given = {key: value for key, value in values.items() if value is not None}
-    try:
-        orbit = msgspec.convert(given, OrbitSection)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"this orbit is not supported: {error}") from error
+    orbit = convert(Document(given, "this orbit is not supported", {}), OrbitSection)
     return orbit, _date(options.epoch, "--epoch")
 
 
@@ -355,22 +352,52 @@ def add_stations(parser: argparse.ArgumentParser) -> None:
 
 def run_passes(options: argparse.Namespace) -> int:
     """Predict the passes and print them."""
+    if options.lead < 0.0:
+        raise UsageError(f"--lead {options.lead:g}: must be 0 s or more before the rise")
     prediction, stations, _ = predicted(options)
-    from ground.passes import facts_of, scheduled_targets  # noqa: PLC0415
+    from ground.passes import NEWER, facts_of  # noqa: PLC0415
 
+    if options.schedule and prediction.timing_error_s > max(options.lead, _UNCERTAIN_S):
+        problem = f"the times have a standard deviation of {prediction.timing_error_s:.0f} s"
+        cure = f"{NEWER}, or a longer lead"
+        raise UsageError(f"--schedule: {problem}, which exceeds --lead {options.lead:g}: {cure}")
     found = prediction.passes(stations)
+    commands = _commands(prediction, found, options.lead) if options.schedule else [[] for _ in found]
     if options.json:
-        facts = {"timing_error_s": prediction.timing_error_s, "passes": [facts_of(one) for one in found]}
-        sys.stdout.write(to_json(facts))
+        passes = [
+            facts_of(one) | ({"schedule": lines} if options.schedule else {})
+            for one, lines in zip(found, commands, strict=True)
+        ]
+        sys.stdout.write(to_json({"timing_error_s": prediction.timing_error_s, "passes": passes}))
     elif options.schedule:
-        for one in found:
-            for at, target in scheduled_targets(one, options.lead):
-                place = f"ground {one.station.latitude_deg:g} {one.station.longitude_deg:g}"
-                words = "point nadir" if target.goal is Goal.NADIR else f"point {place}"
-                sys.stdout.write(f"schedule {at:%Y-%m-%dT%H:%M:%S} {words}\n")
+        sys.stdout.writelines(f"{line}\n" for lines in commands for line in lines)
     else:
         sys.stdout.write("\n".join(_lines(found)) + "\n" if found else "no pass\n")
     return 0 if found else 1
+
+
+def _commands(prediction: OrbitPrediction, found: list[Pass], lead: float) -> list[list[str]]:
+    """Return the commands of each pass as typed, and print a warning for a pass without commands."""
+    from ground.passes import scheduled_targets  # noqa: PLC0415
+
+    made: list[list[str]] = []
+    for one, targets in zip(found, scheduled_targets(found, lead), strict=True):
+        place = f"point ground {one.station.latitude_deg:g} {one.station.longitude_deg:g}"
+        made.append(
+            [
+                f"schedule {max(at, prediction.begin):%Y-%m-%dT%H:%M:%S} "
+                f"{'point nadir' if target.goal is Goal.NADIR else place}"
+                for at, target in targets
+            ]
+        )
+        if not targets:
+            which = f"{one.station.name}, {one.rise:%Y-%m-%dT%H:%M:%S}"
+            sys.stderr.write(f"{PROGRAM}: {which}: no commands, because an earlier pass lasts longer\n")
+    count = sum(map(len, made))
+    if count > MOST_ENTRIES:
+        problem = f"{count} commands, but the satellite stores {MOST_ENTRIES}: give fewer --days"
+        sys.stderr.write(f"{PROGRAM}: {problem}\n")
+    return made
 
 
 def run_day(options: argparse.Namespace) -> int:
@@ -393,7 +420,7 @@ def predicted(
     The path `options.config` names a configuration or a file of elements.
     """
     try:
-        from ground.passes import OrbitPrediction, read_stations, station_of  # noqa: PLC0415
+        from ground.passes import NEWER, OrbitPrediction, read_stations, station_of  # noqa: PLC0415
     except ModuleNotFoundError as error:
         needed = "pip install 'knightcube-flight[ground]'"
         raise KnightCubeError(f"predicting passes needs {error.name}: {needed}") from error
@@ -410,10 +437,11 @@ def predicted(
     lines, config = _elements(options.config, options.satellite)
     begin = options.begin or datetime.now(UTC).replace(microsecond=0)
     prediction = OrbitPrediction(lines, begin, options.days)
+    prediction.check_age()
     if prediction.timing_error_s > _UNCERTAIN_S:
         sys.stderr.write(
             f"{PROGRAM}: the elements are old: the times at the end have a standard deviation of "
-            f"{prediction.timing_error_s:.0f} s\n"
+            f"{prediction.timing_error_s:.0f} s: {NEWER}\n"
         )
     return prediction, stations, config
 

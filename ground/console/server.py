@@ -434,9 +434,10 @@ def _predicted(lines: tuple[str, str], begin: datetime, days: float, stations: l
 
     prediction = OrbitPrediction(lines, begin, days)
     found = []
-    for one in prediction.passes([station_of(text) for text in stations]):
+    passes = prediction.passes([station_of(text) for text in stations])
+    for one, targets in zip(passes, scheduled_targets(passes), strict=True):
         schedule = []
-        for utc, target in scheduled_targets(one):
+        for utc, target in targets:
             at, words = f"{utc:%Y-%m-%dT%H:%M:%S}", words_of(Point(target))
             schedule.append({"at": at, "words": words, "text": f"point {target.text}"})
         found.append({**facts_of(one), "mask_deg": one.station.mask_deg, "schedule": schedule})

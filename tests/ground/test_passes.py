@@ -9,16 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground.passes import OrbitPrediction, Station, read_stations, station_of
+from ground.passes import OrbitPrediction, Pass, Station, read_stations, scheduled_targets, station_of
 from knightcube.astro.earth.figure import semi_axes
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, north_east_down, terrestrial_time
 from knightcube.astro.earth.sun import earth_from_sun, julian_date, sunlit_share
 from knightcube.errors import UsageError
-from tests.support.orbit_elements import POLAR_ORBIT
+from knightcube.gnc.guidance.pointing_target import Goal
+from tests.support.orbit_elements import POLAR_ORBIT, summed
 
 BEGIN = datetime(2026, 3, 20, 12, tzinfo=UTC)
 BERLIN = Station(name="Berlin", latitude_deg=52.5, longitude_deg=13.4, height=40.0)
+EPOCH = "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    0"
+GEOSTATIONARY, NAVIGATION = (
+    (summed(EPOCH + "0"), summed("2 99999   0.0100  50.0000 0002000 100.0000 100.0000  1.00270000    00")),
+    (summed(EPOCH + "0"), summed("2 99999  55.0000  50.0000 0002000 100.0000 100.0000  2.00560000    00")),
+)
 STATIONS = (BERLIN, Station(name="Tromso", latitude_deg=69.66, longitude_deg=18.94, mask_deg=12.0))
 
 
@@ -84,6 +90,55 @@ def test_a_pass_in_progress_at_the_start_is_whole(prediction: OrbitPrediction) -
     assert abs((same.rise - first.rise).total_seconds()) < 0.5
 
 
+def test_a_long_pass_in_progress_at_the_start_is_whole() -> None:
+    first = OrbitPrediction(NAVIGATION, BEGIN, 1.0).passes((BERLIN,))[0]
+    middle = first.rise + 0.5 * (first.set - first.rise)
+    assert middle - first.rise > timedelta(hours=1)
+    (same,) = OrbitPrediction(NAVIGATION, middle, 0.01).passes((BERLIN,))
+    assert abs((same.rise - first.rise).total_seconds()) < 0.5
+
+
+def test_a_station_at_which_a_geostationary_satellite_never_sets_is_refused() -> None:
+    prediction = OrbitPrediction(GEOSTATIONARY, BEGIN, 1.0)
+    assert prediction.passes((BERLIN,)) == []
+    with pytest.raises(UsageError, match="station Denver: the satellite stays above 5 deg"):
+        prediction.passes((Station(name="Denver", latitude_deg=39.0, longitude_deg=-105.0),))
+
+
+def test_passes_of_an_unknown_revolution_are_refused() -> None:
+    old = OrbitPrediction(POLAR_ORBIT, BEGIN + timedelta(days=200), 0.1)
+    with pytest.raises(UsageError, match=r"2026-03-20 are too old: .* give newer elements"):
+        old.passes((BERLIN,))
+
+
+def _pass(rise: float, end: float, longitude: float) -> Pass:
+    """Return a pass from `rise` to `end`, s after BEGIN, over a station at this longitude (deg)."""
+    station = Station(name="station", latitude_deg=0.0, longitude_deg=longitude)
+    at = [BEGIN + timedelta(seconds=seconds) for seconds in (rise, 0.5 * (rise + end), end)]
+    return Pass(station, at[0], at[1], at[2], (0.0, 0.0, 0.0), 50.0, 6e5, 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("spans", "expected"),
+    [
+        ([(500, 900), (2000, 2400)], [(380, 900), (1880, 2400)]),
+        ([(500, 900), (960, 1400)], [(380, 900), (901, 1400)]),
+        ([(500, 900), (600, 1000)], [(380, 900), (901, 1000)]),
+        ([(500, 900), (600, 800), (850, 1300)], [(380, 900), None, (901, 1300)]),
+    ],
+)
+def test_overlapping_passes_follow_each_other(
+    spans: list[tuple[float, float]], expected: list[tuple[float, float] | None]
+) -> None:
+    passes = [_pass(*span, longitude=10.0 * number) for number, span in enumerate(spans)]
+    for one, commands, times in zip(passes, scheduled_targets(passes), expected, strict=True):
+        assert [(at - BEGIN).total_seconds() for at, _ in commands] == list(times or ())
+        if times is not None:
+            (_, station), (_, nadir) = commands
+            assert math.degrees(station.numbers[1]) == pytest.approx(one.station.longitude_deg)
+            assert nadir.goal is Goal.NADIR
+
+
 def test_the_sun_at_satellite_and_station_is_that_of_the_ephemeris(prediction: OrbitPrediction) -> None:
     for one in prediction.passes(STATIONS):
         date = julian_date(one.top)
@@ -130,9 +185,9 @@ def test_stations_are_read_from_text_and_file(tmp_path: Path) -> None:
     [
         ("Berlin", "give NAME,LATITUDE,LONGITUDE"),
         ("Berlin,52.5,x", "could not convert"),
-        ("Berlin,95,13", "<= 90.0"),
-        ("Berlin,52,13,0,90", "< 90.0"),
-        ("Berlin,nan,13", "latitude_deg"),
+        ("Berlin,95,13", "`latitude_deg` is 95.0: expected a number <= 90.0; give NAME,"),
+        ("Berlin,52,13,0,90", "`mask_deg` is 90.0: expected a number < 90.0"),
+        ("Berlin,nan,13", "`latitude_deg` is nan"),
         (",52,13", "length >= 1"),
         ("Berlin,1,2,3,4,5", "give NAME,LATITUDE,LONGITUDE"),
     ],
@@ -146,5 +201,5 @@ def test_a_wrong_station_is_refused_with_the_reason(text: str, reason: str) -> N
 def test_a_wrong_file_of_stations_names_file_and_key(tmp_path: Path) -> None:
     file = tmp_path / "stations.yaml"
     file.write_text("stations:\n  - {name: Berlin, latitude_deg: 52.5, longitude_deg: 13.4, hight: 40}\n")
-    with pytest.raises(UsageError, match=r"stations.yaml: .*hight"):
+    with pytest.raises(UsageError, match=r"stations.yaml:2: .*hight"):
         read_stations(file)

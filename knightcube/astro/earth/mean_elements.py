@@ -46,6 +46,8 @@ _PARAMETER = 1e-9 * GRAVITATIONAL_PARAMETER
 _FAILED = 1e6
 """Residual (km) assigned to elements that SGP4 cannot propagate."""
 _NUMBER = 99_999
+_FIRST_DATE, _LAST_DATE = 2_435_839.5, 2_472_364.5
+"""Julian dates of 1957-01-01 and 2057-01-01, between which the two digits of the year are unique."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +81,7 @@ def fit_elements(
     The Julian dates UTC (n,) are ascending. Positions (n, 3), m, and velocities (n, 3), m/s, are geocentric
     and in ICRS axes. Without velocities, the first two dates must be less than half a revolution apart.
     Raises UsageError if fewer than four positions are given (fewer than two with velocities), if the
-    positions are not in order of time, or if no elements fit.
+    positions are not in order of time, if their year is not 1957 to 2056, or if no elements fit.
     """
     least = 4 if velocities is None else 2
     if len(dates) < least:
@@ -88,6 +90,9 @@ def fit_elements(
     states = positions if velocities is None else np.hstack([positions, velocities])
     if not (np.all(np.isfinite(states)) and np.all(np.diff(dates) > 0.0)):
         raise UsageError("the positions must be finite, and their times must ascend")
+    if not _FIRST_DATE <= float(dates[0]) < _LAST_DATE:
+        problem = "the year of two-line elements has two digits: give times from 1957 to 2056"
+        raise UsageError(f"the first position has the Julian date {float(dates[0]):.1f}: {problem}")
     fit = _Fit(dates, states)
     parameters, span = fit.first_guess(), _FIRST_SPAN / 60.0
     used = np.ones(len(dates), dtype=bool)

@@ -40,6 +40,20 @@ def test_the_elements_of_an_orbit_are_those_of_the_shipped_configuration() -> No
     assert (facts["positions"], facts["span_s"]) == (145, pytest.approx(86_400.0))
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (("--epoch", "2070-03-20T12:00:00"), "two digits: give times from 1957 to 2056"),
+        (("--epoch", "1900-03-20T12:00:00"), "two digits: give times from 1957 to 2056"),
+        (("--local-time", "30"), "`local_time` is 30.0: expected a number <= 24.0"),
+    ],
+)
+def test_an_orbit_that_two_lines_cannot_state_is_refused(change: tuple[str, str], reason: str) -> None:
+    done = command("elements", *ORBIT, *change)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert reason in done.stderr
+
+
 @pytest.mark.parametrize("velocity", [False, True])
 def test_elements_are_fitted_to_noisy_fixes(velocity: bool, tmp_path: Path) -> None:
     lines = json.loads(command("elements", *ORBIT, "--json").stdout)["elements"]
@@ -248,8 +262,29 @@ def test_elements_may_stand_in_a_file_of_their_own(
 
 
 def test_old_elements_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["passes", "orbit_3u", "--from", "2026-12-20T12:00:00", *BERLIN]) == 0
+    assert main(["passes", "orbit_3u", "--from", "2026-04-10T12:00:00", *BERLIN]) == 0
     assert "the elements are old" in capsys.readouterr().err
+
+
+def test_commands_of_overlapping_passes_are_in_order_of_time(capsys: pytest.CaptureFixture[str]) -> None:
+    tromso = ("--station", "Tromso,69.66,18.94,130,10")
+    assert main(["passes", *FROM_NOON, *BERLIN, *tromso, "--days", "2", "--schedule"]) == 0
+    shown = capsys.readouterr()
+    times = [line.split()[1] for line in shown.out.splitlines()]
+    assert times == sorted(times)
+    assert len(times) == len(set(times))
+    assert f"{len(times)} commands, but the satellite stores 32" in shown.err
+    assert main(["passes", *FROM_NOON, *BERLIN, *tromso, "--schedule", "--json"]) == 0
+    listed = [line for one in json.loads(capsys.readouterr().out)["passes"] for line in one["schedule"]]
+    assert listed
+    assert [line.split()[1] for line in listed] == times[: len(listed)]
+
+
+def test_a_command_of_a_pass_in_progress_is_due_at_the_start(capsys: pytest.CaptureFixture[str]) -> None:
+    begin = "2026-03-20T21:57:00"
+    assert main(["passes", "orbit_3u", "--from", begin, *BERLIN, "--days", "0.01", "--schedule"]) == 0
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert first == f"schedule {begin} point ground 52.5 13.4"
 
 
 def test_a_station_that_never_sees_the_satellite_has_no_pass(capsys: pytest.CaptureFixture[str]) -> None:
@@ -264,6 +299,12 @@ def test_a_station_that_never_sees_the_satellite_has_no_pass(capsys: pytest.Capt
         ((*FROM_NOON, *BERLIN, *BERLIN), "two stations are called 'Berlin'"),
         ((*FROM_NOON, *BERLIN, "--days", "31"), "--days 31: must be at most 30"),
         (("step_demo", *BERLIN), "this needs the configuration of a satellite"),
+        ((*FROM_NOON, *BERLIN, "--schedule", "--lead", "-500"), "--lead -500: must be 0 s or more"),
+        (("orbit_3u", "--from", "2026-12-20T12:00:00", *BERLIN), "the elements of 2026-03-20 are too old"),
+        (
+            ("orbit_3u", "--from", "2026-05-20T12:00:00", *BERLIN, "--schedule"),
+            "which exceeds --lead 120: give newer elements",
+        ),
     ],
 )
 def test_a_wrong_use_is_refused(
