@@ -146,7 +146,14 @@ def step_light(session: Session) -> Outcome:
     elif sources < _FEW_SOURCES:
         findings.append(_no_light(session.known.get("dark"), pixels, level, sources))
     values = {"level": level, "sources": sources, "saturated": saturated, "sequence": frames[-1].sequence}
-    return Outcome(findings, values, {}, {}, {"light": pixels})
+    return Outcome(findings, values, _size_changes(camera, pixels), {}, {"light": pixels})
+
+
+def _size_changes(camera: Camera, pixels: Image) -> dict[str, Any]:
+    """Return the columns and rows of a frame as changes of the configuration, if they differ from it."""
+    if pixels.shape == (camera.rows, camera.columns):
+        return {}
+    return {"camera": {"columns": pixels.shape[1], "rows": pixels.shape[0]}}
 
 
 def _wrong_size(part: str, camera: Camera | WideCamera, pixels: Image) -> list[Finding]:
@@ -180,7 +187,7 @@ def psf_width(pixels: Image) -> tuple[float, int]:
             continue  # too small for the detection
         rows, columns = (size // factor * factor for size in pixels.shape)
         squares = pixels[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
-        summed = pixels if factor == 1 else squares.sum(axis=(1, 3), dtype=np.uint32)
+        summed = squares.sum(axis=(1, 3), dtype=np.uint32)
         found = detect(np.minimum(summed, 65535).astype(np.uint16))
         if len(found) >= _FEW_SOURCES and (factor == 1 or found.psf_sigma > 1.0):
             return factor * float(found.psf_sigma), len(found)
@@ -230,7 +237,8 @@ def step_lens(session: Session) -> Outcome:
         raise StepSkipped(f"no frame could be solved: {found.images[0].reason}")
     calibration = lens.calibration
     findings = []
-    field_deg = 2.0 * math.degrees(math.atan(0.5 * camera.columns / calibration.lens.focal_length))
+    # The frames may be smaller or larger than the configuration states; then their size is written too.
+    field_deg = 2.0 * math.degrees(math.atan(0.5 * frames[0].shape[1] / calibration.lens.focal_length))
     if abs(field_deg / camera.field_of_view_deg - 1.0) > 0.02:
         text = f"{field_deg:.3f} deg across the columns, configured {camera.field_of_view_deg:g}"
         findings.append(Finding("camera", "wrong field of view", text, "use the fragment's `camera`"))
@@ -238,7 +246,7 @@ def step_lens(session: Session) -> Outcome:
         cure = "correct the order of the rows, or remove the mirror"
         findings.append(Finding("camera", "mirrored", "the frames are mirrored", cure))
     values = {"stars": calibration.stars, "rms_px": calibration.rms_after, "field_of_view_deg": field_deg}
-    changes: dict[str, Any] = {}
+    changes = _size_changes(camera, frames[0])
     if calibration.stars >= MIN_STARS and "focal_length" not in calibration.undetermined:
         kept = {
             name: round(value, 8) if isinstance(value, float) else value
@@ -246,7 +254,8 @@ def step_lens(session: Session) -> Outcome:
             if name in {"focal_length", "centre", "k1", "k2", "aspect", "shear", "p1", "p2"}
         }
         accuracy = {name: float(f"{value:.3g}") for name, value in lens.accuracy.items()}
-        changes = {"camera": {"field_of_view_deg": round(field_deg, 6), "lens": kept, "accuracy": accuracy}}
+        fitted = {"field_of_view_deg": round(field_deg, 6), "lens": kept, "accuracy": accuracy}
+        changes = {"camera": changes.get("camera", {}) | fitted}
     return Outcome(findings, values, changes)
 
 

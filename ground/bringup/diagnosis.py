@@ -523,6 +523,8 @@ class CoilTest:
         volts: supply voltage (V) without a command, and the lowest supply voltage with a command; NaN without
             a monitor.
         sensed: whether the magnetometer works; if not, only the currents of the coils are evaluated.
+        rotation: largest rotation (rad) of the body between the recordings without and with a current.
+        ambient: strength (T) of the field without a current.
     """
 
     commanded: FloatArray
@@ -536,6 +538,8 @@ class CoilTest:
     clipped: bool = False
     volts: tuple[float, float] = (math.nan, math.nan)
     sensed: bool = True
+    rotation: float = 0.0
+    ambient: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -598,6 +602,8 @@ def diagnose_coils(
     exact = np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6)  # each axis is exactly a body axis
     askew, strength = ASKEW if exact else RECOGNISED, sign * strength
     state = CoilsFound(response, expected, serves, strength, misfit, live, drawn, 1.0, joined, askew, found)
+    if moved := _moved(test):
+        return replace(state, findings=moved)
     shared, shunt = _shared_fault(test, state, size_known)
     # A monitor that measures no current gives no information about single coils.
     unmeasured = any(one.kind == "no current" for one in shared)
@@ -635,7 +641,7 @@ def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict
     return found
 
 
-_ALL = frozenset({"no field", "no supply", "no response", "wrong supply voltage", "sagging supply"})
+_ALL = frozenset({"moved", "no field", "no supply", "no response", "wrong supply voltage", "sagging supply"})
 """Kinds of faults that concern all coils; single coils are not evaluated after such a fault."""
 
 
@@ -667,6 +673,25 @@ def _match(
             strength[j] = float(response[j] @ unit[k] / np.linalg.norm(expected[k]))
             misfit[j] = math.acos(min(1.0, abs(float(cosine[j, k]))))
     return serves, strength, misfit
+
+
+_STILL, _MOVED = 5e-3, 0.1
+"""Largest rotation (rad) of a body at rest, and largest share of the field change that it may explain."""
+
+
+def _moved(test: CoilTest) -> list[Finding]:
+    """Return a finding if a rotation of the body changes the measured field like the field of a coil.
+
+    In the field of a Helmholtz coil, the torque of a coil rotates a body that is not held.
+    """
+    change = np.linalg.norm(np.stack([test.plus, test.minus]), axis=2) * test.commanded
+    if not test.sensed or test.rotation <= max(
+        _STILL, _MOVED * float(change.max()) / max(test.ambient, 1e-9)
+    ):
+        return []
+    text = f"the body rotated by {math.degrees(test.rotation):.1f} deg while a coil was driven"
+    cure = "hold the body still, and repeat the step: the rotation changes the measured field"
+    return [Finding("coils", "moved", text, cure)]
 
 
 def _shared_fault(test: CoilTest, state: CoilsFound, size_known: bool) -> tuple[list[Finding], float]:

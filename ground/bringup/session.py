@@ -18,7 +18,7 @@ from flight.schema.sections import Config
 from ground.bringup import diagnosis
 from ground.bringup.bench import STILL_S, Outcome, Session, StepSkipped, find
 from ground.bringup.cameras import step_dark, step_focus, step_lens, step_light, step_wide
-from ground.bringup.diagnosis import Finding
+from ground.bringup.diagnosis import Finding, Samples
 from ground.bringup.satellite import step_gps, step_power, step_strings
 from hal.interfaces.devices import COIL_NAMES, InertialUnit, PowerMonitor, TorqueCoils
 from hal.interfaces.wires import SECOND_NS
@@ -174,6 +174,7 @@ def _drive(
     absent, volts = np.zeros((count, 2)), np.full((count, 3), math.nan)
     idle: list[float] = []
     spread: list[float] = []
+    recorded: list[Samples] = []
     clipped: list[bool] = []
     fault = ""
 
@@ -194,6 +195,7 @@ def _drive(
         session.wait(_SETTLE_S, repeat)
         samples = session.record(_DRIVE_S, repeat)
         spread.append(diagnosis.noise_of(samples.field).max() / math.sqrt(len(samples.times)))
+        recorded.append(samples)
         return samples.field, float(np.mean(list(drawn.values()))) if drawn else math.nan
 
     zero = np.zeros(slots)
@@ -219,9 +221,37 @@ def _drive(
     )
     resting, supply = float(np.mean(idle)), (float(np.max(volts[:, 0])), float(np.min(volts[:, 1:])))
     plus, minus, clips = fields[:, 0], fields[:, 1], any(clipped)
+    rotation, ambient = _rotation(session, recorded), float(np.linalg.norm(recorded[0].field.mean(axis=0)))
     return diagnosis.CoilTest(
-        commanded, plus, minus, currents, resting, noise, absent, fault, clips, supply, sensed
+        commanded,
+        plus,
+        minus,
+        currents,
+        resting,
+        noise,
+        absent,
+        fault,
+        clips,
+        supply,
+        sensed,
+        rotation,
+        ambient,
     )
+
+
+def _rotation(session: Session, recorded: Sequence[Samples]) -> float:
+    """Return the largest rotation (rad) of the body between a recording and the next.
+
+    The gyro's bias is that of the step `rest`, or else the mean rate of all recordings. The rotation is 0
+    for a gyro whose rates are not finite.
+    """
+    rates = np.array([samples.rate.mean(axis=0) for samples in recorded])
+    times = np.array([samples.times.mean() for samples in recorded])
+    rest = session.known.get("rest", Outcome())
+    sound = not any(one.part == "inertial_unit.gyro" for one in rest.findings)
+    bias = np.array(rest.values["bias"]) if sound and "bias" in rest.values else rates.mean(axis=0)
+    turned = 0.5 * (rates[1:] + rates[:-1] - 2.0 * bias) * np.diff(times)[:, None]
+    return float(np.nan_to_num(np.linalg.norm(turned, axis=1)).max(initial=0.0))
 
 
 def _voltage(monitor: PowerMonitor | None) -> float:

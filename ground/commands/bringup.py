@@ -79,6 +79,9 @@ def run(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     kept = {} if options.again else _kept(options.out / REPORT, key)
+    # A device that was missing may be connected now; the steps that were skipped for it are not kept.
+    if "find" in kept and kept["find"].findings:
+        del kept["find"]
     wanted = options.only or [name for name in steps_of(config) if name not in kept]
     # After Ctrl-C the coils are set to zero before the program ends.
     with interruptible(), _opened(options, text, config, emulated) as session:

@@ -340,7 +340,7 @@ def _night_share(view: LimbView, rays: FloatArray, sun: FloatArray | None) -> fl
 def _altitude_off(
     fit: FittedLimb, limb: LimbPoints, prior: Prior, altitudes: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the distance (sigma) of the altitude that the edges imply from prior knowledge, and that altitude.
+    """Return the distance (sigma) of the implied altitude from prior knowledge, and the altitude, m.
 
     A known altitude is compared with the altitude of a fit without it; otherwise the fitted altitude is
     compared with the range `altitudes`, m.

@@ -218,6 +218,12 @@ def test_a_fault_of_the_first_light_is_named(
     assert all(expected is not None and expected[1] in one.text for one in found)
 
 
+def test_frames_of_another_size_correct_the_configured_size() -> None:
+    found = step_light(bench(noisy(), starry(8)[:, :120])[0])
+    assert found.changes == {"camera": {"columns": 120, "rows": SIZE}}
+    assert step_light(bench(noisy(), starry(8))[0]).changes == {}
+
+
 def test_the_configured_saturation_is_used() -> None:
     camera = Camera(columns=SIZE, rows=SIZE, bits=12, saturation=3000.0)
     found = step_light(bench(noisy(), _saturated(40, 3000), camera=camera)[0])
@@ -235,6 +241,11 @@ def test_the_psf_width_is_that_of_the_stars(width: float, factor: int) -> None:
     measured, count = psf_width(pixels)
     assert measured == pytest.approx(width, rel=0.08)
     assert count == 12
+
+
+def test_the_psf_width_of_8_bit_frames_is_that_of_16_bits() -> None:
+    pixels = np.minimum(starry(12), 255)
+    assert psf_width(pixels.astype(np.uint8)) == psf_width(pixels)
 
 
 def test_four_stars_have_no_psf_width() -> None:

@@ -234,14 +234,19 @@ FIELD = 5e-4 * np.array([[1.0, 0.1, 0.0], [0.0, 1.1, -0.1], [0.1, 0.0, 0.9]])
 class Bench:
     """Coils whose fields a magnetometer measures at once, and a monitor of their supply."""
 
-    def __init__(self, *, idle: float = 0.004, gain: float = 1.0, fault: str = "") -> None:
+    def __init__(
+        self, *, idle: float = 0.004, gain: float = 1.0, fault: str = "", swing: float = 0.0
+    ) -> None:
         self.idle, self.gain, self.fault = idle, gain, fault
         self.coils = Driven(self)
         noise = np.random.default_rng(4).normal(size=(4000, 3))
 
         def sample(number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-            field = SITE + self.coils.now[:3] @ FIELD + 1e-8 * noise[number]
-            return np.zeros(3), field, np.array([0.0, 0.0, G])
+            phase = 2.0 * np.pi * number / 800.0  # a period of 20 s
+            body = attitude_matrix(from_rotation_vector(np.array([swing * np.sin(phase), 0.0, 0.0])))
+            field = body @ SITE + self.coils.now[:3] @ FIELD + 1e-8 * noise[number]
+            rate = np.array([swing * np.cos(phase) * 2.0 * np.pi / 20.0, 0.0, 0.0])
+            return rate, field, np.array([0.0, 0.0, G])
 
         self.unit = ScriptedUnit(lambda: self.session, sample)
         self.beats = 0
@@ -319,6 +324,15 @@ def test_a_current_while_the_coils_are_off_is_braked_and_a_refused_command_is_re
     assert named(found.findings) == ["coils refused", "coils current while off"]
     assert found.findings[0].text == "no acknowledge"
     assert bench.coils.braked == [frozenset({0, 1, 2})]
+
+
+def test_coils_of_a_body_that_moves_are_not_judged() -> None:
+    """A body that swings by 30 deg changes the measured field more than 10 % of a coil's field."""
+    found = step_coils(Bench(swing=np.radians(30.0)).session)
+    assert named(found.findings) == ["coils moved"]
+    assert "rotated by" in found.findings[0].text
+    assert found.changes == {}
+    assert step_coils(Bench(swing=np.radians(0.2)).session).findings == []
 
 
 def test_a_monitor_without_readings_is_reported_and_the_fields_are_compared() -> None:

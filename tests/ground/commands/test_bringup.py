@@ -311,6 +311,16 @@ def test_the_status_is_1_for_faults_and_for_steps_that_could_not_be_done(
         assert scripted.pictures[1][1]["rest"].findings == [FAULT, FAULT]
 
 
+def test_devices_that_were_missing_are_looked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scripted = Scripted(monkeypatch, tmp_path, find=Outcome([FAULT], {"answers": {"gps": "no answer"}}))
+    scripted.run()
+    scripted.done.clear()
+    scripted.run()
+    assert scripted.done == ["find"]
+
+
 def test_results_of_another_configuration_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
