@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,7 +16,19 @@ import numpy as np
 from flight.app.run import utc_ns
 from flight.link import events
 from flight.link.commands import CommandPacker, Ping
-from flight.link.telemetry.definitions import COMMAND, EVENT, FACTS, MODES, SEVERITIES, STEERING, States
+from flight.link.process.commanding import Stage
+from flight.link.telemetry.definitions import (
+    COMMAND,
+    EVENT,
+    FACTS,
+    LINK,
+    MODES,
+    SEVERITIES,
+    STEERING,
+    TRANSFER,
+    VERIFICATION,
+    States,
+)
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
@@ -30,11 +42,15 @@ if TYPE_CHECKING:
 
 STREAMS = ("imu", "field", "coils", "power", "camera")
 LISTED_EVENTS = 12
+SILENT_S = 3.0  # time (s) without a packet of a flight that is shown
 _KEPT_EVENTS = 200
 _MAX_TIME = 1e15  # mission time (s) above which a packet is assumed to be damaged
 _TIMEOUT_S = 2.0  # longest time (s) to wait for the answer to a ping
 _FROM_START_S = 0.1  # mission time (s) up to which the first packet of a complete log arrives
 _REPEATED = frozenset({"run", "parameters"})  # packets of the start that a flight sends again later
+_OF_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name, "run"})
+"""Packets that the link process sends also without a flight."""
+_BAD_STAGES = frozenset({Stage.REFUSED, Stage.FAILED})
 
 
 class PacketSource(Protocol):
@@ -170,7 +186,8 @@ class FlightState:
         mode: label of the flight's mode, or an empty text until the mode is known.
         ended: reason for the end of the flight, or an empty text before the end.
         events: newest events.
-        faults: number of received events whose severity is fault.
+        faults: number of received events whose severity is fault, including the events before them that were
+            not recorded.
         since: mission time of the first packet, s, or None before the first packet. No packet contains the
             number of faults since the start, so faults before this time are not counted.
         newest: newest packets by name.
@@ -183,9 +200,14 @@ class FlightState:
     faults: int = 0
     since: float | None = None
     newest: dict[str, Any] = field(default_factory=dict)
+    _received: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Begin to measure the time without packets."""
+        self._received = time.monotonic()
 
     def update(self, packets: Mapping[str, PacketArray]) -> list[LoggedEvent]:
-        """Update the state with new packets and return the events among them."""
+        """Update the state with new packets and return the events and failed commands among them."""
         found = [
             LoggedEvent(
                 float(row["time_ns"]) * 1e-9,
@@ -207,11 +229,19 @@ class FlightState:
         modes = [(int(row["time_ns"]), int(row["mode"])) for rows in with_mode for row in rows]
         if modes:
             self.mode = named(MODES, max(modes)[1])
+        self.faults += sum(1 + event.suppressed for event in found if event.severity >= events.Severity.FAULT)
+        found += _failed_commands(packets.get(VERIFICATION.name, ()))
         self.events.extend(found)
-        self.faults += sum(event.severity >= events.Severity.FAULT for event in found)
+        if any(len(rows) and name not in _OF_LINK for name, rows in packets.items()):
+            self._received = time.monotonic()
         ends = [event.text or event.name for event in found if event.name == events.STOPPED.name]
         self.ended = ends[-1] if ends else self.ended
         return found
+
+    @property
+    def silence(self) -> float:
+        """Time (s) since the last packet of the flight itself; the link process also sends packets."""
+        return time.monotonic() - self._received
 
     def value(self, packet: str, name: str) -> Any:
         """Return a field of the newest packet of a type, or None before the first packet."""
@@ -241,6 +271,20 @@ class FlightState:
         if not all(0.5 < np.linalg.norm(one) < 2.0 for one in pair):
             return None
         return math.degrees(float(angle_between(*pair)))
+
+
+def _failed_commands(rows: Iterable[np.void]) -> list[LoggedEvent]:
+    """Return the reports of a link on refused and failed commands, which may be scheduled, as warnings."""
+    return [
+        LoggedEvent(
+            float(row["time_ns"]) * 1e-9,
+            int(events.Severity.WARNING),
+            f"{printable(to_text(row['name'])) or 'command'} {Stage(int(row['stage'])).name.lower()}",
+            printable(to_text(row["text"])),
+        )
+        for row in rows
+        if int(row["stage"]) in _BAD_STAGES
+    ]
 
 
 def named(states: States, number: Any) -> str:
@@ -325,7 +369,7 @@ _Line = list[tuple[str, str]]
 
 
 def panel(state: FlightState, silence: float) -> RenderableType:
-    """Return the panel of a flight whose log has not grown for `silence` s. Needs the package rich."""
+    """Return the panel of a flight that has sent no packet for `silence` s. Needs the package rich."""
     from rich.console import Group  # noqa: PLC0415 - an extra
     from rich.panel import Panel  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
@@ -341,7 +385,7 @@ def panel(state: FlightState, silence: float) -> RenderableType:
     mode = state.mode or "mode not known"
     colour = _MODE_COLOURS.get(state.mode, "bold black on green")
     title = Text(" ").join([Text(f" {mode} ", colour), Text(f"{state.time:.1f} s{planned}", "bold")])
-    silent = f"no packet for {silence:.0f} s" if silence > 3.0 else ""
+    silent = f"no packet for {silence:.0f} s" if silence > SILENT_S else ""
     end = Text(f"ended: {state.ended}" if state.ended else silent, "bold")
     listed = Table(box=None, pad_edge=False, show_header=False)
     for column in range(4):

@@ -25,6 +25,7 @@ from ground.link.commanding import add_link_options, ground_files_folder, termin
 from ground.link.gateway import ADDRESS, Gateway, new_token, token_file, token_path
 from ground.link.terminal import make_keys
 from ground.watch import (
+    SILENT_S,
     STREAMS,
     FlightState,
     LogTail,
@@ -144,27 +145,43 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
     `wait` is the longest time (s) to wait for a first complete state, and `where` is the end of the message
     that is shown if no packets arrive.
     """
-    state = FlightState()
+    state, by_link = FlightState(), options.link is not None
+
+    def silence() -> float:
+        """Return the time (s) since the last packet of the flight."""
+        return state.silence if by_link else tail.silence
+
     if options.json or options.once:
         state.update(tail.new())
         until = time.monotonic() + wait
         while not {"attitude", "health"} <= state.newest.keys() and time.monotonic() < until:
             state.update(tail.new())
         # The link process also sends packets of its own, which do not show that a flight is in progress.
-        if not state.newest or (options.link is not None and not state.mode):
-            sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}\n")
+        if not state.newest or (by_link and not state.mode):
+            cause = _cause(state) if by_link else ""
+            sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}{cause}\n")
             return 1
-        line = state_line(state) + (f"  ended: {state.ended}" if state.ended else "")
-        sys.stdout.write(to_json(_facts(state)) if options.json else line + "\n")
+        silent = f"  no packet for {silence():.0f} s" if silence() > SILENT_S else ""
+        line = state_line(state) + (f"  ended: {state.ended}" if state.ended else silent)
+        facts = _facts(state) | {"silence_s": silence()}
+        sys.stdout.write(to_json(facts) if options.json else line + "\n")
         return 0
-    with _ending() as ended, _display(options, state, tail) as refresh:
+    with _ending() as ended, _display(options, state, tail, silence) as refresh:
         refresh()
-        while not (state.ended or tail.silence > options.patience or ended.wait(_READ_S)):
+        while not (state.ended or silence() > options.patience or ended.wait(_READ_S)):
             refresh()
     if not state.ended and not ended.is_set():
-        sys.stderr.write(f"knightcube: no new packet for {tail.silence:.0f} s {where}\n")
+        cause = _cause(state) if by_link else ""
+        sys.stderr.write(f"knightcube: no new packet for {silence():.0f} s {where}{cause}\n")
         return 1
     return 0
+
+
+def _cause(state: FlightState) -> str:
+    """Return the possible causes and remedies if no packet of a flight arrives over a link."""
+    if not state.newest:
+        return ": no frame is authentic: check --link, --keys and --spacecraft, and that the link runs"
+    return ": the link answers, but the flight does not run, or the link reads another run (its --log)"
 
 
 @contextlib.contextmanager
@@ -186,7 +203,7 @@ def _ending() -> Iterator[threading.Event]:
 
 @contextlib.contextmanager
 def _display(
-    options: argparse.Namespace, state: FlightState, tail: PacketSource
+    options: argparse.Namespace, state: FlightState, tail: PacketSource, silence: Callable[[], float]
 ) -> Iterator[Callable[[], None]]:
     """Yield a function that shows the new packets: on a panel in a terminal with rich, otherwise as lines."""
     live = None
@@ -205,7 +222,7 @@ def _display(
             sys.stdout.flush()
         else:
             state.update(tail.new())
-            live.update(panel(state, tail.silence), refresh=True)
+            live.update(panel(state, silence()), refresh=True)
 
     with live or contextlib.nullcontext():
         yield refresh

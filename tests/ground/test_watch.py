@@ -18,7 +18,18 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import ATTITUDE, EVENT, FACTS, HEALTH, LINK, MODE, PACKETS, Packet
+from flight.link.process.commanding import Stage
+from flight.link.telemetry.definitions import (
+    ATTITUDE,
+    EVENT,
+    FACTS,
+    HEALTH,
+    LINK,
+    MODE,
+    PACKETS,
+    VERIFICATION,
+    Packet,
+)
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Packer, PacketArray
 from ground.commands import station
@@ -197,7 +208,7 @@ def test_a_terminal_without_rich_gets_lines_and_the_cure(
     monkeypatch.setitem(sys.modules, "rich.live", None)
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     options = argparse.Namespace(plain=False, every=10.0)
-    with station._display(options, FlightState(), LogTail(growing)) as refresh:
+    with station._display(options, FlightState(), LogTail(growing), lambda: 0.0) as refresh:
         refresh()
     shown = capsys.readouterr()
     assert "pip install 'knightcube-flight[watch]'" in shown.err
@@ -345,7 +356,39 @@ def test_a_link_without_a_flight_has_no_state(capsys: pytest.CaptureFixture[str]
     options = argparse.Namespace(once=True, json=False, link="127.0.0.1:5010")
     only_the_link = pack(Packer(), LINK, 5.0)
     assert station._watch(options, Portions(only_the_link), 0.0, "over the link") == 1
-    assert capsys.readouterr().out == ""
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "the link answers, but the flight does not run" in shown.err
+    assert station._watch(options, Portions(), 0.0, "over the link") == 1
+    assert "no frame is authentic: check --link, --keys and --spacecraft" in capsys.readouterr().err
+
+
+def test_a_watch_ends_if_only_the_link_sends_packets(capsys: pytest.CaptureFixture[str]) -> None:
+    options = argparse.Namespace(
+        once=False, json=False, link="127.0.0.1:5010", every=10.0, patience=0.3, plain=True
+    )
+    only_the_link = [pack(Packer(), LINK, 5.0 + k) for k in range(40)]
+    assert station._watch(options, Portions(*only_the_link), 0.0, "over the link") == 1
+    assert "s over the link: the link answers, but the flight does not run" in capsys.readouterr().err
+
+
+def test_failed_commands_of_a_link_are_shown() -> None:
+    lines: list[str] = []
+    reports = b"".join(
+        pack(Packer(), VERIFICATION, 7.0, stage=int(stage), name="schedule", text=stage.name)
+        for stage in Stage
+    )
+    PlainLines(FlightState(), 10.0, lines.append).feed(scan(reports).packets)
+    assert [line for line in lines if "schedule" in line] == [
+        "    7.000 s  warning  schedule refused: REFUSED\n",
+        "    7.000 s  warning  schedule failed: FAILED\n",
+    ]
+
+
+def test_faults_that_were_not_recorded_are_counted() -> None:
+    state, fault = FlightState(), int(events.Severity.FAULT)
+    state.update(scan(pack(Packer(), EVENT, 5.0, severity=fault, name="imu-silent", suppressed=4)).packets)
+    assert state.faults == 5
 
 
 def test_one_look_over_a_link_waits_for_a_complete_state(capsys: pytest.CaptureFixture[str]) -> None:

@@ -356,6 +356,9 @@ def _decode(data: bytes) -> _Copy | None:
         return None
 
 
+_DATE_LENGTH = 10  # length of a date without the time of day
+_PAST_ENTRIES = 8
+"""Number of executed or failed entries whose results `list-schedule` reports."""
 LATEST_NS = 10 * SECOND_NS
 """Maximum delay (ns) with which a scheduled command is still executed."""
 
@@ -370,6 +373,8 @@ class Scheduling:
     def __init__(self, timetable: Timetable) -> None:
         self._timetable = timetable
         self._mode: int | None = None
+        # Texts of the newest entries that were due and their results, by SPI and counter.
+        self._past: dict[tuple[int, int], tuple[str, str]] = {}
 
     def beginning(self) -> list[Report]:
         """Return the reports to be sent at the start of the link process."""
@@ -382,6 +387,14 @@ class Scheduling:
         if layout is not None:
             self._mode = int(layout.array(packet)[0]["mode"])
 
+    def reported(self, report: Report) -> None:
+        """Update the result of a scheduled command from a report about this command."""
+        key = report.spi, report.counter
+        if key in self._past:
+            stage, text = report.stage.name.lower(), self._past[key][0]
+            own = f"{stage}, {report.text}" if report.stage is Stage.FAILED else stage
+            self._past[key] = text, own
+
     def obey(self, directive: Scheduled | Deletion | Listing, done: Report, utc_ns: int) -> list[Report]:
         """Execute a directive and return all reports about it; `done` is the report of completion."""
         try:
@@ -392,9 +405,11 @@ class Scheduling:
                     self._timetable.remove(number)
                     return [done]
                 case Listing():
-                    texts = [text_of(entry) for entry in self._timetable.entries]
+                    texts = [f"{own}: past entry {text}" for text, own in self._past.values()]
+                    count = len(self._timetable.entries)
+                    texts += [text_of(entry) for entry in self._timetable.entries]
                     lines = [replace(done, stage=Stage.STARTED, text=text) for text in texts]
-                    return [*lines, replace(done, text=f"{len(lines)} scheduled")]
+                    return [*lines, replace(done, text=f"{count} scheduled")]
         except (CommandError, TimetableError) as error:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
 
@@ -410,8 +425,12 @@ class Scheduling:
             except TimetableError as error:  # the entry is still on disk, so a restart could execute it again
                 problem = str(error)
                 self._timetable.forget(entry.number)
+            while len(self._past) >= _PAST_ENTRIES:
+                del self._past[next(iter(self._past))]
+            result = f"not executed, {problem}" if problem else "sent to the flight"
+            self._past[entry.spi, entry.counter] = text_of(entry), result
             if problem:
-                text = f"not executed, {problem}: {text_of(entry)}"
+                text = f"{result}: {text_of(entry)}"
                 yield Report(entry.spi, entry.counter, Stage.FAILED, SCHEDULE.name, text)
             else:
                 yield Sent(entry.spi, entry.counter, command_of_words(entry.command, stored=True))
@@ -440,6 +459,8 @@ def utc_of(text: str) -> int:
     """Return the ns since 1970 of a UTC in ISO 8601 format, at most 2262-04-11. Raises CommandError."""
     try:
         time = datetime.fromisoformat(text)
+        if len(text) <= _DATE_LENGTH:
+            raise ValueError("the time of day is missing")
     except ValueError as error:
         raise CommandError(f"{text!r} is not a UTC such as 2026-11-23T21:00:00") from error
     time = time.replace(tzinfo=UTC) if time.tzinfo is None else time

@@ -543,7 +543,7 @@ class Station:
         for sent, answer in self._control.answers(now_ns):
             reports = self._verification.answered(sent, answer)
             self._refused_commands += reports[0].stage is Stage.FAILED
-            self._report(*reports)
+            self._report_stages(*reports)
         self._follow(now_ns)
         self._execute_due(now_ns)
         self._report(*self._playback.turn())
@@ -617,7 +617,7 @@ class Station:
     def _hand_over(self, sent: Sent, packet: bytes, now_ns: int) -> None:
         if problem := self._control.send(sent, packet, now_ns):
             self._refused_commands += 1
-            self._report(report(sent, Stage.FAILED, problem))
+            self._report_stages(report(sent, Stage.FAILED, problem))
 
     def _execute_due(self, now_ns: int) -> None:
         """Send due scheduled commands to the control process, and report commands that are not executed."""
@@ -675,7 +675,7 @@ class Station:
             self._downlink.live(packet)
             self._scheduling.followed(packet)
             self._renewal.followed(packet, now_ns, live=self._log.is_live)
-            self._report(*self._verification.followed(packet))
+            self._report_stages(*self._verification.followed(packet))
             if self._log.is_live and self._log.label:
                 self._follow_utc(self._log.label, time_of(packet) - now_ns)
         if self._log.label and now_ns >= self._label_ns:
@@ -710,6 +710,12 @@ class Station:
             except KnightCubeError as error:
                 problem = problem or error
         raise problem or KnightCubeError("no SPI is configured for telemetry")
+
+    def _report_stages(self, *reports: Report) -> None:
+        """Report stages of commands to the flight, which may be scheduled commands."""
+        for one in reports:
+            self._scheduling.reported(one)
+        self._report(*reports)
 
     def _report(self, *reports: Report) -> None:
         for one in reports:

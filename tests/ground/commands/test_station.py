@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -55,8 +56,11 @@ def test_the_present_state_is_printed_once(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout.count("\n")) == (0, 1)
     assert "hold" in done.stdout
     assert "  ended: " in done.stdout
-    live = command("watch", flight_log(tmp_path / "live", stopped=False), "--once")
-    assert "ended" not in live.stdout
+    killed = flight_log(tmp_path / "live", stopped=False)
+    assert "ended" not in command("watch", killed, "--once").stdout
+    os.utime(killed / "flight-0001.ccsds", (1.0e9, 1.0e9))
+    assert "no packet for " in command("watch", killed, "--once").stdout
+    assert json.loads(command("watch", killed, "--json").stdout)["silence_s"] > 1e6
 
 
 def test_the_present_state_as_json(tmp_path: Path) -> None:

@@ -145,6 +145,31 @@ def test_safe_suspends_the_schedule(link: BothEnds) -> None:
     assert "the flight is in mode SAFE" in texts(link, counter)[-1]
 
 
+def test_the_list_has_the_results_of_past_entries(link: BothEnds) -> None:
+    """A ground station that was not in contact at the time of a scheduled command receives its result."""
+    at = in_seconds(link, 5)
+    send(link, Scheduled(at, "ping 7"))
+    send(link, Scheduled(at, "mode hold"))
+    link.turn(8.0)
+    link.record(link.mode_packet(Mode.SAFE, "commanded"))
+    late = in_seconds(link, 5)
+    send(link, Scheduled(late, "point sun"))
+    link.turn(8.0)
+    waiting = in_seconds(link, 900)
+    send(link, Scheduled(waiting, "ping 9"))
+    assert texts(link, send(link, Listing()))[1:] == [
+        f"completed: past entry 1: {at}Z ping 7",
+        f"completed: past entry 2: {at}Z mode hold",
+        f"not executed, the flight is in mode SAFE: past entry 3: {late}Z point sun, roll free",
+        f"4: {waiting}Z ping 9",
+        "1 scheduled",
+    ]
+    for _ in range(9):
+        send(link, Scheduled(in_seconds(link, 2), "ping 1"))
+        link.turn(4.0)
+    assert len(texts(link, send(link, Listing()))[1:-2]) == 8
+
+
 def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> None:
     def refused(at: str, words: str) -> str:
         counter = send(link, Scheduled(at, words))
@@ -154,6 +179,7 @@ def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> 
     later = in_seconds(link, 3600)
     assert "has passed" in refused(in_seconds(link, -1), "ping 1")
     assert "is not a UTC" in refused("tomorrow", "ping 1")
+    assert "is not a UTC" in refused("2099-01-01", "ping 1"), "the time of day is missing"
     assert "is not a command" in refused(later, "schedule x ping")
     assert "must lie within" in refused(later, "slew 3")
     assert "no command is scheduled with the number 5" in texts(link, send(link, Deletion(5)))[-1]
