@@ -14,7 +14,7 @@ from flight.app.cli import PROGRAM
 from flight.app.cli.run import seed_number
 from flight.schema import reader as configuration
 from flight.schema.devices import camera_model
-from ground.commands.options import add_field, check_size, positive, print_result, write_new
+from ground.commands.options import add_field, check_new, check_size, positive, print_result, write_new
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image
@@ -53,8 +53,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Calibrate the camera, and print and write the result. The exit status is 1 if the calibration fails."""
-    if options.out is not None and options.out.exists():
-        raise UsageError(f"{options.out}: exists already: name another file")
+    check_new(options.out)
     frames = _read(options.images)
 
     def show(round_number: int, number: int) -> None:
@@ -90,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
-    frames = [(path, read_image(path)) for path in paths]
+    frames = [(path, read_image(path, upright=False)) for path in paths]
     first = frames[0]
     for path, pixels in frames:
         check_size(path, pixels)
@@ -278,6 +277,7 @@ def run_index(options: argparse.Namespace) -> int:
     else:
         camera = camera_model(configuration.load_camera(options.camera))
         settings = IndexSettings.of_field(field_of_view(camera), 1.0 / camera.focal_length)
+    check_new(options.out)
     sky = build(replace(settings, faintest=options.faintest, epoch=options.epoch))
     try:
         save(sky, options.out)

@@ -137,7 +137,7 @@ def _line(fact: dict[str, Any]) -> str:
 
 def _keep(out: Path, frame: Frame, count: int) -> Path:
     path = out if count == 1 else out.with_name(f"{out.stem}-{frame.sequence}{out.suffix}")
-    write_picture(path, frame.pixels)
+    write_picture(path, frame.pixels, frame.exposure_ns * 1e-9)
     return path
 
 

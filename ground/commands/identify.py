@@ -21,7 +21,7 @@ from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, TestbedConfig
 from flight.schema.document import config_path
-from ground.commands.options import positive, print_result, write_new
+from ground.commands.options import check_new, check_picture, positive, print_result, write_new
 from ground.identification.fit import (
     DURATION,
     MAGNETOMETER_ERROR,
@@ -102,8 +102,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Fly unless the user gives the folder of a run, fit the constants, and print and write the results."""
-    if options.out is not None and options.out.exists():
-        raise UsageError(f"{options.out}: exists already: name another file")
+    check_new(options.out)
+    check_picture("--picture", options.picture)
     folder = Path(options.source)
     if folder.is_dir():
         for name in ("run", "duration", "seed", "realtime"):

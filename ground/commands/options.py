@@ -7,17 +7,19 @@ import math
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flight.app.cli import to_json
 from flight.schema.document import config_path
-from knightcube.astro.arrays import Image
+from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
-from knightcube.vision.camera.images import read_image, read_raw
+from knightcube.vision.camera.images import read_image, read_raw, stated_exposure
 from knightcube.vision.frame import LEAST_SIDE
 
 _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)(?:\+([0-9]+))?")
@@ -64,10 +66,56 @@ def interruptible() -> Iterator[None]:
 
 
 def read_picture(options: argparse.Namespace) -> Image:
-    """Return the pixels (rows, columns) of the picture that the arguments name. Raises UsageError."""
-    pixels = read_raw(options.image, *options.raw) if options.raw else read_image(options.image)
+    """Return the pixels (rows, columns) of the picture that the arguments name.
+
+    Raises UsageError if the picture cannot be read, or if the overlay would replace a picture that is read.
+    """
+    second, mask = getattr(options, "second", None), getattr(options, "mask", None)
+    check_picture("--overlay", options.overlay, options.image, second, mask, options.camera)
+    if options.raw:
+        pixels = read_raw(options.image, *options.raw)
+    else:  # the lens of a calibrated camera belongs to the rows and columns of its detector
+        pixels = read_image(options.image, upright=options.camera is None)
     check_size(options.image, pixels)
     return pixels
+
+
+def exposure_of(options: argparse.Namespace, configured: float | None) -> tuple[float | None, str]:
+    """Return the exposure time (s) of a picture, or None if it is unknown, and a line about its source.
+
+    The option `--exposure` has precedence over the metadata of the picture, and the metadata have precedence
+    over the `configured` exposure time. The line is empty unless two of them differ by more than 1 %.
+    """
+    given, stated = options.exposure, None if options.raw else stated_exposure(options.image)
+    found = given or stated or configured
+    others = [] if given is None else [("the picture states", stated)]
+    others += [("the configuration states", configured)] if given is None and stated is not None else []
+    if found is None:
+        return None, ""
+    different = [f"{who} {s:g} s" for who, s in others if s is not None and abs(s / found - 1.0) > 0.01]
+    return found, f"exposure:      {found:g} s; {different[0]}\n" if different else ""
+
+
+_MOST_ASIDE, _MOST_RATIO = 60.0, 3.0
+"""Largest angle (deg) and ratio of magnitudes between a rough rate and the rate whose sign it determines."""
+
+
+def prior_contradiction(prior: Sequence[float] | None, rate: FloatArray | None) -> str:
+    """Return how a rough rate (3,) contradicts a measured rate (3,), rad/s, or no text.
+
+    Such a rough rate does not determine the sign of the measured rate.
+    """
+    if prior is None or rate is None or not np.any(prior):
+        return ""
+    sizes = float(np.linalg.norm(prior)), float(np.linalg.norm(rate))
+    cosine = abs(float(np.dot(prior, rate))) / (sizes[0] * sizes[1])
+    aside = math.degrees(math.acos(min(1.0, cosine)))
+    if aside <= _MOST_ASIDE and 1.0 / _MOST_RATIO <= sizes[0] / sizes[1] <= _MOST_RATIO:
+        return ""
+    return (
+        f"not used: {1e3 * sizes[0]:.3g} mrad/s, {aside:.0f} deg from the axis of the measured"
+        f" rate of {1e3 * sizes[1]:.3g} mrad/s: check its axes and its unit (rad/s)"
+    )
 
 
 def check_size(path: Path, pixels: Image) -> None:
@@ -122,6 +170,27 @@ def utc(text: str) -> datetime:
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: give a time such as 2026-03-01T12:00:00") from error
     return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of a PNG file."""
+
+
+def check_picture(option: str, path: Path | None, *read: Path | None) -> None:
+    """Raise UsageError if a PNG file to be written would replace a file that is read, or no PNG file."""
+    if path is None:
+        return
+    if any(one is not None and one.resolve() == path.resolve() for one in read):
+        raise UsageError(f"{option} {path}: would replace a file that is read: name another file")
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        if file.read(len(_PNG)) not in {_PNG, b""}:
+            raise UsageError(f"{option} {path}: exists already and is not a PNG file: name another file")
+
+
+def check_new(path: Path | None) -> None:
+    """Raise UsageError if a file to be written exists already."""
+    if path is not None and path.exists():
+        raise UsageError(f"{path}: exists already: name another file")
 
 
 def write_new(path: Path, text: str) -> None:

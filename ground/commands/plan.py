@@ -16,7 +16,7 @@ from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, as_orbit
 from flight.schema.document import config_path
-from ground.commands.options import finite, positive, print_result, utc
+from ground.commands.options import check_picture, finite, positive, print_result, utc
 from knightcube import plan_slew, plan_step
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
@@ -74,6 +74,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Plan a slew, and print and draw the result."""
     in_orbit = options.orbit is not None
+    check_picture("--picture", options.picture, options.config, options.orbit)
     for name in _TESTBED_ONLY if in_orbit else _ORBIT_ONLY:
         if getattr(options, name) not in (None, False):
             option = name.replace("_", "-")
@@ -163,6 +164,8 @@ def _check(options: argparse.Namespace) -> None:
     ):
         if value is not None and not low <= value <= high:
             raise UsageError(f"{option} {value:g}: must be {low:g} to {high:g}")
+    if options.time_price is not None and options.horizon is not None:
+        raise UsageError(f"--horizon {options.horizon:g}: --time-price chooses the horizon: give one of them")
 
 
 def _add_orbit_options(parser: argparse.ArgumentParser) -> None:

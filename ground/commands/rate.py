@@ -16,9 +16,11 @@ from ground.commands.options import (
     add_field,
     add_output,
     add_picture,
+    exposure_of,
     finite,
     positive,
     print_result,
+    prior_contradiction,
     read_picture,
 )
 from ground.pictures import draw_marks
@@ -43,8 +45,9 @@ from knightcube.vision.streaks.streak_result import (
 LIKELIHOOD = "likelihood"
 
 _SHUTTER = (
-    "shutter:       not described, which the claim allows for: give --line-time, 0 for all rows at once\n"
+    "shutter:       not described, included in the uncertainty: give --line-time, 0 for all rows at once\n"
 )
+_FIELD = "field of view: assumed to be exact: give --fov-error, or --camera with a calibration\n"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +61,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: knightcube rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
     add_picture(parser)
     add_field(parser)
-    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
+    text = "standard deviation of --fov (default 0), for the uncertainty of the rate"
+    parser.add_argument("--fov-error", type=positive, metavar="DEG", help=text)
+    text = "exposure time (default: of the picture's metadata, or of --camera)"
+    parser.add_argument("--exposure", type=positive, metavar="S", help=text)
     parser.add_argument("--gain", type=positive, metavar="E", help="electrons per count (default 1)")
     parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="count at which pixels clip")
     parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, standard deviation (1)")
@@ -78,10 +84,17 @@ def run(options: argparse.Namespace) -> int:
     prior = None if options.prior is None else np.array(options.prior)
     likelihood = _likelihood(options, camera).in_units_of(unit, zero)
     found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
+    unused = prior_contradiction(options.prior, found.rate)
+    if unused:
+        found = _estimate(options.method, pixels, pinhole, exposure, likelihood, None)
     objects = _objects(pixels, pinhole, found, likelihood, unit)
     facts = _facts(found, objects, options.method) | {"shutter_described": not likelihood.shutter_unstated}
     unstated = isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated
-    print_result(options, facts, _text(found, objects) + (_SHUTTER if unstated else ""))
+    assumed = _FIELD if options.fov and options.fov_error is None and found.rate is not None else ""
+    text = _text(found, objects) + (_SHUTTER if unstated else "") + assumed
+    print_result(
+        options, facts | {"prior_used": not unused}, text + (f"prior:         {unused}\n" if unused else "")
+    )
     if options.overlay is not None:
         ends = [item.endpoints for item in objects]
         write_picture(options.overlay, draw_marks(grey_stretch(pixels), found.endpoints, found.used, ends))
@@ -93,7 +106,8 @@ def run(options: argparse.Namespace) -> int:
 def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image) -> tuple[Pinhole, float]:
     rows, columns = pixels.shape
     fov_deg = options.fov or (camera.field_of_view_deg if camera else None)
-    exposure = options.exposure or (camera.exposure if camera else None)
+    exposure, differing = exposure_of(options, camera.exposure if camera else None)
+    sys.stderr.write(differing)
     if fov_deg is None or exposure is None:
         raise UsageError("give --fov and --exposure, or --camera with a configuration that has them")
     if options.fov is None and camera is not None and camera.lens is not None:
@@ -109,6 +123,12 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
     """Return the fit settings: from the options, else from the configuration, else the defaults."""
     settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
+    if options.fov_error is not None:
+        if options.fov is None or options.method != LIKELIHOOD:
+            raise UsageError(f"--fov-error {options.fov_error:g}: only with --fov and --method {LIKELIHOOD}")
+        # The focal length is half of the picture's width divided by tan(fov / 2).
+        relative = math.radians(options.fov_error) / math.sin(math.radians(options.fov))
+        settings = replace(settings, knowledge=replace(settings.knowledge, focal_length=relative))
     given = {"gain": options.gain, "saturation": options.saturation, "psf_sigma": options.psf}
     given["line_time"] = options.line_time
     return replace(settings, **{name: value for name, value in given.items() if value is not None})
@@ -185,9 +205,12 @@ def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:
         size = float(np.linalg.norm(found.rate))
         along = found.rate / size
         spread = float(np.sqrt(along @ found.covariance @ along))
-        values = "  ".join(f"{1e3 * r:+.4f} +- {1e3 * s:.4f}" for r, s in zip(found.rate, sigma, strict=True))
+        # Slow rates need more digits: the smallest uncertainty has at least two.
+        digits = max(4, 1 - math.floor(math.log10(max(1e3 * float(sigma.min()), 1e-12))))
+        pairs = zip(found.rate, sigma, strict=True)
+        values = "  ".join(f"{1e3 * r:+.{digits}f} +- {1e3 * s:.{digits}f}" for r, s in pairs)
         lines.append(f"rate x, y, z:  {values} mrad/s")
-        lines.append(f"magnitude:     {1e3 * size:.4f} mrad/s +- {100.0 * spread / size:.3f} %")
+        lines.append(f"magnitude:     {1e3 * size:.{digits}f} mrad/s +- {100.0 * spread / size:.3f} %")
     if found.status is StreakStatus.AMBIGUOUS:
         lines.append("direction:     unknown, the rate may have the opposite sign: give --prior")
     length = f", {found.length:.1f} px long" if math.isfinite(found.length) else ""

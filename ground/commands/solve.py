@@ -18,9 +18,12 @@ from ground.commands.options import (
     add_field,
     add_output,
     add_picture,
+    check_new,
+    exposure_of,
     finite,
     positive,
     print_result,
+    prior_contradiction,
     read_picture,
     utc,
     write_new,
@@ -62,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_field(parser)
     add = parser.add_argument
     add("--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of the field)")
-    text = "exposure time, needed for the angular rate from streaks"
+    text = "exposure time, needed for the angular rate from streaks (default: of metadata or --camera)"
     add("--exposure", type=positive, metavar="S", help=text)
     add("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     text = "time of the picture, such as 2026-11-21, for proper motion, aberration and planets"
@@ -93,12 +96,14 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Solve the picture, and print and draw the solution. The exit status is 1 without a solution."""
-    if options.wcs is not None and options.wcs.exists():
-        raise UsageError(f"{options.wcs}: exists already: name another file")
+    check_new(options.wcs)
     pixels = read_picture(options)
     tracker, exposure, axis_sigma = _tracker(options, pixels)
     begin = time.perf_counter()
     solution = tracker.solve(pixels, exposure=exposure, utc=options.date, rate=options.prior)
+    unused = prior_contradiction(options.prior, solution.rate)
+    if unused:
+        solution = tracker.solve(pixels, exposure=exposure, utc=options.date)
     seconds = time.perf_counter() - begin
     sky_map, bodies = solution.sky_map, []
     if sky_map is not None and options.date is not None:
@@ -106,7 +111,8 @@ def run(options: argparse.Namespace) -> int:
     reversed_rows = options.raw is None and rows_reversed(options.image)
     values = {"attitude_method": options.attitude, "centroid_method": options.centroid}
     values |= facts(solution, seconds) | sky_facts(sky_map, bodies, reversed_rows)
-    text = _text(solution, seconds, axis_sigma) + sky_text(sky_map, bodies)
+    text = _text(solution, seconds, axis_sigma) + (f"prior:            {unused}\n" if unused else "")
+    text += sky_text(sky_map, bodies)
     print_result(options, values | {"optical_axis_sigma_px": axis_sigma}, text)
     if options.wcs is not None and sky_map is not None:
         write_new(options.wcs, header_text(sky_map, reversed_rows))
@@ -123,7 +129,7 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
     The third returned value is the standard deviation (px) of the optical axis of a calibrated camera; None
     without a calibrated camera.
     """
-    fov, error, exposure, lens, settings = options.fov, options.fov_error, options.exposure, None, None
+    fov, error, configured, lens, settings = options.fov, options.fov_error, None, None, None
     accuracy = None
     if options.camera is not None:
         camera = configuration.load_camera(options.camera)
@@ -131,7 +137,7 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
             size = f"{pixels.shape[1]} x {pixels.shape[0]} pixels"
             own = f"the camera of {options.camera} has {camera.columns} x {camera.rows}"
             raise UsageError(f"{options.image}: {size}, but {own}")
-        lens, exposure = camera_model(camera), exposure or camera.exposure
+        lens, configured = camera_model(camera), camera.exposure
         if camera.lens is None and error is None:
             # The field of view has a tolerance unless the lens is calibrated.
             error = FOV_TOLERANCE * math.degrees(field_of_view(lens))
@@ -150,6 +156,8 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
         settings = replace(settings, attitude=SOLVERS[options.attitude])
     settings = replace(settings, detection=replace(settings.detection, method=options.centroid))
     tracker = StarTracker(fov, error, camera=lens, settings=settings, index=options.index)
+    exposure, differing = exposure_of(options, configured)
+    sys.stderr.write(differing)
     return tracker, exposure, None if accuracy is None else accuracy.centre
 
 

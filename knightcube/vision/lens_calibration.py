@@ -15,6 +15,7 @@ are listed in `undetermined`.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -493,10 +494,11 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Return the lens of a camera from images of the night sky.
 
-    All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
-    images are excluded. Ten images with stars in the corners give a better calibration than a hundred images
-    without stars in the corners. Lens terms that the stars do not determine are omitted. If most images show
-    a mirrored sky, because of a mirror or a reversed order of the rows, all images are mirrored back.
+    All images must be taken by one camera at one focus setting. Copies of an image, and images that do not
+    fit the lens of the other images, are excluded. Ten images with stars in the corners give a better
+    calibration than a hundred images without stars in the corners. Lens terms that the stars do not determine
+    are omitted. If most images show a mirrored sky, because of a mirror or a reversed order of the rows, all
+    images are mirrored back.
 
     Args:
         images: arrays (rows, columns) of counts, or colour images (rows, columns, 3), all of one shape.
@@ -531,9 +533,9 @@ def calibrate_lens(
         if lens is None and 2 * len(reversed_images) > len(solved):
             turned = [image[:, ::-1] for image in images]
             return _mirrored_back(calibrate_lens(turned, fov_deg=fov_deg, progress=progress))
-        for number in reversed_images:
-            outcomes[number] = replace(outcomes[number], excluded=_REVERSED)
-        solved = [number for number in solved if number not in reversed_images]
+        for number, reason in (_repeated(images) | dict.fromkeys(reversed_images, _REVERSED)).items():
+            outcomes[number] = replace(outcomes[number], excluded=reason)
+        solved = [number for number in solved if not outcomes[number].excluded]
         if not solved:
             return LensCalibration(None, tuple(outcomes))
         solutions = [outcomes[number].solution for number in solved]
@@ -547,6 +549,20 @@ def calibrate_lens(
             outcomes[solved[number]] = replace(outcomes[solved[number]], excluded=reason)
         model, scale = lens.calibration.lens, (0.999, 1.001)
     return LensCalibration(lens, tuple(outcomes))
+
+
+def _repeated(images: Sequence[Image]) -> dict[int, str]:
+    """Return why images with the pixels of an earlier image are excluded, by their index.
+
+    The errors of such images are not independent.
+    """
+    first: dict[bytes, int] = {}
+    found: dict[int, str] = {}
+    for number, image in enumerate(images):
+        earlier = first.setdefault(hashlib.sha256(image.tobytes()).digest(), number)
+        if earlier != number:
+            found[number] = f"it has the pixels of picture {earlier + 1}: give different pictures"
+    return found
 
 
 def _mirrored_back(found: LensCalibration) -> LensCalibration:

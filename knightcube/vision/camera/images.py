@@ -218,18 +218,19 @@ _OTHER_BYTES = {
 }
 
 
-def read_image(path: Path | str) -> Image:
+def read_image(path: Path | str, *, upright: bool = True) -> Image:
     """Return the image (rows, columns) of a FITS, PNG, TIFF, JPEG or BMP file.
 
     The format is recognised by the file's content, not by its name. The pixels are uint8 or uint16. The
     pixels of FITS files may also be signed, 32-bit or floating-point. Colour images are converted to
-    luminance (ITU-R BT.601). Photographs are rotated according to the orientation in their EXIF data. All
-    formats except FITS need Pillow. Raises UsageError if the file is missing, damaged or in an unsupported
-    format, if pixels are not finite, or if Pillow is not installed.
+    luminance (ITU-R BT.601). Photographs are rotated according to the orientation in their EXIF data unless
+    `upright` is false: then rows and columns are those of the camera's detector, as a calibrated lens needs
+    them. All formats except FITS need Pillow. Raises UsageError if the file is missing, damaged or in an
+    unsupported format, if pixels are not finite, or if Pillow is not installed.
     """
     path = Path(path)
     content = _fits_content(path)
-    return fits_image(content, str(path)) if content else _through_pillow(path)
+    return fits_image(content, str(path)) if content else _through_pillow(path, upright)
 
 
 def read_raw(path: Path, columns: int, rows: int, bits: int, header: int | None = 0) -> Image:
@@ -270,23 +271,55 @@ def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDAr
     return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=-1)
 
 
-def write_picture(path: Path, picture: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+_EXIF_FOLDER, _EXPOSURE_TIME = 0x8769, 0x829A
+"""Numbers of the folder of EXIF tags and of its tag ExposureTime (s) (EXIF 2.3, section 4.6)."""
+
+
+def stated_exposure(path: Path) -> float | None:
+    """Return the exposure time (s) in the metadata of an image file, or None.
+
+    The metadata are EXPTIME or EXPOSURE of a FITS file, and ExposureTime of the EXIF data of other files.
+    Raises UsageError if a FITS file cannot be read.
+    """
+    value: Any = None
+    # Damaged metadata are ignored; `read_image` reports damaged files.
+    with suppress(ImportError, OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError):
+        if content := _fits_content(path):
+            header = _first_image(content, str(path))[0]
+            value = next((header[key] for key in ("EXPTIME", "EXPOSURE") if key in header), None)
+        else:
+            from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for files
+
+            with warnings.catch_warnings(action="ignore"), pillow.open(path, formats=FORMATS) as picture:
+                value = picture.getexif().get_ifd(_EXIF_FOLDER).get(_EXPOSURE_TIME)
+        seconds = math.nan if value is None else float(value)
+        return seconds if math.isfinite(seconds) and seconds > 0.0 else None
+    return None
+
+
+def write_picture(
+    path: Path, picture: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], exposure: float | None = None
+) -> None:
     """Write a PNG file from an RGB image (rows, columns, 3) or a grey image (rows, columns) of 8 or 16 bits.
 
-    Raises UsageError if the file cannot be written.
+    An `exposure` time (s) is written as EXIF data, from which `stated_exposure` reads it. Raises UsageError
+    if the file cannot be written.
     """
     try:
         from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for files
     except ImportError as error:
         raise UsageError(f"{path}: a PNG needs Pillow: {EXTRA}") from error
     try:
+        metadata = pillow.Exif()
+        if exposure is not None:
+            metadata[_EXIF_FOLDER] = {_EXPOSURE_TIME: exposure}
         # Noise cannot be compressed: a higher level takes five times as long, for files 3 % smaller.
-        pillow.fromarray(picture).save(path, format="PNG", compress_level=1)
+        pillow.fromarray(picture).save(path, format="PNG", compress_level=1, exif=metadata)
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _through_pillow(path: Path) -> Image:
+def _through_pillow(path: Path, upright: bool) -> Image:
     try:
         from PIL import Image as pillow  # noqa: PLC0415
         from PIL import UnidentifiedImageError  # noqa: PLC0415
@@ -301,9 +334,9 @@ def _through_pillow(path: Path) -> Image:
                 with pillow.open(path, formats=FORMATS) as again:
                     again.tile = [tile._replace(args=_low_bytes(tile.args)) for tile in again.tile]
                     luminance = np.rint((256.0 * high + _colours(again)) @ LUMINANCE)
-                    return _upright(luminance.astype(np.uint16), picture)
+                    return _upright(luminance.astype(np.uint16), picture, upright)
             picture.load()
-            return _upright(_grey(path, picture), picture)
+            return _upright(_grey(path, picture), picture, upright)
     except UnidentifiedImageError as error:
         raise UsageError(f"{path}: is not a {', '.join(FORMATS)} or FITS image: convert it") from error
     except pillow.DecompressionBombError as error:
@@ -319,9 +352,14 @@ _ORIENTATION = 0x0112
 """Number of the tag Orientation (EXIF 2.3, TIFF 6.0): sides of the picture at which row and column 0 lie."""
 
 
-def _upright(image: Image, picture: Picture) -> Image:
-    """Return an image (rows, columns) rotated and mirrored according to the EXIF data of its file."""
+def _upright(image: Image, picture: Picture, upright: bool) -> Image:
+    """Return an image (rows, columns) rotated and mirrored according to the EXIF data of its file.
+
+    The image of a JPEG, PNG or BMP file is returned as it is stored if `upright` is false.
+    """
     orientation: object = 1
+    if not upright:
+        return image
     # Pillow itself rotates TIFF images by 180 deg or mirrors them. Damaged metadata are ignored.
     with suppress(OSError, SyntaxError, ValueError, TypeError, LookupError, struct.error):
         orientation = picture.getexif().get(_ORIENTATION, 1)

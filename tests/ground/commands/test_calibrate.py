@@ -128,6 +128,21 @@ def test_pictures_without_stars_are_named_with_the_reason_and_exit_status_1(tmp_
     assert "cloud.png" in done.stderr
 
 
+def test_a_picture_that_is_given_twice_counts_once(pictures: list[Path], tmp_path: Path) -> None:
+    """The copy also has the same pixels if its file is rotated by its metadata."""
+    exif = pillow.Exif()
+    exif[0x0112] = 6
+    pillow.open(pictures[1]).save(tmp_path / "copy.png", exif=exif)
+    once = json.loads(command("calibrate", *pictures[:2], "--fov", "12", "--json").stdout)
+    copies = (pictures[0], tmp_path / "copy.png")
+    twice = json.loads(command("calibrate", *pictures[:2], *copies, "--fov", "12", "--json").stdout)
+    assert twice["sigma"] == once["sigma"]
+    assert twice["focal_length"] == once["focal_length"]
+    text = command("calibrate", *pictures[:2], *copies, "--fov", "12").stdout
+    assert "pictures:     2 of 4 used" in text
+    assert "copy.png: excluded: it has the pixels of picture 2: give different pictures" in text
+
+
 def test_a_file_that_is_there_is_not_overwritten(pictures: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
     out.write_text("camera: mine\n")

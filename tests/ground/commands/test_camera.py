@@ -12,7 +12,7 @@ from flight.app.cli import main
 from flight.schema import reader as configuration
 from flight.schema.devices import AravisDevice, V4l2Device
 from flight.schema.document import ConfigError
-from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.images import read_image, stated_exposure
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.hal.cameras.rig import kernel_in
 from tests.manual_clock import ManualClock
@@ -89,6 +89,9 @@ def test_frames_of_a_simulated_camera_are_taken_alike(
     assert main(["camera", "--config", str(config), "--count", "2", "--exposure", "0.1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == ["frame 1", "frame 2"]
+    path = tmp_path / "frame.png"
+    assert main(["camera", "--config", str(config), "--exposure", "0.1", "--out", str(path)]) == 0
+    assert stated_exposure(path) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +99,10 @@ def test_frames_of_a_simulated_camera_are_taken_alike(
     [
         (["--count", "0"], "--count 0"),
         (["--exposure", "nan"], "--exposure nan: give seconds"),
-        (["--out", "frame.fits"], "ends in .png"),
+        (
+            ["--out", "frame.fits"],
+            "ends in .png",
+        ),
         ([], "`camera` is missing"),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
+from knightcube.vision.camera.images import write_picture  # noqa: E402
 from sim_hal.star_camera import StarCameraModel  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
 from tests.support.fits_files import fits_file  # noqa: E402
@@ -96,6 +97,12 @@ def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path)
         (["{picture}", "--fov", "20"], "give --fov and --exposure"),
         (["{picture}", "--camera", "config/testbed.yaml"], "give a configuration with a camera"),
         (["{picture}", "--fov", "170", "--exposure", "1"], "--fov 170.0"),
+        (["{picture}", "--fov", "20", "--overlay", "{picture}"], "would replace a file that is read"),
+        (
+            ["{picture}", "--fov", "20", "--overlay", "config/testbed.yaml"],
+            "exists already and is not a PNG file",
+        ),
+        (["{picture}", "--camera", "step_demo", "--fov-error", "1"], "--fov-error 1: only with --fov"),
     ],
 )
 def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) -> None:
@@ -147,6 +154,68 @@ def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_pa
 
     exact, usual = sigma("{centre: 0.0, distortion: 0.0}"), sigma("{}")
     assert exact < 0.9 * usual
+
+
+@pytest.mark.parametrize("factor", [20.0, 0.05])
+@pytest.mark.parametrize("command_name", ["rate", "solve"])
+def test_a_prior_of_another_size_does_not_determine_the_sign(
+    scene: Scene, picture: Path, command_name: str, factor: float
+) -> None:
+    words = (command_name, picture, "--fov", FOV, "--exposure", "0.2")
+    prior = ("--prior", *(f"{factor * component:.6f}" for component in scene.rate))
+    done = command(*words, *prior)
+    assert done.returncode == 0, done.stderr
+    assert "not used: " in done.stdout
+    assert "check its axes and its unit (rad/s)" in done.stdout
+    assert "unknown, the rate may have the opposite sign" in done.stdout
+
+
+def test_a_prior_across_the_axis_does_not_determine_the_sign(scene: Scene, picture: Path) -> None:
+    aside = np.cross(scene.rate, [0.0, 0.0, 1.0])
+    aside *= np.linalg.norm(scene.rate) / np.linalg.norm(aside)
+    words = ("--fov", FOV, "--exposure", "0.2", "--json", "--prior")
+    facts = json.loads(command("rate", picture, *words, *map(str, aside + 0.1 * scene.rate)).stdout)
+    assert (facts["status"], facts["prior_used"]) == ("ambiguous", False)
+
+
+def test_the_error_of_the_field_of_view_is_in_the_uncertainty(scene: Scene, picture: Path) -> None:
+    """The field of view is 5 % too large, so the rate across the boresight is too."""
+    prior = ("--prior", *map(str, scene.rate))
+
+    def sigmas(*more: str) -> float:
+        words = ("--fov", "13.1", *more, "--exposure", "0.2", "--json", *prior)
+        facts = json.loads(command("rate", picture, *words).stdout)
+        error = np.array(facts["rate_rad_s"]) - scene.rate
+        return float(error @ np.linalg.solve(facts["covariance_rad2_s2"], error))
+
+    assert sigmas("--fov-error", "0.6") < 12.0
+    assert sigmas() > 100.0
+    assert (
+        "field of view: assumed to be exact"
+        in command("rate", picture, "--fov", FOV, "--exposure", "0.2").stdout
+    )
+
+
+def test_the_exposure_is_that_of_the_picture_unless_another_is_given(
+    scene: Scene, picture: Path, tmp_path: Path
+) -> None:
+    path, config = tmp_path / "frame.png", tmp_path / "camera.yaml"
+    write_picture(path, scene.pixels, 0.2)
+    config.write_text("camera: {columns: 640, rows: 640, bits: 12, field_of_view_deg: 12.5, exposure: 1.0}\n")
+    done = command("rate", path, "--camera", config, "--json")
+    assert json.loads(done.stdout)["exposure_s"] == pytest.approx(0.2)
+    assert "0.2 s; the configuration states 1 s" in done.stderr
+    given = command("rate", path, "--camera", config, "--json", "--exposure", "0.4")
+    assert json.loads(given.stdout)["exposure_s"] == 0.4
+    assert "0.4 s; the picture states 0.2 s" in given.stderr
+    assert json.loads(command("rate", picture, "--camera", config, "--json").stdout)["exposure_s"] == 1.0
+
+
+def test_slow_rates_have_an_uncertainty_of_two_digits(picture: Path) -> None:
+    shown = command("rate", picture, "--fov", FOV, "--exposure", "2000").stdout
+    line = next(line for line in shown.splitlines() if line.startswith("rate x, y, z:"))
+    assert all(float(word) > 0.0 for word in line.split("+- ")[1].split()[:1])
+    assert "+- 0.0000 " not in line
 
 
 def test_a_shutter_that_nobody_described_widens_the_claim_and_the_command_asks_for_it(picture: Path) -> None:

@@ -250,7 +250,7 @@ def test_pictures_that_are_not_solved_are_named(monkeypatch: pytest.MonkeyPatch)
 
 def test_pictures_of_two_sizes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"a": (100, 120), "b": (100, 121)}
-    monkeypatch.setattr(calibrate, "read_image", lambda path: np.zeros(sizes[path.name], np.uint8))
+    monkeypatch.setattr(calibrate, "read_image", lambda path, upright: np.zeros(sizes[path.name], np.uint8))
     monkeypatch.setattr(calibrate, "check_size", lambda *_: None)
     assert len(calibrate._read([Path("a"), Path("a")])) == 2
     with pytest.raises(UsageError, match=r"121 x 100 .* 120 x 100"):

@@ -18,6 +18,8 @@ PLAN = "plan --from 0.1 --to 0"
         ("plan --from 2 --to 0", "--from 2: must be -0.68 to 0.68"),
         (f"{PLAN} --horizon -1", "--horizon -1: must be 0.001 to 100000"),
         (f"{PLAN} --nodes 2", "--nodes 2: must be 8 to 40"),
+        (f"{PLAN} --time-price 1 --horizon 20", "--horizon 20: --time-price chooses the horizon"),
+        (f"{PLAN} --picture README.md", "--picture README.md: exists already and is not a PNG file"),
         (f"{PLAN} --time-price -1", "-1 is not a positive number"),
         (f"{PLAN} --picture TMP/no/where.png", "where.png: the picture cannot be written"),
         ("command --to TMP/none slew 5", "q2 = 5.0 must lie within -0.68 to 0.68"),

@@ -23,6 +23,7 @@ from knightcube.vision.camera.images import (
     grey_stretch,
     keep_frame,
     read_image,
+    stated_exposure,
     write_picture,
 )
 from knightcube.vision.frame import grey_image
@@ -445,3 +446,22 @@ def test_a_photograph_is_rotated_as_its_metadata_state(tmp_path: Path, name: str
     image = read_image(tmp_path / name)
     assert image.shape == (32, 48)
     assert np.abs(image.astype(int) - pixels).max() <= (30 if name == "a.jpg" else 0)
+    if name != "a.tiff":  # Pillow itself rotates TIFF images
+        detector = read_image(tmp_path / name, upright=False)
+        assert np.abs(detector.astype(int) - stored[orientation]).max() <= (30 if name == "a.jpg" else 0)
+
+
+def test_the_exposure_time_is_that_of_the_metadata(tmp_path: Path) -> None:
+    pixels = np.zeros((32, 48), dtype=np.uint8)
+    exif = pillow.Exif()
+    exif[0x8769] = {0x829A: 0.25}
+    pillow.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
+    pillow.fromarray(pixels).save(tmp_path / "plain.png")
+    write_picture(tmp_path / "a.png", pixels, 0.3)
+    write_picture(tmp_path / "b.png", pixels)
+    (tmp_path / "a.fits").write_bytes(fits_file(pixels, 8, EXPTIME=1.5))
+    (tmp_path / "b.fits").write_bytes(fits_file(pixels, 8, EXPTIME=0.0))
+    (tmp_path / "a.bin").write_bytes(b"no image")
+    found = {path.name: stated_exposure(path) for path in tmp_path.iterdir()}
+    expected = {"a.jpg": 0.25, "a.png": 0.3, "a.fits": 1.5}
+    assert found == expected | dict.fromkeys(["plain.png", "b.png", "b.fits", "a.bin"])
