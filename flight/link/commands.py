@@ -65,6 +65,9 @@ def problem_of(values: Mapping[str, float]) -> str:
         low, high = parameter.valid or (-math.inf, math.inf)
         if not low <= values[key] <= high:  # NaN compares false
             return f"{key} = {values[key]:g} must lie within {low:g} to {high:g} {parameter.unit}"
+    warning, hottest = values["health.temperature"], values["health.hottest"]
+    if warning > hottest:
+        return f"health.temperature = {warning:g} must not exceed health.hottest = {hottest:g} degree C"
     return ""
 
 

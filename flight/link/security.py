@@ -117,7 +117,7 @@ COPIES = ("a", "b")
 _RECORD = struct.Struct(f">4sHIQ{KEY_BYTES}s")
 _MAGIC = b"KCS1"
 _CRC_BYTES = 4
-_LOCK, _OWNER = "lock", "owner"
+_LOCK, OWNER = "lock", "owner"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -205,7 +205,7 @@ class Vault:
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Lock the folder against a second link process. Raises UsageError if it is already locked."""
-        with locked(self._folder / _OWNER, f"{self._folder}: another link process uses these counters"):
+        with locked(self._folder / OWNER, f"{self._folder}: another link process uses these counters"):
             yield
 
     def read(self, name: int | str) -> Association | None:

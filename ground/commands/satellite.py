@@ -24,7 +24,7 @@ from flight.link import commands
 from flight.link.events import Mode
 from flight.link.files.store import Store
 from flight.link.process import directives
-from flight.link.process.commanding import Report, Stage, final_mode
+from flight.link.process.commanding import Report, Stage, final_mode, utc_of
 from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import (
@@ -44,9 +44,11 @@ from ground.link.commanding import (
     FileSession,
     add_link_options,
     change_key,
+    check_timeout,
     exchange,
     explained,
     ground_files_folder,
+    no_answer,
     obeyed,
     sha256_of,
     terminal_of,
@@ -154,6 +156,7 @@ def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
     typed = parser.parse_args(options.words)
     behind = {name: getattr(typed, name) for name in ("timeout", "json") if hasattr(typed, name)}
     try:
+        utc_of(options.at)
         line = commands.words_of(_command_of(typed))
     except commands.CommandError as error:
         raise UsageError(str(error)) from error
@@ -188,6 +191,7 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
 
 def run_command(options: argparse.Namespace) -> int:
     """Send the command, wait for the answer and print it."""
+    check_timeout(options.timeout)
     if options.what == "schedule":
         options = _with_scheduled(options)
     if options.link is not None:
@@ -279,7 +283,9 @@ def _command_of(options: argparse.Namespace) -> commands.Command:
     for field in packet.fields:
         value = getattr(options, field.name)
         if field.kind.startswith("S"):
-            value = " ".join(value)
+            value, size = " ".join(value), int(field.kind[1:])
+            if len(value.encode(errors="replace")) >= size:  # a command such as `safe` is sent all the same
+                sys.stderr.write(f"knightcube: {field.name}: only its first {size - 1} bytes are sent\n")
         numbers_by_label = {label: number for number, label in field.states}
         fields[field.name] = numbers_by_label[value] if field.states else value
     return commands.command_of(packet, fields)
@@ -322,8 +328,7 @@ def configure_parameters(parser: argparse.ArgumentParser) -> None:
 
 def run_parameters(options: argparse.Namespace) -> int:
     """Request the parameter table, change it if requested, and print the table in use."""
-    if not 0.0 < options.timeout < float("inf"):
-        raise UsageError(f"--timeout {options.timeout}: must be a positive number of seconds")
+    check_timeout(options.timeout)
     file = _parameters_in(options.load) if options.load is not None else None
     changes = dict(map(_change, options.changes))
     before, _ = _ask(options, commands.DumpParameters())
@@ -387,8 +392,9 @@ def _ask_by_link(
                     reported = True
             if refused or (refused is not None and (table is not None or not wants_table)):
                 break
+        gate = terminal.gate
     if refused is None:
-        raise KnightCubeError(f"{options.link}: no answer within {options.timeout:g} s")
+        raise no_answer(gate, options.timeout)
     return table, refused
 
 
@@ -535,8 +541,14 @@ class _FileWork:
                         self._command(directives.DeleteFile(f"received/{name}"))
                 return self._put(options.path, name)
             case "use":
-                name = f"received/{options.kind}/{options.path.name}"
-                return self._command(directives.UseFile(name, sha256_of(options.path)))
+                name, digest = f"received/{options.kind}/{options.path.name}", sha256_of(options.path)
+                try:
+                    return self._command(directives.UseFile(name, digest))
+                except KnightCubeError as error:
+                    if "its SHA-256 is" not in str(error):
+                        raise
+                    problem = f"{error}, but that of {options.path} is {digest.hex()}"
+                    raise KnightCubeError(f"{problem}: send the file again by `put --replace`") from error
             case "delete":
                 return self._command(directives.DeleteFile(options.name))
             case word:

@@ -247,7 +247,7 @@ class LinkFeed:
                 text = "; ".join(explained(report) for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
             time.sleep(0.02)
-        raise no_answer(_ANSWER_S)
+        raise no_answer(self._terminal.gate, _ANSWER_S)
 
     @contextlib.contextmanager
     def transferring(self, store: Store, rate: float) -> Iterator[FileSession]:

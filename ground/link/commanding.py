@@ -7,6 +7,7 @@ import hashlib
 import os
 import socket
 import tempfile
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -22,7 +23,17 @@ from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Directive, NewKey, SendFile
 from flight.link.process.filing import LISTING
-from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, may_change, new_key
+from flight.link.security import (
+    COMMAND_SPIS,
+    NEXT,
+    Association,
+    Gate,
+    Refusal,
+    Sealer,
+    Vault,
+    may_change,
+    new_key,
+)
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
 from flight.schema.reader import load
@@ -42,6 +53,10 @@ Show = Callable[[Report], object]
 _BLOCK = 64  # number of frame counters reserved at once, because each reservation takes two disk writes
 _SILENCE_S = 5.0
 """Time (s) without telemetry after which the ground sends a ping while it awaits the reports on a command."""
+_STATUS_S = 1.5  # longest time (s) to wait for the packet `link`, which is sent once a second
+_REASON_S = 2.0  # longest time (s) to wait for the satellite's reason for the end of a transfer
+_RANGES = {"spacecraft": (0, 1023), "frame_bytes": (128, 2048)}
+"""Permitted values of the link's settings, as in the configuration (`flight.schema.sections.Link`)."""
 _REPEAT_NS = 5_000_000_000  # time (ns) after which an unanswered command is sent again
 _BURST_S = 0.05  # longest time (s) over which unused transmission capacity accumulates
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
@@ -54,8 +69,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     Raises KnightCubeError if no answer arrives within `timeout` s, and UsageError for an invalid address or
     timeout.
     """
-    if not 0.0 < timeout < float("inf"):
-        raise UsageError(f"--timeout {timeout}: must be a positive number of seconds")
+    check_timeout(timeout)
     host, _, port = to.rpartition(":")
     if host and port.isdigit() and not Path(to).exists():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
@@ -101,6 +115,12 @@ def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExc
     parser.add_argument("--frame-bytes", type=int, metavar="N", help=text)
 
 
+def check_timeout(seconds: float) -> None:
+    """Raise UsageError unless the time to wait is a positive finite number."""
+    if not 0.0 < seconds < float("inf"):
+        raise UsageError(f"--timeout {seconds}: must be a positive number of seconds")
+
+
 def ground_files_folder(keys: Path) -> Path:
     """Return the ground's folder for transferred files, such as keys/ground-files for the keys keys/ground.
 
@@ -122,10 +142,11 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
     if section is None:
         raise UsageError(f"{options.config}: has no section `link`")
     settings = TerminalSettings.of(section)
-    if options.spacecraft is not None:
-        settings = replace(settings, spacecraft=options.spacecraft)
-    if options.frame_bytes is not None:
-        settings = replace(settings, frame_bytes=options.frame_bytes)
+    for name, (low, high) in _RANGES.items():
+        if (value := getattr(options, name)) is not None:
+            if not low <= value <= high:
+                raise UsageError(f"--{name.replace('_', '-')} {value}: must be {low} to {high}")
+            settings = replace(settings, **{name: value})
     return open_terminal(options.link, options.keys, settings)
 
 
@@ -145,15 +166,30 @@ def explained(report: Report) -> str:
     if report.stage is not Stage.REPEATED:
         return report.text
     return (
-        f"{report.text}: the counter in the ground's folder of keys is too low, because the folder is an "
-        "older copy; the next telemetry raises the counter: then send the command again"
+        f"{report.text}: the counter in the ground's folder of keys was too low, because the folder is an "
+        "older copy; telemetry raises the counter: send the command again"
     )
 
 
-def no_answer(seconds: float) -> KnightCubeError:
-    """Return the error of a command on which no report arrived for `seconds` s."""
+def no_answer(gate: Gate, seconds: float) -> KnightCubeError:
+    """Return the error of a command on which no report arrived for `seconds` s, with its possible causes.
+
+    The causes depend on the numbers of telemetry frames that `gate` has accepted and refused.
+    """
+    foreign, forged = gate.refused[Refusal.HEADER], gate.refused[Refusal.MAC]
+    if gate.admitted:
+        cause = "telemetry arrives, but the command or its reports were lost"
+    elif foreign + forged:
+        which = "another spacecraft (--spacecraft)" if foreign > forged else "other keys (--keys)"
+        cause = f"{foreign + forged} frames of {which} were received"
+    else:
+        cause = (
+            "no telemetry frame was received: check the address of --link, and that the link runs; the "
+            "satellite does not answer frames with other --keys, with another --spacecraft or, from an older "
+            f"copy of the keys, with counters that were used: `--spi {COMMAND_SPIS[1]} ping` renews these"
+        )
     return KnightCubeError(
-        f"no answer over the link within {seconds:g} s: the command or its reports were lost; look at the "
+        f"no answer over the link within {seconds:g} s: {cause}; look at the "
         "telemetry before you send the command again, because it may have been executed"
     )
 
@@ -170,8 +206,24 @@ def command(
 
     The call ends with the final report, when `ended` is true for the list of received reports, or after
     `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
-    the ground when it restarts, and after a minute without a frame.
+    the ground when it restarts, and after a minute without a frame. If the frame's counter was used before,
+    or if the reserve SPI is used, the counters of the ground are then raised above those of the satellite.
     """
+    found = _followed(terminal, packet, spi, seconds, show, ended)
+    if spi == COMMAND_SPIS[1] or any(report.stage is Stage.REPEATED for report in found):
+        terminal.learn_counters(_STATUS_S)
+    return found
+
+
+def _followed(
+    terminal: Terminal,
+    packet: bytes,
+    spi: int,
+    seconds: float,
+    show: Show,
+    ended: Callable[[list[Report]], bool],
+) -> list[Report]:
+    """Send a command, `show` its reports and return them, see `command`."""
     counter, packer, found = terminal.send(packet, spi), CommandPacker(), list[Report]()
     left = seconds
     while left > 0.0:
@@ -187,7 +239,7 @@ def command(
         if terminal.gate.admitted == heard and left > 0.0:
             terminal.send(packer.pack(Ping(), utc_ns()), spi)
     if not found:
-        raise no_answer(seconds)
+        raise no_answer(terminal.gate, seconds)
     return found
 
 
@@ -259,6 +311,7 @@ class FileSession:
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
+        self._failed: list[tuple[Progress, float]] = []  # failed transfers, each with the time (s) to wait
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
         self._credit, self._credit_ns = 0.0, now_ns
@@ -340,8 +393,12 @@ class FileSession:
         self.entity.ended.clear()
         for one in found:
             if one.condition != 0:
+                self._failed.append((one, time.monotonic() + _REASON_S))
+        for one, until in self._failed:
+            # The satellite's reason is in the packet `transfer`, which may follow the end of the transfer.
+            if (one.source, one.number) in self._texts or time.monotonic() >= until:
                 raise KnightCubeError(f"{one.name}: {self.reason_of(one)}")
-        return bool(found)
+        return bool(found) and not self._failed
 
     def completed(self) -> bool:
         """Return whether the satellite has completed a command.

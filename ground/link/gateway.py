@@ -30,7 +30,7 @@ from flight.link.process.directives import LONGEST_IN_PORTIONS
 from flight.link.process.station import host_port
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, SECONDARY_BYTES, crc16
-from ground.link.terminal import FRAME_OVERHEAD_BYTES, Terminal, report_of
+from ground.link.terminal import FRAME_OVERHEAD_BYTES, PORTS, Terminal, report_of
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -214,11 +214,16 @@ class Gateway:
         self.down = self.up = self.refused = 0
         try:
             host, port = host_port(address)
+            if not 0 <= port < PORTS:
+                raise UsageError(f"{address}: the port must be 0 to {PORTS - 1}")
             if not IPv4Address(host).is_loopback:
                 raise UsageError(f"{address}: plain packets are served on loopback only: give 127.0.0.1:PORT")
             self._listener = socket.create_server((host, port))
-        except (OSError, OverflowError, ValueError) as error:
-            raise UsageError(f"{address}: cannot listen there: {error}") from error
+        except ValueError as error:
+            raise UsageError(f"{address}: give 127.0.0.1:PORT") from error
+        except OSError as error:
+            problem = f"cannot listen there: {error.strerror or error}"
+            raise UsageError(f"{address}: {problem}: give another port by --serve") from error
         self._listener.setblocking(False)
 
     @property

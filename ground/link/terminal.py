@@ -38,6 +38,7 @@ _STORE_EVERY = 256  # number of telemetry frames between two writes of the anti-
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
+PORTS = 1 << 16  # number of TCP and UDP ports
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
 FRAME_OVERHEAD_BYTES = frames.TELECOMMAND_HEADER.size + security.OVERHEAD_BYTES + CRC_BYTES
 """Number of bytes that a telecommand frame adds to its packet."""
@@ -133,6 +134,7 @@ class Terminal:
         self._channels: dict[int, frames.PacketAssembler] = {}
         self._expected: dict[int, int] = {}  # next counter of each SPI
         self._codes = codes or settings.codes()
+        self._learned = False
         self.lost_frames = self.idle_frames = 0
         self.packet_bytes = settings.command_frame_bytes - FRAME_OVERHEAD_BYTES
         spis, mask, encrypted = security.TELEMETRY_SPIS, frames.TELEMETRY_MASK, settings.encrypted
@@ -215,6 +217,13 @@ class Terminal:
                     return
                 reported = True
 
+    def learn_counters(self, seconds: float) -> None:
+        """Receive telemetry for at most `seconds` s, until it has raised counters that are too low."""
+        self._learned = False
+        for _ in self.packets(seconds):
+            if self._learned:
+                return
+
     def reception(self) -> str:
         """Return the numbers of received and lost frames and of corrected errors as a text."""
         code = self._codes.telemetry
@@ -234,6 +243,7 @@ class Terminal:
 
         The stored counters are behind if the folder of keys is an older copy.
         """
+        self._learned = True
         (row,) = LAYOUTS[LINK.name].array(packet)
         for spi, highest, generation in zip(
             security.COMMAND_SPIS, row["highest"], row["generation"], strict=False
@@ -262,7 +272,7 @@ class UdpGround:
     def __init__(self, address: str, codes: LinkCodes | None = None) -> None:
         """Open a socket that sends to HOST:PORT and receives at any free port. Raises KnightCubeError."""
         self._codes = codes or LinkCodes()
-        self._address = host_port(address)
+        self._name, self._address = address, checked_address(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         self._socket.setblocking(False)
@@ -283,7 +293,7 @@ class UdpGround:
 
     def send(self, frame: bytes) -> None:
         """Send a datagram."""
-        with _reaching(str(self._address)):
+        with _reaching(self._name):
             self._socket.sendto(self._codes.commands.encode(frame), self._address)
 
     def close(self) -> None:
@@ -335,6 +345,12 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
     """
     settings = settings or TerminalSettings()
     vault, codes = security.Vault(keys), settings.codes()
+    if not any(map(vault.copies, (*security.COMMAND_SPIS, *security.TELEMETRY_SPIS))):
+        raise UsageError(
+            f"{keys}: contains no keys: give the folder `ground` that `knightcube keys` has made"
+        )
+    if (keys / security.OWNER).exists():
+        raise UsageError(f"{keys}: a link process uses these keys of the satellite: give the ground's folder")
     kiss = address.startswith("kiss:")
     framing, place = codes.on_ground(kiss), address.removeprefix("kiss:")
     line: GroundLine
@@ -345,7 +361,8 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
                 port = serial.Serial(device, int(baud), exclusive=True)
                 line = StreamGround(address, port.fileno(), framing, port.close)
             elif kiss or place.startswith("tcp:"):
-                connection = socket.create_connection(host_port(place.removeprefix("tcp:")), timeout=5.0)
+                where = checked_address(place.removeprefix("tcp:"))
+                connection = socket.create_connection(where, timeout=5.0)
                 connection.setblocking(True)
                 line = StreamGround(address, connection.fileno(), framing, connection.close)
             else:
@@ -353,6 +370,14 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
     except ValueError as error:
         raise UsageError(f"{address}: give {ADDRESSES}") from error
     return Terminal(line, vault, settings, codes)
+
+
+def checked_address(address: str) -> tuple[str, int]:
+    """Return host and port of an address HOST:PORT. Raises ValueError for an impossible port."""
+    host, port = host_port(address)
+    if not host or not 0 < port < PORTS:
+        raise ValueError(f"{address}: the port must be 1 to {PORTS - 1}")
+    return host, port
 
 
 @contextlib.contextmanager

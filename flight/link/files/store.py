@@ -179,8 +179,10 @@ class _Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def problem_of_name(name: str) -> str:
     """Return why a name is not allowed, or ""; an allowed name stays in the folder of received files."""
     parts = name.split("/")
-    if len(name.encode(errors="replace")) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
-        return f"{name[:LONGEST_NAME]!r} is too long for the name of a file"
+    if len(name.encode(errors="replace")) >= LONGEST_NAME:
+        return f"{name[:LONGEST_NAME]!r} is too long: a name has fewer than {LONGEST_NAME} bytes"
+    if len(parts) > _MOST_PARTS:
+        return f"{name!r} has {len(parts)} parts: the name of a file has at most {_MOST_PARTS}"
     if not all(_PART.fullmatch(part) for part in parts):
         return f"{name!r} is not an allowed name: use letters, digits and . _ + -, but no leading . + -"
     return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -384,6 +385,17 @@ LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 
+def _check(directive: Directive) -> None:
+    """Raise CommandError for values that cannot be executed."""
+    if not isinstance(directive, Play):
+        return
+    begin, end = directive.begin, directive.end
+    if math.isnan(begin) or math.isnan(end):
+        raise CommandError(f"playback from {begin:g} to {end:g} s: give two numbers")
+    if begin > end:
+        raise CommandError(f"the end {end:g} s must not be before the begin {begin:g} s")
+
+
 def pack(directive: Directive, utc_ns: int) -> bytes:
     """Return a directive encoded as a packet. Raises CommandError for values out of range."""
     packet, values = directive.packet, dict[str, Any]()
@@ -392,10 +404,11 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
         if isinstance(value, str) and len(value.encode()) >= int(one.kind[1:]):
             raise CommandError(f"{value}: too long, {one.name} must have fewer than {one.kind[1:]} bytes")
         values[one.name] = list(value) if isinstance(value, bytes) else value
+    _check(directive)
     try:
         return Packer(LAYOUTS).pack(packet, utc_ns, values)
     except TelemetryError as error:
-        raise CommandError("the values do not fit into the directive") from error
+        raise CommandError(str(error)) from error
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
@@ -424,8 +437,7 @@ def unpack(data: bytes) -> Directive | None:
         else:
             values[one.name] = bytes(raw.tolist()) if one.count > 1 else raw.item()
     directive: Directive = _BY_NAME[layout.packet.name](**values)
-    if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
-        raise CommandError(f"the end {directive.end:g} s must not be before the begin {directive.begin:g} s")
+    _check(directive)
     if values.get("part", 0) >= len(PARTS):
         raise CommandError(f"part {values['part']} is unknown")
     if values.get("kind", 0) >= len(KINDS):

@@ -13,6 +13,7 @@ from enum import IntEnum
 
 from knightcube.errors import UsageError
 
+_ROUNDING = 1e-9  # error (rad) of an angle that was converted between degrees and radians
 _LENGTH = 1e-3
 """Largest accepted difference between the length of a commanded quaternion and one."""
 
@@ -91,7 +92,9 @@ class PointingTarget:
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))
-            raise UsageError(f"{self.goal.label} takes {counts} numbers, not {len(self.numbers)}")
+            names = ", ".join(name for name, *_ in ARGUMENTS.get(self.goal, ()))
+            which = f": {names}" if names else ""
+            raise UsageError(f"{self.goal.label} takes {counts} numbers, not {len(self.numbers)}{which}")
         if not all(map(math.isfinite, (*self.numbers, self.roll or 0.0))):
             raise UsageError(f"{self.goal.label}: numbers and roll must be finite")
         if self.goal is Goal.INERTIAL:
@@ -104,6 +107,15 @@ class PointingTarget:
             raise UsageError(f"latitude {math.degrees(self.numbers[0]):g} deg is beyond a pole")
         if self.goal is Goal.OBJECT and self.numbers and not abs(self.numbers[1]) <= _RIGHT:
             raise UsageError(f"declination {math.degrees(self.numbers[1]):g} deg is beyond a pole")
+        self._check_angles()
+
+    def _check_angles(self) -> None:
+        """Raise UsageError for an angle of more than a revolution, such as a mistyped value."""
+        angles = () if self.goal is Goal.INERTIAL or not self.numbers else ARGUMENTS.get(self.goal, ())
+        named = dict(zip((name for name, *_ in angles), self.numbers, strict=False))
+        for name, value in (named | {"roll": self.roll or 0.0}).items():
+            if abs(value) > 2.0 * math.pi + _ROUNDING:
+                raise UsageError(f"{name} {math.degrees(value):g} deg must lie within -360 to 360 deg")
 
     @property
     def text(self) -> str:

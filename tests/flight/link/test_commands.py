@@ -44,7 +44,9 @@ TARGETS = st.one_of(
     st.builds(PointingTarget, st.just(Goal.GROUND), st.tuples(st.floats(-1.57, 1.57), st.floats(-3.2, 3.2))),
     st.just(PointingTarget(Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8))),
     st.just(PointingTarget(Goal.OBJECT)),
-    st.builds(PointingTarget, st.just(Goal.OBJECT), st.tuples(st.floats(-6.3, 6.3), st.floats(-1.57, 1.57))),
+    st.builds(
+        PointingTarget, st.just(Goal.OBJECT), st.tuples(st.floats(-6.28, 6.28), st.floats(-1.57, 1.57))
+    ),
 )
 
 ANY: st.SearchStrategy[Command] = st.one_of(

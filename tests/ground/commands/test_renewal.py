@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tarfile
+from collections import Counter
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -217,6 +218,7 @@ def test_activate_succeeds_only_if_the_trial_has_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, stages: list[str], status: int, error: str
 ) -> None:
     terminal = Mock()
+    terminal.gate.refused = Counter()
     reports = [Report(1, 7, Stage[stage], "activate", "text") for stage in stages]
     terminal.follow.side_effect = [reports, *[[]] * 1000]
     monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: terminal)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -176,6 +177,34 @@ def test_a_scheduled_command_is_the_command_as_typed(typed: str) -> None:
         assert flown == meant
 
 
+@pytest.mark.parametrize(
+    ("typed", "complaint"),
+    [
+        (("--timeout", "0", "ping"), "--timeout 0.0: must be a positive number of seconds"),
+        (("--timeout", "nan", "ping"), "--timeout nan: must be a positive number of seconds"),
+        (("schedule", "tomorrow", "mode", "safe"), "'tomorrow' is not a UTC such as"),
+        (("schedule", "2026-11-23", "mode", "safe"), "'2026-11-23' is not a UTC such as"),
+        (("play", "nan", "5"), "playback from nan to 5 s: give two numbers"),
+        (("play", "10", "5"), "the end 5 s must not be before the begin 10 s"),
+        (("unschedule", "-1"), "number = -1 cannot be stored as u4"),
+        (("point", "ground", "10", "400"), "longitude 400 deg must lie within -360 to 360 deg"),
+    ],
+)
+def test_a_wrong_command_is_refused_before_it_is_sent(
+    monkeypatch: pytest.MonkeyPatch, typed: tuple[str, ...], complaint: str
+) -> None:
+    monkeypatch.setattr(satellite, "send", lambda *_: pytest.fail("a frame was sent"))
+    monkeypatch.setattr(satellite, "terminal_of", lambda _: Link())
+    done = command("command", *LINK, *typed)
+    assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
+
+
+def test_a_reason_that_is_too_long_is_cut_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
+    made = unpack(satellite.packet_of(words("safe", "x" * 70)))
+    assert made == ChangeMode(Mode.SAFE, "x" * 63)
+    assert "reason: only its first 63 bytes are sent" in capsys.readouterr().err
+
+
 def test_a_table_of_parameters_cannot_be_scheduled(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         satellite._with_scheduled(words("schedule", "2026-11-23T21:00:00", "load-parameters", "1", "2"))
@@ -215,6 +244,7 @@ class Link:
         self.received = list(packets)
         self.sent: list[bytes] = []
         self.closed = 0
+        self.gate = SimpleNamespace(admitted=0, refused=Counter())
 
     def send(self, packet: bytes, spi: int = 1) -> int:
         self.sent.append(packet)
@@ -332,6 +362,10 @@ def test_a_refused_table_is_reported(flight: Flight) -> None:
         ((f"{PARAMETER_KEYS[0]}=much",), "much"),
         (("--timeout", "0"), "--timeout"),
         ((f"{PARAMETER_KEYS[0]}=1e9",), PARAMETER_KEYS[0]),
+        (
+            ("health.temperature=100", "health.hottest=50"),
+            "health.temperature = 100 must not exceed health.hottest = 50 degree C",
+        ),
     ],
 )
 def test_wrong_parameters_are_refused(flight: Flight, arguments: tuple[str, ...], complaint: str) -> None:
@@ -402,6 +436,8 @@ class Session:
         self.asked: list[Any] = []
         self._reports: list[Report] = []
         self.entity = SimpleNamespace(ended=[], transfers=list)
+        self._failed: list[Any] = []
+        self._texts = {(one.source, one.number): "no room" for _, ended in turns for one in ended}
 
     def ask(self, directive: Any, _: int) -> None:
         self.asked.append(directive)
@@ -438,7 +474,7 @@ def work(session: Session, ended: bool = False) -> satellite._FileWork:
 
 def ending(name: str, number: int = 5, condition: int = 0) -> Any:
     """Return the packet that reports the end of a transfer."""
-    return SimpleNamespace(name=name, number=number, condition=condition)
+    return SimpleNamespace(name=name, source=2, number=number, condition=condition)
 
 
 @pytest.mark.usefixtures("quiet")

@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import socket
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +21,7 @@ from flight.link.frames import LONGEST_FRAME
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import NewKey, SendFile
-from flight.link.security import NEXT, Association, Vault
+from flight.link.security import NEXT, Association, Refusal, Vault
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Packer
 from ground.link import commanding
@@ -46,7 +47,8 @@ class FakeTerminal:
         self.answers = list(answers)
         self.sent: list[bytes] = []
         self.names: list[Any] = []
-        self.gate = SimpleNamespace(admitted=0)
+        self.gate = SimpleNamespace(admitted=0, refused=Counter())
+        self.learned = 0
 
     def sealer(self, spi: int, block: int) -> Any:
         return SimpleNamespace(name=spi, block=block, _name=spi)
@@ -58,6 +60,9 @@ class FakeTerminal:
         self.sent.append(packet)
         self.names.append(sealer._name)
         return len(self.sent)
+
+    def learn_counters(self, seconds: float) -> None:
+        self.learned += 1
 
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         yield from (self.answers.pop(0) if self.answers else [])
@@ -93,6 +98,33 @@ def test_each_report_is_shown_and_none_is_an_error() -> None:
     assert commanding.command(terminal(None, answers), b"x", 1, 2.0, shown.append) == answers == shown
     with pytest.raises(KnightCubeError, match=r"within 2\.5 s"):
         commanding.command(terminal(), b"x", 1, 2.5, shown.append)
+
+
+@pytest.mark.parametrize(
+    ("admitted", "refused", "cause"),
+    [
+        (7, {Refusal.MAC: 1}, "telemetry arrives, but the command or its reports were lost"),
+        (0, {Refusal.MAC: 7}, r"7 frames of other keys \(--keys\) were received"),
+        (0, {Refusal.HEADER: 7}, r"7 frames of another spacecraft \(--spacecraft\) were received"),
+        (0, {}, "no telemetry frame was received: check the address of --link"),
+    ],
+)
+def test_a_missing_answer_has_a_cause(admitted: int, refused: dict[Refusal, int], cause: str) -> None:
+    double = terminal()
+    double.gate = SimpleNamespace(admitted=admitted, refused=Counter(refused))
+    with pytest.raises(KnightCubeError, match=cause):
+        commanding.command(double, b"x", 1, 2.5, lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("spi", "last", "learned"),
+    [(1, Stage.COMPLETED, 0), (2, Stage.COMPLETED, 1), (1, Stage.REPEATED, 1)],
+)
+def test_the_counters_are_raised_if_they_may_be_too_low(spi: int, last: Stage, learned: int) -> None:
+    """The link sends its counters once a second, which may be later than the reports on a command."""
+    double = terminal(None, [report(last, spi=spi)])
+    commanding.command(double, b"x", spi, 2.0, lambda _: None)
+    assert double.learned == learned
 
 
 def test_a_ping_follows_each_silence_so_that_a_restarted_link_knows_the_ground() -> None:
@@ -254,6 +286,22 @@ def test_the_satellites_reason_goes_before_our_own(tmp_path: Path) -> None:
     assert files.reason_of(cast(Any, ours)) == "no room"
 
 
+def test_a_failed_transfer_waits_for_the_reason_of_the_satellite(tmp_path: Path) -> None:
+    """The satellite's reason is in a packet that may arrive after the end of the transfer."""
+    files = session(tmp_path, terminal())
+    values: dict[str, Any] = {
+        field.name: "" if field.kind.startswith("S") else 0 for field in TRANSFER.fields
+    }
+    failed = SimpleNamespace(name="a", source=2, number=7, condition=4, said="filestore rejection")
+    files.entity.ended.append(cast(Any, failed))
+    assert not files.ended("a", 7)
+    assert not files.ended("a", 7)
+    packet = Packer().pack(TRANSFER, 0, {**values, "source": 2, "number": 7, "text": "a exists on board"})
+    files.take([(0, packet)], 1)
+    with pytest.raises(KnightCubeError, match="a: a exists on board"):
+        files.ended("a", 7)
+
+
 def test_units_of_an_unknown_kind_are_ignored(tmp_path: Path) -> None:
     files = session(tmp_path, terminal())
     files.take([(0, UnitPacker(DOWN).pack(b"\xff\xff\xff", 0))], 5)
@@ -344,6 +392,9 @@ def test_the_settings_of_the_link_are_those_of_the_configuration_and_the_options
     assert (described.command_frame_bytes, described.encrypted) == (200, False)
     coding = described.coding
     assert (coding.randomiser, coding.reed_solomon, coding.cltu) == ("long", 4, "randomised")
+    for wrong in (["--spacecraft", "5000"], ["--frame-bytes", "5"]):
+        with pytest.raises(UsageError, match=f"{wrong[0]} {wrong[1]}: must be "):
+            commanding.terminal_of(parser.parse_args([*words, *wrong]))
     with pytest.raises(UsageError, match=r"without.yaml: has no section `link`"):
         commanding.terminal_of(parser.parse_args([*words, "--config", str(tmp_path / "without.yaml")]))
 

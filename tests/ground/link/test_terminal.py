@@ -131,10 +131,42 @@ def test_a_tcp_line_waits_for_its_bytes_and_ends_with_its_peer(keys: Path) -> No
                 list(terminal.take())
 
 
-@pytest.mark.parametrize("address", ["nowhere", "tcp:1.2.3.4", "127.0.0.1:x", "/dev/null@fast"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "nowhere",
+        "tcp:1.2.3.4",
+        "127.0.0.1:x",
+        "127.0.0.1:0",
+        "127.0.0.1:99999",
+        "kiss:127.0.0.1:-1",
+        ":5010",
+        "/dev/null@fast",
+    ],
+)
 def test_an_address_of_another_form_is_refused(keys: Path, address: str) -> None:
     with pytest.raises((UsageError, KnightCubeError)):
         open_terminal(address, keys)
+
+
+def test_a_folder_without_keys_of_the_ground_is_refused(tmp_path: Path) -> None:
+    make_keys(tmp_path / "keys")
+    with pytest.raises(UsageError, match="contains no keys: give the folder `ground`"):
+        open_terminal("127.0.0.1:9", tmp_path / "keys")
+    satellite = tmp_path / "keys" / "satellite"
+    with (
+        Vault(satellite).owned(),
+        pytest.raises(UsageError, match="uses these keys of the satellite"),
+    ):
+        open_terminal("127.0.0.1:9", satellite)
+
+
+def test_the_name_of_an_unknown_host_is_reported_as_given(keys: Path) -> None:
+    with (
+        contextlib.closing(open_terminal("satellite.invalid:5010", keys)) as terminal,
+        pytest.raises(KnightCubeError, match=r"^satellite\.invalid:5010: cannot be reached"),
+    ):
+        terminal.send(b"x")
 
 
 def report(counter: int, spi: int, stage: Stage, text: str = "") -> bytes:

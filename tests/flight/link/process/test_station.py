@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 from collections.abc import Iterator
 from contextlib import closing
@@ -14,11 +15,11 @@ import pytest
 from flight.link.commands import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
 from flight.link.events import Mode
 from flight.link.process import directives, station
-from flight.link.process.directives import NewKey, Play, Stop
+from flight.link.process.directives import Deletion, NewKey, Play, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK
 from flight.link.security import Admitted
 from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
-from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, crc16
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, crc16
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.flight.link.vaults import frame_with
@@ -361,7 +362,14 @@ def test_damaged_directives_are_refused_in_words(damage: bytes) -> None:
     assert directives.unpack(good) == Play(0, 1.0, 2.0)
     with pytest.raises(CommandError):
         directives.unpack(good[: 6 + len(damage)] + damage)
-    backwards = directives.pack(Play(0, 2.0, 1.0), 5)
+    with pytest.raises(CommandError, match="the end 1 s must not be before the begin 2 s"):
+        directives.pack(Play(0, 2.0, 1.0), 5)
+    with pytest.raises(CommandError, match="from nan to 5 s: give two numbers"):
+        directives.pack(Play(0, math.nan, 5.0), 5)
+    with pytest.raises(CommandError, match="number = -1 cannot be stored as u4"):
+        directives.pack(Deletion(-1), 5)
+    fields = {"run": 0, "begin": 2.0, "end": 1.0}
+    backwards = Packer(directives.LAYOUTS).pack(Play.packet, 5, fields)
     assert crc16(backwards[:-CRC_BYTES]) == int.from_bytes(backwards[-CRC_BYTES:], "big")
     with pytest.raises(CommandError, match="must not be before the begin"):
         directives.unpack(backwards)
