@@ -85,9 +85,9 @@ PING = telecommand(
 SAFE = telecommand(
     "safe",
     0x202,
-    "Abort: set the coils to zero and change to safe mode",
+    "Abort: change to safe mode: no coil current in a testbed, detumbling and Sun pointing in a satellite",
     Field("reason", "S64", "-", "reason for the log"),
-    hazard="ends pointing, slews and detumbling until the next command",
+    hazard="ends pointing and slews until the next command",
 )
 MODE = telecommand(
     "mode",

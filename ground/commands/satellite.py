@@ -138,7 +138,9 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
 def _add_commands(words: _Words, packets: Sequence[Packet] = commands.COMMANDS) -> None:
     """Add a subparser for each of the telecommands."""
     for packet in packets:
-        _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
+        _configure_word(
+            words.add_parser(packet.name, help=packet.meaning[:1].lower() + packet.meaning[1:]), packet
+        )
 
 
 def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:

@@ -470,7 +470,7 @@ class Receiver:
             self.stop(Condition.UNSUPPORTED_CHECKSUM, problem)
             return
         if not problem and metadata.size > room:
-            problem = f"{metadata.size} bytes are too many"
+            problem = f"{metadata.size} bytes exceed the permitted {room} bytes"
         if problem:
             self.stop(Condition.FILESTORE_REJECTION, problem)
 

@@ -208,7 +208,7 @@ class Filing:
         if kind not in KINDS or not rest or "/" in rest:
             return f"{metadata.name}: use a name KIND/NAME with KIND one of {', '.join(KINDS)}"
         if (self._store.received / metadata.name).exists():
-            return f"{metadata.name} exists on board: delete it first, or put it with --replace"
+            return "exists on board: put it with --replace, or delete it first"
         taken = sum(path.stat().st_size for path in self._store.received.rglob("*") if path.is_file())
         if taken + metadata.size > MOST_RECEIVED:
             return f"{taken} of {MOST_RECEIVED} bytes are in use: delete files that are not needed"
