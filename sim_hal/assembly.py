@@ -319,7 +319,9 @@ def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
     """Return the optics and detector of an emulated star camera."""
     from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415 - see above
 
+    lens = lens_of(camera)
     return StarCameraModel(
+        lens=lens if isinstance(lens, Lens) else None,
         columns=camera.columns,
         rows=camera.rows,
         field_of_view=float(np.deg2rad(camera.field_of_view_deg)),

@@ -12,7 +12,7 @@ import importlib
 import math
 import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -46,7 +46,7 @@ from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, coil_field, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.horizon_camera_job import polygon_mask
-from knightcube.vision.streaks.streak_result import LikelihoodSettings, knowledge_of_pinhole
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 _KNOWN = CameraKnowledge()
 _MOST_HIDDEN = 0.5
@@ -638,18 +638,6 @@ def stated_accuracy(camera: Camera) -> CameraKnowledge:
     return CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time)
 
 
-def camera_knowledge(camera: Camera) -> CameraKnowledge:
-    """Return the uncertainty of the pinhole model with which the streak fit represents the camera.
-
-    The streak fit has no lens model, so the difference between a calibrated lens and the pinhole adds to the
-    uncertainty.
-    """
-    knowledge, lens = stated_accuracy(camera), camera_model(camera)
-    if knowledge.line_time is None and camera.line_time is not None:
-        knowledge = replace(knowledge, line_time=0.0)
-    return knowledge_of_pinhole(knowledge, lens) if isinstance(lens, Lens) else knowledge
-
-
 def likelihood_settings(camera: Camera) -> LikelihoodSettings:
     """Return the settings of the streak fit for the camera's frames."""
     return LikelihoodSettings(
@@ -657,7 +645,7 @@ def likelihood_settings(camera: Camera) -> LikelihoodSettings:
         saturation=camera.saturation,
         psf_sigma=camera.psf_sigma,
         line_time=camera.line_time,
-        knowledge=camera_knowledge(camera),
+        knowledge=stated_accuracy(camera),
     )
 
 

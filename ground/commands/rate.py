@@ -29,7 +29,7 @@ from knightcube.errors import UsageError
 from knightcube.reference.corner_streak_rate import estimate_rate
 from knightcube.reference.corner_streaks import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.images import grey_stretch, write_picture
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import Pinhole, streak_camera
 from knightcube.vision.frame import raw_counts
 from knightcube.vision.objects.detect import SpaceObject, detect_objects
 from knightcube.vision.objects.settings import ObjectSettings
@@ -114,7 +114,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
         if (camera.rows, camera.columns) != pixels.shape:
             own = f"{camera.columns} x {camera.rows}"
             raise UsageError(f"{options.image} has {columns} x {rows} pixels, but the camera has {own}")
-        return camera_model(camera).ideal, exposure
+        return streak_camera(camera_model(camera)), exposure
     if not 0.1 <= fov_deg <= 120.0:
         raise UsageError(f"--fov {fov_deg}: a pinhole camera can have 0.1 to 120 degrees")
     return Pinhole.from_field_of_view(columns, rows, math.radians(fov_deg)), exposure

@@ -29,7 +29,7 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
-from knightcube.vision.camera.lens import CameraModel, Pinhole
+from knightcube.vision.camera.lens import CameraModel, Pinhole, streak_camera
 from knightcube.vision.frame import FrameState, frame_state, raw_counts, saturation_count
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import FieldPoints, MeasuredObjects, ObjectMeasurementSettings
@@ -51,7 +51,6 @@ from knightcube.vision.startracker.solve import (
 )
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Survey, survey
 from knightcube.vision.startracker.tracking import PRIOR_SIGMAS
-from knightcube.vision.streaks.geometry import streak_pinhole
 from knightcube.vision.streaks.streak_result import (
     REASONS,
     FrameMotion,
@@ -467,7 +466,7 @@ def _motion(job: FrameJob) -> FrameMotion:
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
     lens, estimator, previous = job.camera.ideal, job.estimator, job.previous_checksum
     if isinstance(estimator, LikelihoodSettings):
-        lens = streak_pinhole(job.camera, estimator.knowledge)
+        lens = streak_camera(job.camera)
         course = prior.course if prior is not None else None
         return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous, course)
     return estimator.motion(job.pixels, lens, job.exposure, rate, sigma, previous)

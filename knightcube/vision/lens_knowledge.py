@@ -464,7 +464,7 @@ class LensKnowledge:
         by[1, 1] = by[2, 2] = by[4, _LINE_TIME] = 1.0
         by[3, 3], by[3, 4] = square, quadratic * square**2
         covariance = by @ self.covariance @ by.T
-        covariance[3, 3] += (_FOURTH_LEFT * float(self.values[4]) * square**2) ** 2
+        covariance[3, 3] += (_FOURTH_LEFT * square**2) ** 2 * self.covariance[4, 4]
         covariance[4, 4] = self.shutter[1] ** 2
         corner = np.zeros(len(self.values))
         corner[0], corner[3], corner[4] = 1.0 / f, square, square**2

@@ -34,7 +34,7 @@ from scipy.special import ndtr, ndtri
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import Lens, Pinhole, streak_camera
 
 DEVICE = "star camera model"
 
@@ -389,6 +389,7 @@ class StarCameraModel:
         columns: number of pixel columns.
         rows: number of pixel rows.
         field_of_view: angle across the columns, from edge to edge, rad.
+        lens: camera geometry with distortion, which replaces the pinhole of `field_of_view` unless None.
         aperture: diameter of the aperture, m.
         zero_magnitude_flux: charge rate from a source of V = 0, e-/s per m^2 of aperture (Sease, eq. 2.7,
             where 19,000 is per mm^2).
@@ -427,9 +428,15 @@ class StarCameraModel:
     hot_pixels: tuple[HotPixel, ...] = ()
     line_time: float = 0.0
     background_gradient: tuple[float, float] = (0.0, 0.0)
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         check_limits(DEVICE, self, _LIMITS)
+        if self.lens is not None and (self.lens.rows, self.lens.columns) != (self.rows, self.columns):
+            raise ValueError(
+                f"{DEVICE}: {self.columns} x {self.rows} pixels behind a lens of "
+                f"{self.lens.columns} x {self.lens.rows}: give both the same"
+            )
         for name, choices in (("psf", ("integrated", "bilinear")), ("noise", ("poisson", "uniform"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{DEVICE}: {name} = {getattr(self, name)!r}: use {' or '.join(choices)}")
@@ -446,7 +453,9 @@ class StarCameraModel:
 
     @property
     def pinhole(self) -> Pinhole:
-        """Pinhole geometry of the camera (Sease, eqs. 2.3 and 2.4, corrected)."""
+        """Geometry of the camera (Sease, eqs. 2.3 and 2.4, corrected), with the distortion of its lens."""
+        if self.lens is not None:
+            return streak_camera(self.lens)
         return Pinhole.from_field_of_view(self.columns, self.rows, self.field_of_view)
 
     @property

@@ -82,7 +82,7 @@ class Pinhole:
 
     def rescaled(self, factor: float) -> Pinhole:
         """Return the camera with its focal length multiplied by `factor`."""
-        return Pinhole(self.columns, self.rows, self.focal_length * factor)
+        return replace(self, focal_length=self.focal_length * factor)
 
     def binned(self, columns: int, rows: int, size: int) -> Pinhole:
         """Return the camera of `columns` x `rows` bins of `size` x `size` px with the same centre."""
@@ -215,7 +215,7 @@ class Lens:
             raise LensError(f"{text}: must be between -{_MOST_SHAPE} and {_MOST_SHAPE}")
         if not (math.isfinite(self.p1) and math.isfinite(self.p2)):
             raise LensError(f"p1 {self.p1}, p2 {self.p2}: must be finite")
-        object.__setattr__(self, "reach", _reach(self.k1, self.k2))
+        object.__setattr__(self, "reach", fold_of(self.k1, self.k2))
         corner = self._corner()
         if corner >= self._limit():
             raise LensError(
@@ -389,7 +389,7 @@ def _undistorted(stretched: FloatArray, k1: float, k2: float, limit: float) -> F
     return out
 
 
-def _reach(k1: float, k2: float) -> float:
+def fold_of(k1: float, k2: float) -> float:
     """Return the smallest tangent r of a field angle at which the distorted radius has a maximum.
 
     The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite without a root.
@@ -400,6 +400,165 @@ def _reach(k1: float, k2: float) -> float:
     # This formula for the smaller positive root r^2 avoids cancellation and is also valid for k2 = 0.
     denominator = -3.0 * k1 + math.sqrt(discriminant)
     return math.sqrt(2.0 / denominator) if denominator > _NO_FOLD else math.inf
+
+
+# Largest change (px) in the last iteration that inverts the distortion, and maximum number of iterations.
+_LAST_CHANGE = 1e-9
+_MOST_INVERSIONS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class DistortedPinhole(Pinhole):
+    """A pinhole camera with the image errors of a lens, which moves a point u of the ideal image to A d(u).
+
+    Unlike a `Lens`, the camera has derivatives of the distortion, and images all directions in front of it.
+    The distorted point is d(u) = u (1 + scale + cubic s + fourth s^2) + t(u), where u is the distance from
+    the image centre and s is the square of |u| relative to the distance of the corner. The matrix A and the
+    tangential distortion t are those of `Lens`.
+
+    Attributes:
+        shift: displacement (x, y) of the image centre, px.
+        scale: relative error of the focal length.
+        cubic, fourth: relative displacement of the corner by the two terms of the radial distortion.
+        tangential: coefficients (p1, p2) of the tangential distortion.
+        shape: aspect and shear of the pixels.
+    """
+
+    shift: tuple[float, float] = (0.0, 0.0)
+    scale: float = 0.0
+    cubic: float = 0.0
+    fourth: float = 0.0
+    tangential: tuple[float, float] = (0.0, 0.0)
+    shape: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, camera: Pinhole | Lens) -> DistortedPinhole:
+        """Return the pinhole camera that has the same image as `camera`."""
+        if isinstance(camera, DistortedPinhole):
+            return camera
+        if isinstance(camera, Pinhole):
+            return cls(camera.columns, camera.rows, camera.focal_length)
+        middle = camera.ideal.centre
+        square = (math.hypot(*middle) / camera.focal_length) ** 2
+        return cls(
+            camera.columns,
+            camera.rows,
+            camera.focal_length,
+            shift=(camera.centre[0] - middle[0], camera.centre[1] - middle[1]),
+            cubic=camera.k1 * square,
+            fourth=camera.k2 * square**2,
+            tangential=(camera.p1, camera.p2),
+            shape=(camera.aspect, camera.shear),
+        )
+
+    def binned(self, columns: int, rows: int, size: int) -> DistortedPinhole:
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px."""
+        shift = self.shift[0] / size, self.shift[1] / size
+        focal_length = self.focal_length / size
+        return replace(self, columns=columns, rows=rows, focal_length=focal_length, shift=shift)
+
+    @property
+    def ideal(self) -> Pinhole:
+        """The pinhole camera without the image errors."""
+        return Pinhole(self.columns, self.rows, self.focal_length)
+
+    @property
+    def half_diagonal(self) -> float:
+        """The angle from the axis to the farthest corner of the detector, rad."""
+        right, bottom = self.columns - 0.5, self.rows - 0.5
+        corners = np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
+        away = self.undistorted(corners) - np.array(self.centre)
+        return float(np.arctan(np.hypot(*away.T).max() / self.focal_length))
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions with z <= 0 give NaN."""
+        return self.distorted(Pinhole.project(self, vectors))
+
+    def unit_vectors(self, points: FloatArray) -> FloatArray:
+        """Return unit vectors (n, 3) to pixels (n, 2), in the camera frame."""
+        return Pinhole.unit_vectors(self, self.undistorted(np.asarray(points, dtype=float)))
+
+    def distorted(self, points: FloatArray) -> FloatArray:
+        """Return the image positions (..., 2), px, with lens distortion, of ideal `points` (..., 2), px."""
+        away = points - np.array(self.centre)
+        moved = away * (1.0 + self._growth(away)) + self._tangential(away, away)
+        return np.asarray(moved @ self._pixels() + np.array(self.centre) + np.array(self.shift))
+
+    def undistorted(self, points: FloatArray) -> FloatArray:
+        """Return the ideal positions (..., 2), px, of image `points` (..., 2), px, with lens distortion."""
+        shifted = points - np.array(self.centre) - np.array(self.shift)
+        away = shifted = shifted @ np.linalg.inv(self._pixels())
+        for _ in range(_MOST_INVERSIONS):
+            before = away
+            away = (shifted - self._tangential(before, before)) / (1.0 + self._growth(before))
+            if not np.any(np.abs(away - before) > _LAST_CHANGE):
+                break
+        return np.asarray(away + np.array(self.centre))
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """Return the Jacobian (m, 2, 2) of the lens distortion at ideal `points` (m, 2) px."""
+        away = points - np.array(self.centre)
+        slope = 2.0 * self._slopes(away)[0]
+        radial = (1.0 + self._growth(away))[..., None] * np.eye(2) + slope[..., None] * (
+            away[:, :, None] * away[:, None, :]
+        )
+        tangential = [2.0 * self._tangential(away, axis) for axis in np.eye(2)]
+        return np.asarray(self._pixels() @ (radial + np.stack(tangential, axis=-1)))
+
+    def curvature(self, points: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the acceleration (m, 2), px per exposure^2, of image points due to the distortion.
+
+        The ideal `points` (m, 2), px, move with a constant `velocity` (m, 2), px per exposure.
+        """
+        away = points - np.array(self.centre)
+        slope, change = self._slopes(away)
+        closing = np.sum(away * velocity, axis=1, keepdims=True)
+        square = np.sum(velocity**2, axis=1, keepdims=True)
+        radial = 2.0 * slope * (2.0 * closing * velocity + square * away) + 4.0 * change * closing**2 * away
+        return np.asarray((radial + 2.0 * self._tangential(velocity, velocity)) @ self._pixels())
+
+    @property
+    def _corner_square(self) -> float:
+        return float(np.sum(np.square(self.centre)))
+
+    def _squares(self, away: FloatArray) -> tuple[FloatArray, float]:
+        """Return the squares (..., 1) of distances relative to the corner, and the square of the fold.
+
+        Beyond the fold, at which the distorted distance has a maximum, the distortion is that of the fold, so
+        that stars far outside the image do not appear in the image.
+        """
+        fold = fold_of(self.cubic / (1.0 + self.scale), self.fourth / (1.0 + self.scale)) ** 2
+        return np.minimum(np.sum(away**2, axis=-1, keepdims=True) / self._corner_square, fold), fold
+
+    def _growth(self, away: FloatArray) -> FloatArray:
+        """Return the relative radial displacement (..., 1) at distances (..., 2), px, from the centre."""
+        square, _ = self._squares(away)
+        return np.asarray(self.scale + square * (self.cubic + square * self.fourth))
+
+    def _slopes(self, away: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the first and second derivatives (m, 1) of `_growth` with respect to |away|^2, 1/px^2."""
+        square, fold = self._squares(away)
+        first = (self.cubic + 2.0 * self.fourth * square) / self._corner_square
+        second = np.full_like(square, 2.0 * self.fourth / self._corner_square**2)
+        return np.where(square < fold, first, 0.0), np.where(square < fold, second, 0.0)
+
+    def _tangential(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        """Return the symmetric bilinear form (..., 2), px, of the tangential distortion of two distances."""
+        across = one[..., :1] * other[..., 1:] + one[..., 1:] * other[..., :1]
+        along = np.array(self.tangential[::-1])
+        squares = one * other
+        total = np.sum(squares, axis=-1, keepdims=True)
+        form = along * (total + 2.0 * squares) + along[::-1] * across
+        return np.asarray(form / self.focal_length)
+
+    def _pixels(self) -> FloatArray:
+        aspect, shear = self.shape
+        return np.array([[1.0 + aspect, shear], [shear, 1.0 - aspect]])
+
+
+def streak_camera(camera: CameraModel) -> Pinhole:
+    """Return the model of `camera` for paths of stars: a lens becomes a `DistortedPinhole`."""
+    return camera if isinstance(camera, Pinhole) else DistortedPinhole.of(Lens.of(camera))
 
 
 def check_camera(camera: CameraModel) -> None:

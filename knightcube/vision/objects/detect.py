@@ -46,7 +46,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.compiled import compiled_form_of
 from knightcube.errors import KnightCubeError
 from knightcube.vision.background import MAD_TO_SIGMA
-from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera
+from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
 from knightcube.vision.frame import gain_in_counts, line_of, positions, raw_counts
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
@@ -813,8 +813,7 @@ def detect_objects(
     Args:
         image: pixel values (rows, columns) of any integer or floating type, with streaks of 20 px or more.
             Gain and saturation of the settings are in the unit of the pixel values.
-        camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`. The
-            search neglects lens distortion.
+        camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`.
         rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
             from the streaks of the image. If the sign of the rate is unknown, the directions of motion of all
             objects may have the wrong sign.
@@ -835,14 +834,15 @@ def detect_objects(
     rotation = finite_array("rate", rate, (3,)) * exposure
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     none = DetectedObjects((), np.empty((0, 3)), np.empty((0, 3, 3)))
-    if not _keeps_stars(rotation, camera.ideal):
+    simple = streak_camera(camera)
+    if not _keeps_stars(rotation, simple):
         angle = float(np.linalg.norm(rotation))
         reason = f"no star remains in the image during a rotation by {angle:.3g} rad: check rate and exposure"
         return replace(none, reason=reason)
     saturation = None if settings.saturation is None else (settings.saturation - zero) / unit
     settings = replace(settings, gain=gain_in_counts(settings.gain, unit), saturation=saturation)
     ends = EndpointSettings(gain=settings.gain, saturation=settings.saturation)
-    report = detect(pixels, camera.ideal, rotation, exposure, ends, settings)
+    report = detect(pixels, simple, rotation, exposure, ends, settings)
     if report is None:
         return replace(none, reason=f"fewer than {ends.least_streaks} significant streaks")
     if problem := _problem_of_rate(report):

@@ -22,7 +22,7 @@ import numpy as np
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
-from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.lens import CameraModel, streak_camera
 from knightcube.vision.objects.detect import detect
 from knightcube.vision.objects.settings import (
     FLOOR_PX,
@@ -344,7 +344,7 @@ def _among_streaks(
     if motion.rate is None:
         return []
     streaks = EndpointSettings(gain=detection.gain or 1.0, saturation=detection.saturation)
-    report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
+    report = detect(seen.pixels, streak_camera(solution.camera), rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
     # The magnitude of a star of one count is computed from identified streaks, or NaN if there are none.
@@ -442,7 +442,9 @@ def measure_points(
     moves = motion.status is StreakStatus.RATE and motion.rate is not None and motion.length >= STREAK_PX
     if moves and isinstance(motion, MotionResult) and motion.rate is not None:
         ends = EndpointSettings(gain=detection.gain or 1.0, saturation=detection.saturation)
-        report = detect(pixels, camera.ideal, motion.rate * exposure, exposure, ends, settings.search)
+        report = detect(
+            pixels, streak_camera(camera), motion.rate * exposure, exposure, ends, settings.search
+        )
         found = () if report is None else report.objects
         middles = np.array([item.endpoints.mean(axis=0) for item in found]).reshape(-1, 2)
         points = np.vstack([motion.stars[motion.used], middles])

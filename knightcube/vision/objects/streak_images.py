@@ -18,7 +18,7 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import DistortedPinhole, Pinhole
 
 # Spacing (px) of the Gaussians that model a streak; the ripple is 0.2 % for a PSF of 0.6 px.
 _STEP_PX = 1.0
@@ -47,7 +47,8 @@ def star_paths(
     The array `directions` (n, 3), camera axes, contains the direction of each star when it has covered the
     fraction `starts` (n,) of its path. All paths have the number of points that the longest path requires.
     """
-    return _paths_on_circles(directions, rotation, starts, (pinhole.focal_length, *pinhole.centre))
+    paths = _paths_on_circles(directions, rotation, starts, (pinhole.focal_length, *pinhole.centre))
+    return pinhole.distorted(paths) if isinstance(pinhole, DistortedPinhole) else paths
 
 
 def _paths_on_circles_numpy(
@@ -134,7 +135,10 @@ def path_among_stars(
     counted from the first of the `ends`. If `parts` is None, the points are evenly spaced.
     """
     parts = _even_parts(ends) if parts is None else parts
-    return _path_among_stars(ends, rotation, parts, (float(pinhole.focal_length), *pinhole.centre))
+    view = (float(pinhole.focal_length), *pinhole.centre)
+    if not isinstance(pinhole, DistortedPinhole):
+        return _path_among_stars(ends, rotation, parts, view)
+    return pinhole.distorted(_path_among_stars(pinhole.undistorted(ends), rotation, parts, view))
 
 
 def _path_among_stars_numpy(

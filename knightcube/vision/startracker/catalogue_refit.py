@@ -17,7 +17,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import Pinhole, streak_camera
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.sky_map import SkyMap, apparent
 from knightcube.vision.startracker.solve import (
@@ -38,7 +38,6 @@ from knightcube.vision.streaks.geometry import (
     path_lengths,
     polar_angles,
     positions,
-    streak_pinhole,
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
 from knightcube.vision.streaks.scene_images import light_of
@@ -105,7 +104,7 @@ def refit_motion(
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
-    pinhole, exposure = streak_pinhole(solution.camera, likelihood.knowledge), motion.exposure
+    pinhole, exposure = streak_camera(solution.camera), motion.exposure
     # The rotation during the exposure includes mean rate, acceleration and higher-order terms.
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]

@@ -25,7 +25,7 @@ from itertools import chain, islice
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
-from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole, image_of_camera
+from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
 from knightcube.vision.frame import raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
@@ -80,7 +80,6 @@ from knightcube.vision.streaks.streak_result import (
     admit,
     direction_of_time,
     in_time,
-    knowledge_of_pinhole,
     validate,
 )
 from knightcube.vision.streaks.uncertainty import (
@@ -223,7 +222,7 @@ def _rescanned(
         motion = CameraMotion.steady(frame[2] * angle)
         found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
         bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
-        x, y, z = frame @ pinhole.unit_vectors(found.stars[bright]).T
+        x, y, z = frame @ pinhole.ideal.unit_vectors(found.stars[bright]).T
         circles = Circles(frame, z, np.arctan2(y, x))
         for best, stars, light in scan_angles(camera.frame, pinhole, circles, 1, angle):
             if len(light[:_FIRST_STARS]) < settings.least_stars:
@@ -662,8 +661,7 @@ def estimate_rate(
     Args:
         image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger. Raw
             counts are best, because the gain and the saturation are in the unit of the pixel values.
-        camera: pinhole model or calibrated lens. The distortion of a lens is not corrected; the covariance
-            includes its effect on the rate.
+        camera: pinhole model or calibrated lens.
         exposure: exposure time, s.
         prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
             the rotation.
@@ -677,9 +675,7 @@ def estimate_rate(
     settings = settings or LikelihoodSettings()
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     settings = settings.in_units_of(unit, zero)
-    if isinstance(camera, Lens):
-        settings = replace(settings, knowledge=knowledge_of_pinhole(settings.knowledge, camera))
-    found = estimate_motion(pixels, camera.ideal, exposure, settings, prior_rate, prior_sigma)
+    found = estimate_motion(pixels, streak_camera(camera), exposure, settings, prior_rate, prior_sigma)
     found = replace(found, flux=unit * found.flux, faint_flux=unit * found.faint_flux)
     if found.rate is not None or found.reason:
         return found

@@ -172,7 +172,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
-    half = pinhole.half_diagonal
+    half = pinhole.ideal.half_diagonal
     wide = np.pi if inside_field <= half else float(np.arcsin(np.sin(half) / np.sin(inside_field)))
     count = int(2.0 * wide / step)
     azimuth = -wide + step * np.arange(count)
@@ -215,7 +215,7 @@ def _refined_angle(
     height = circles.height[certain]
     sine = np.sqrt(np.maximum(1.0 - height**2, 0.0))
     local = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), height])
-    pixel = pinhole.project((circles.frame.T @ local).T)
+    pixel = pinhole.ideal.project((circles.frame.T @ local).T)
     spacing = boxes.step * pinhole.focal_length * sine
     # A sample of 3 x 3 pixels contains 83 % of the flux of a streak segment of 3 px.
     light = light[certain] * spacing / (3.0 * 0.83) * across / np.maximum(seen[certain], 1.0)
@@ -385,7 +385,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     if found is None:
         return None
     axis, agree = found
-    middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
+    middle = np.array([0.0, 0.0, 1.0])
     # Azimuth zero is the direction to the image centre, or arbitrary if the axis passes through the centre.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
@@ -393,7 +393,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         first = first - (first @ axis) * axis
     first = first / np.linalg.norm(first)
     frame = np.stack([first, cross_product(axis, first), axis])
-    centre = np.einsum("ij,nj->ni", frame, pinhole.unit_vectors(regions.centre))
+    centre = np.einsum("ij,nj->ni", frame, pinhole.ideal.unit_vectors(regions.centre))
     reference = np.arctan2(centre[:, 1], centre[:, 0])
     view = (float(pinhole.focal_length), *pinhole.centre)
     pixels = regions.column, regions.row, regions.light, regions.owner
@@ -604,7 +604,7 @@ def _stars_of_angle(
     chosen = np.flatnonzero(whole | cut)[:most]
     sine = np.sqrt(np.maximum(1.0 - guess.height[chosen] ** 2, 0.0))
     local = np.stack([sine * np.cos(middle[chosen]), sine * np.sin(middle[chosen]), guess.height[chosen]])
-    pixel = pinhole.project((guess.frame.T @ local).T)
+    pixel = pinhole.ideal.project((guess.frame.T @ local).T)
     seen = np.isfinite(pixel).all(axis=1)
     return pixel[seen], (regions.flux / part)[chosen][seen]
 

@@ -70,7 +70,7 @@ class PolarGrid:
         polar = self.polar[0] + row * (self.polar[1] - self.polar[0])
         azimuth = self.azimuth[0] + column * (self.azimuth[1] - self.azimuth[0])
         local = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
-        return pinhole.project((self.frame.T @ local).T)
+        return pinhole.ideal.project((self.frame.T @ local).T)
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
@@ -86,7 +86,7 @@ def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarG
         first = np.array([1.0, 0.0, 0.0])
     first = first / np.linalg.norm(first)
     frame = np.stack([first, cross_product(axis, first), axis])
-    half = pinhole.half_diagonal
+    half = pinhole.ideal.half_diagonal
     spacing = every * ACROSS / pinhole.focal_length
     polar = np.arange(max(inside_field - half, _NEAREST), inside_field + half, spacing)
     fastest = float(np.max(np.sin(polar))) * pinhole.focal_length
@@ -155,7 +155,7 @@ def _border(pinhole: Pinhole) -> FloatArray:
     sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
     along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
     down = np.concatenate([np.zeros_like(sides[0]), sides[1], np.full_like(sides[0], y), y - sides[1]])
-    return pinhole.unit_vectors(np.stack([along, down], axis=-1))
+    return pinhole.ideal.unit_vectors(np.stack([along, down], axis=-1))
 
 
 def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> IntArray:

@@ -7,7 +7,6 @@ prior rate, from a gyro or the previous estimate, determines the sign of the rat
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -28,7 +27,7 @@ from knightcube.astro.arrays import (
 )
 from knightcube.astro.quaternion import from_rotation_vector
 from knightcube.errors import ArgumentError
-from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Lens, Pinhole, check_shape
+from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Pinhole, check_shape
 from knightcube.vision.frame import FrameState, check_pixels, frame_state, gain_in_counts
 from knightcube.vision.streaks.geometry import GAUSSIAN, Course, PsfProfile
 
@@ -123,20 +122,6 @@ class LikelihoodSettings:
             return self
         saturation = None if self.saturation is None else (self.saturation - zero) / unit
         return replace(self, saturation=saturation, gain=gain_in_counts(self.gain, unit))
-
-
-def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
-    """Return the accuracy of the pinhole camera that replaces a calibrated `lens` in the fit of streaks.
-
-    The fit does not model the lens distortion. The difference between lens and pinhole is therefore included
-    in the uncertainty of the pinhole.
-    """
-    middle = 0.5 * (lens.columns - 1), 0.5 * (lens.rows - 1)
-    square = math.hypot(*middle) ** 2 / lens.focal_length**2
-    centre = math.hypot(knowledge.centre, math.dist(lens.centre, middle))
-    radial, tangential = square * (lens.k1 + square * lens.k2), math.hypot(lens.p1, lens.p2)
-    others = lens.aspect, lens.shear, 3.0 * math.sqrt(square) * tangential
-    return replace(knowledge, centre=centre, distortion=math.hypot(knowledge.distortion, radial, *others))
 
 
 class StreakStatus(Enum):

@@ -17,12 +17,12 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray
+from knightcube.vision.camera.lens import DistortedPinhole
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.fit_windows import SLOWEST
 from knightcube.vision.streaks.geometry import (
     GAUSSIAN,
     PIXEL_VARIANCE,
-    DistortedPinhole,
     StreakScene,
     path_lengths,
     positions,
@@ -243,12 +243,9 @@ def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     """Return `camera` with a lens that has calibration errors `error` (m,), given in standard deviations."""
     # The last row contains the errors of the line time, which is not a property of the lens.
     change = _error_root(camera)[:4] @ error
-    pinhole = camera.pinhole
-    if isinstance(pinhole, DistortedPinhole):
-        change = change + np.array([pinhole.scale, *pinhole.shift, pinhole.cubic])
-    scale, x, y, cubic = change.tolist()
-    lens = DistortedPinhole(pinhole.columns, pinhole.rows, pinhole.focal_length, (x, y), scale, cubic)
-    return replace(camera, pinhole=lens)
+    lens = DistortedPinhole.of(camera.pinhole)
+    scale, x, y, cubic = (change + np.array([lens.scale, *lens.shift, lens.cubic])).tolist()
+    return replace(camera, pinhole=replace(lens, shift=(x, y), scale=scale, cubic=cubic))
 
 
 # Minimum relative change of the rate of a motion that starts or ends near rest.

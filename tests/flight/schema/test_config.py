@@ -19,10 +19,9 @@ from flight.link.commands import Point
 from flight.loop.commanding import command_of
 from flight.schema import reader
 from flight.schema.bodies import OrbitConfig, TestbedConfig, as_orbit, as_testbed
-from flight.schema.devices import camera_knowledge
+from flight.schema.devices import likelihood_settings
 from flight.schema.document import ConfigError, read_document, to_yaml
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
-from knightcube.vision.camera.lens import EXACT
 from sim_hal.assembly import camera_model
 from sim_hal.settings import Simulation
 
@@ -344,23 +343,16 @@ def test_a_configuration_is_written_in_its_order_and_read_back_the_same() -> Non
     assert read_document(text, "written").values == values | {"pair": [1, -0.0]}
 
 
-def test_what_a_lens_differs_by_from_a_pinhole_counts_as_unknown_to_the_streaks() -> None:
-    """An unknown lens is described by the offset of the optical axis and by the distortion.
-
-    The optical axis is 3 px (x) and 4 px (y) from the image centre. The distortion moves the image corner by
-    1 % of its distance from the centre.
-    """
+def test_the_fit_of_streaks_has_the_stated_accuracy_of_the_camera() -> None:
     demo = reader.load(FOLDER / "step_demo.yaml").camera
     assert demo is not None
-    assert camera_knowledge(demo) == EXACT
+    exact = likelihood_settings(demo)
+    assert (exact.knowledge.centre, exact.knowledge.distortion, exact.line_time_sigma) == (0.0, 0.0, 0.0)
     accuracy = "accuracy: {centre: 0.0, distortion: 0.0}"
-    focal, corner = 2900.0, 511.5 * 2.0**0.5
-    lens = f"lens: {{focal_length: {focal}, centre: [514.5, 507.5], k1: {0.01 * (focal / corner) ** 2}}}"
-    camera = reader.parse(DEMO.replace(accuracy, f"{accuracy}\n  {lens}"), "text").camera
+    camera = reader.parse(DEMO.replace(accuracy, "accuracy: {centre: 3.0, distortion: 0.01}"), "text").camera
     assert camera is not None
-    known = camera_knowledge(camera)
-    assert known.centre == pytest.approx(5.0)
-    assert known.distortion == pytest.approx(0.01)
+    stated = likelihood_settings(camera).knowledge
+    assert (stated.centre, stated.distortion) == (3.0, 0.01)
 
 
 COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, channels: [4, 5]}"

@@ -456,7 +456,7 @@ DEFAULTS = {
     "columns": 1024, "rows": 1024, "field_of_view": math.radians(20.0), "aperture": 0.025,
     "zero_magnitude_flux": 1.9e10, "read_noise": 10.0, "dark_current": 50.0, "gain": 1.0, "pedestal": 100.0,
     "bits": 12, "full_well": 20_000.0, "psf_sigma": 1.0, "psf": "integrated", "noise": "poisson",
-    "hot_pixels": (), "line_time": 0.0, "background_gradient": (0.0, 0.0),
+    "hot_pixels": (), "line_time": 0.0, "background_gradient": (0.0, 0.0), "lens": None,
 }  # fmt: skip
 RANGES = {
     "columns": (1, 16_384), "rows": (1, 16_384), "field_of_view": (1e-4, 2.8), "aperture": (1e-4, 10.0),

@@ -8,7 +8,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.lens import CameraModel, Exposures, Lens, LensError, Pinhole, _undistorted
+from knightcube.vision.camera.lens import (
+    CameraModel,
+    Exposures,
+    Lens,
+    LensError,
+    Pinhole,
+    _undistorted,
+    streak_camera,
+)
 from tests.support.compiled_forms import assert_forms_agree
 
 _PINHOLE = Pinhole.from_field_of_view(1024, 768, np.radians(20.0))
@@ -265,6 +273,36 @@ def test_points_are_exposed_as_usual_and_the_slowest_streaks_longest() -> None:
     assert EXPOSURES.at(np.radians(0.15)) == EXPOSURES.usual
     assert EXPOSURES.at(np.radians(0.2)) == EXPOSURES.most
     assert EXPOSURES.at(np.radians(90.0)) == EXPOSURES.least
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(1024, 768, 2900.0, (515.0, 380.0), 0.15, 0.4),
+        Lens(1024, 768, 2900.0, (511.5, 383.5), -2.0, 3.0),
+        Lens(1024, 768, 2900.0, (509.0, 390.0), -0.5, aspect=0.03, shear=-0.01, p1=0.04, p2=-0.02),
+    ],
+)
+def test_the_camera_for_paths_of_stars_images_like_the_lens(lens: Lens) -> None:
+    simple, points = streak_camera(lens), _points(3).reshape(20, 10, 2)
+    vectors = lens.unit_vectors(points)
+    assert np.abs(lens.ideal.project(vectors) - points).max() > 2.0
+    assert simple.unit_vectors(points) == pytest.approx(vectors, abs=1e-11)
+    assert simple.project(vectors) == pytest.approx(points, abs=1e-7)
+    assert simple.half_diagonal == pytest.approx(lens.half_diagonal, abs=1e-9)
+    assert simple.ideal == lens.ideal
+    assert streak_camera(_PINHOLE) is _PINHOLE
+
+
+def test_a_direction_beyond_the_fold_of_the_distortion_is_not_in_the_image() -> None:
+    """The lens returns NaN, and the camera for paths of stars a place outside the image."""
+    lens = Lens(1024, 768, 2900.0, (511.5, 383.5), k1=-2.4)
+    angle = np.linspace(lens.half_diagonal, 1.5, 300)
+    vectors = np.stack([np.sin(angle), np.zeros(300), np.cos(angle)], axis=1)
+    assert np.isnan(lens.project(vectors)).any()
+    places = streak_camera(lens).project(vectors)
+    assert (np.diff(places[:, 0]) > 0.0).all()
+    assert not lens.contains(places[1:]).any()
 
 
 @pytest.mark.parametrize(("k1", "k2"), [(-0.3, 0.2), (-0.2, 0.0), (0.4, -0.1), (0.1, 0.2)])

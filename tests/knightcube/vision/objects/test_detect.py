@@ -20,6 +20,7 @@ from knightcube.astro.attitude.solvers import rotation_between
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
 from knightcube.errors import ArgumentError, KnightCubeError
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
+from knightcube.vision.camera.lens import CameraModel, Lens, streak_camera
 from knightcube.vision.frame_job import run
 from knightcube.vision.objects import detect as detect_module
 from knightcube.vision.objects.detect import (
@@ -212,10 +213,12 @@ def _detect(pixels: FloatArray, rotation: FloatArray, exposure: float = 1.0) -> 
     return report
 
 
-def _turn(pixels: FloatArray, rotation: FloatArray, exposure: float) -> FloatArray:
+def _turn(
+    pixels: FloatArray, rotation: FloatArray, exposure: float, camera: CameraModel = _FRAME_CAMERA.pinhole
+) -> FloatArray:
     """Return the maximum likelihood estimate of the rotation, with the sign of the true rotation."""
     settings = LikelihoodSettings(saturation=_SETTINGS.saturation, gain=_SETTINGS.gain)
-    found = estimate_motion(pixels, _FRAME_CAMERA.pinhole, exposure, settings, rotation / exposure, 0.0)
+    found = estimate_motion(pixels, streak_camera(camera), exposure, settings, rotation / exposure, 0.0)
     assert found.rate is not None
     return np.asarray(found.rate * exposure)
 
@@ -395,22 +398,28 @@ def test_a_frame_without_streaks_has_no_report() -> None:
     assert found.covariance.shape == (0, 3, 3)
 
 
-def test_the_public_search_gives_the_direction_of_each_object_with_its_covariance() -> None:
-    exposure, pinhole = 0.5, _FRAME_CAMERA.pinhole
-    path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 25.0 / _FOCAL, 0.3), _ROTATION)
-    pixels = frame_with(_FRAME_CAMERA, _ROTATION, exposure, 5, [(path, 4.0)], _FAINTEST)
+@pytest.mark.parametrize(
+    "lens",
+    [_FRAME_CAMERA.pinhole, Lens(512, 512, _FOCAL, (262.0, 255.5), k1=-4.0, p1=0.05)],
+    ids=["pinhole", "distorted by 7 %"],
+)
+def test_the_public_search_gives_the_direction_of_each_object_with_its_covariance(lens: CameraModel) -> None:
+    exposure, camera = 0.5, dataclasses.replace(_FRAME_CAMERA, pinhole=streak_camera(lens))
+    path = object_path(camera, _PLACE, motion_across(_PLACE, 25.0 / _FOCAL, 0.3), _ROTATION)
+    pixels = frame_with(camera, _ROTATION, exposure, 5, [(path, 4.0)], _FAINTEST)
     settings = ObjectSettings(gain=_SETTINGS.gain, saturation=_SETTINGS.saturation)
-    found = detect_objects(pixels, pinhole, _turn(pixels, _ROTATION, exposure) / exposure, exposure, settings)
+    rate = _turn(pixels, _ROTATION, exposure, lens) / exposure
+    found = detect_objects(pixels, lens, rate, exposure, settings)
     assert found
     assert found.reason == ""
     assert len(found.objects) == len(found.directions) == 1
-    off = np.cross(found.directions[0], pinhole.unit_vectors(path[[0, -1]].mean(axis=0)[None])[0])
-    sigma = found.objects[0].middle_sigma / pinhole.focal_length
-    assert np.linalg.norm(off) < 3.5 * sigma < 1.0 / pinhole.focal_length
+    off = np.cross(found.directions[0], lens.unit_vectors(path[[0, -1]].mean(axis=0)[None])[0])
+    sigma = found.objects[0].middle_sigma / lens.focal_length
+    assert np.linalg.norm(off) < 3.5 * sigma < 1.0 / lens.focal_length
     spread = np.sort(np.linalg.eigvalsh(found.covariance[0]))
     assert spread == pytest.approx([0.0, sigma**2, sigma**2], abs=1e-20)
     with pytest.raises(ValueError, match="but the camera has"):
-        detect_objects(pixels[1:], pinhole, _ROTATION, exposure)
+        detect_objects(pixels[1:], lens, _ROTATION, exposure)
 
 
 @pytest.mark.parametrize(

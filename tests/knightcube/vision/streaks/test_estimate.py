@@ -30,7 +30,6 @@ from knightcube.vision.streaks.streak_result import (
     LikelihoodSettings,
     MotionResult,
     StreakStatus,
-    knowledge_of_pinhole,
 )
 from sim_hal.star_camera import StarCameraModel, scatter_hot_pixels
 from tests.flight.loop.passing import passed
@@ -565,18 +564,27 @@ def test_one_call_refuses_a_wrong_argument_by_name(given: dict[str, Any], messag
         estimate_rate(**{**usual, **given})
 
 
-def test_a_calibrated_lens_widens_the_covariance_by_what_the_pinhole_lacks() -> None:
-    scene = real_sky(60, 1.1, 60.0, 0.5)
-    pinhole = CAMERA.pinhole
-    centre = (pinhole.centre[0] + 20.0, pinhole.centre[1])
-    lens = Lens(pinhole.columns, pinhole.rows, pinhole.focal_length, centre)
-    settings = LikelihoodSettings(saturation=SATURATION)
-    sizes = []
-    for camera in (pinhole, lens):
-        found = estimate_rate(scene.pixels, camera, scene.exposure, prior_rate=scene.rate, settings=settings)
-        assert found.covariance is not None
-        sizes.append(float(np.trace(found.covariance)))
-    assert sizes[1] > sizes[0]
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(1024, 1024, 2900.0, (518.0, 505.0), k1=0.3),
+        Lens(1024, 1024, 2900.0, (511.5, 511.5), k1=-1.5, k2=4.0),
+        Lens(1024, 1024, 2900.0, (511.5, 511.5), aspect=0.01, shear=4e-3, p1=0.02, p2=-0.01),
+    ],
+    ids=["off-axis", "barrel", "pixels and tangential"],
+)
+def test_the_distortion_of_a_lens_is_corrected(lens: Lens) -> None:
+    """The covariance is right, and the same as that of a pinhole within a factor of 1.5."""
+    knowledge = CameraKnowledge(centre=0.1, distortion=1e-4)
+    settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0, knowledge=knowledge)
+    scene, ideal = (real_sky(61, 1.1, 140.0, 0.5, replace(CAMERA, lens=each)) for each in (lens, None))
+    found = estimate_rate(scene.pixels, lens, scene.exposure, prior_rate=scene.rate, settings=settings)
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert _squared(found.rate - scene.rate, found.covariance) < 16.3
+    best = estimate_rate(ideal.pixels, CAMERA.pinhole, 0.5, prior_rate=ideal.rate, settings=settings)
+    assert best.covariance is not None
+    assert float(np.trace(found.covariance)) < 1.5**2 * float(np.trace(best.covariance))
 
 
 @pytest.mark.parametrize("error", [-0.03, 0.02])
@@ -595,13 +603,3 @@ def test_a_stated_error_of_the_focal_length_is_part_of_the_covariance(error: flo
     assert certain.rate is not None
     assert certain.covariance is not None
     assert _squared(certain.rate - scene.rate, certain.covariance) > 16.3
-
-
-def test_the_knowledge_of_a_pinhole_adds_the_offset_and_the_distortion_of_the_lens() -> None:
-    knowledge = CameraKnowledge(0.001, 3.0, 0.004, None)
-    lens = Lens(1001, 601, 1000.0, (504.0, 300.0), 0.01, 0.02)
-    found = knowledge_of_pinhole(knowledge, lens)
-    square = (500.0**2 + 300.0**2) / 1000.0**2
-    assert found.focal_length == 0.001
-    assert found.centre == pytest.approx(5.0)
-    assert found.distortion == pytest.approx(np.hypot(0.004, square * (0.01 + square * 0.02)))

@@ -13,14 +13,13 @@ from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
-from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
+from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge, DistortedPinhole
 from knightcube.vision.streaks import uncertainty
 from knightcube.vision.streaks.camera_motion import CameraMotion, Vibration
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.fit_windows import Strips
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import (
-    DistortedPinhole,
     PsfProfile,
     Shutter,
     StreakScene,
