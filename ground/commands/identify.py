@@ -20,7 +20,7 @@ from flight.app.cli.run import progress_on, seed_number
 from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig, TestbedConfig
-from flight.schema.document import config_path
+from flight.schema.document import config_path, read_text
 from ground.commands.options import check_new, check_picture, positive, print_result, write_new
 from ground.identification.fit import (
     DURATION,
@@ -39,7 +39,7 @@ from ground.identification.fit import (
     prior_of,
 )
 from ground.identification.orbit import LearnedDescription, LearnedQuantity, fragment, learned_description
-from ground.identification.record import Record, read_record
+from ground.identification.record import IdentificationError, Record, read_record, reported_problems
 from ground.telemetry import read_run
 from knightcube.errors import UsageError
 
@@ -68,6 +68,7 @@ class _Identified:
     record: Record
     found: PlantFit
     plant: AbsolutePlant
+    reported: list[str]
 
     @property
     def fragment(self) -> str:
@@ -177,7 +178,12 @@ def _fly(options: argparse.Namespace) -> Path:
     from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
     from flight.app.run import default_folder  # noqa: PLC0415
 
-    config = excitation_config(configuration.load_testbed(options.source), options.duration or DURATION)
+    given = configuration.load_testbed(options.source)
+    if given.simulation is not None:  # so that an error names the user's file and line
+        from sim_hal.rig import SimulationRequest  # noqa: PLC0415 - loads the simulator
+
+        SimulationRequest(options.source, read_text(options.source), Path()).section()
+    config = excitation_config(given, options.duration or DURATION)
     out = options.run or default_folder(Path(f"{options.source.stem}-identify"))
     with_line = sys.stderr.isatty()
     with tempfile.TemporaryDirectory() as place:
@@ -196,17 +202,23 @@ def _fly(options: argparse.Namespace) -> Path:
 
 def _identify(folder: Path) -> _Identified:
     config = configuration.load_testbed(folder / "config.yaml")
-    record = read_record(read_run(folder), config.coils.stale_after)
+    run = read_run(folder)
+    record, reported = read_record(run, config.coils.stale_after), reported_problems(run)
 
     def show_round(count: int, step: float) -> None:
         sys.stderr.write(f"\r\x1b[Kfitting, round {count + 1}: the last step was {step:.2g} sigma")
         sys.stderr.flush()
 
     with_line = sys.stderr.isatty()
-    found = fit(record, noise_of(config), show_round if with_line else None)
+    try:
+        found = fit(record, noise_of(config), show_round if with_line else None)
+    except IdentificationError as error:
+        because = f"; the flight reported {'; '.join(reported)}" if reported else ""
+        raise IdentificationError(f"{error}{because}") from error
     if with_line:
         sys.stderr.write("\r\x1b[K")
-    return _Identified(folder, config, record, found, absolute(found, prior_of(config), record.field))
+    plant = absolute(found, prior_of(config), record.field)
+    return _Identified(folder, config, record, found, plant, reported)
 
 
 def _facts(made: _Identified) -> dict[str, Any]:
@@ -231,6 +243,7 @@ def _facts(made: _Identified) -> dict[str, Any]:
         "noise": asdict(found.noise),
         "gone_over": len(found.innovations.restarts),
         "innovations": {**asdict(found.whiteness), "white": found.whiteness.passed},
+        "reported": made.reported,
         "fragment": made.fragment,
     }
 
@@ -241,6 +254,7 @@ def _text(made: _Identified) -> str:
     lines = [
         f"flight: {made.folder}, {len(record.time)} samples in {record.time[-1] - record.time[0]:.0f} s, "
         f"{len(found.innovations.restarts)} restarts of the filter",
+        *(f"reported by the flight: {one}" for one in made.reported),
         "",
         "from the motion, divided by the inertia:",
     ]
@@ -253,9 +267,11 @@ def _text(made: _Identified) -> str:
         label, value = name.replace("_", " ") + ":", f"{scaled.value:12.5e} +- {scaled.sigma:.1e} {unit}"
         lines.append(f"  {label:18s}{value:34s} {sources[name]}")
     if field is None:
-        lines += ["", "field:  not measured because the coils were never off long enough: as configured"]
+        why = "the coils were never off long enough, or the field did not rotate with the body"
+        lines += ["", f"field:  not measured because {why}: as configured"]
     else:
         measured = f"{1e4 * field.magnitude:.4f} gauss from the magnetometer"
+        measured += f" less its offset of {1e4 * field.offset:.4f} gauss" if field.offset else ""
         lines += ["", f"field:  {measured}, with a scale error of {100.0 * MAGNETOMETER_ERROR:g} %"]
     verdict = "are white" if found.whiteness.passed else "are NOT white: the errors are increased accordingly"
     lines.append(

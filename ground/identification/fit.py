@@ -86,10 +86,10 @@ _PRIOR_SIGMA = np.array([math.inf, math.inf, math.inf, 1.0, 0.1, 0.02])
 _NOISE_PRIOR = math.log(3.0)  # prior standard deviation of the logarithms of the noise levels
 _MAX_DELAY = 0.1
 _CONVERGED = 0.01  # step size (standard deviations) below which the fit has converged
-_MAX_ROUNDS = 25
+_MAX_ROUNDS = 50
 _NOISE_STEP = 0.02
 _NOISE_CONVERGED = 0.01
-_GATES = (30.0, 8.0)
+_GATES = (30.0, 8.0, 8.0)
 """Outlier gates in standard deviations of the innovations, first with assumed, then with estimated noise."""
 _MAX_RESTARTS = 0.02  # largest fraction of samples at which the filter may restart
 _LAGS = 20  # number of lags of the whiteness test
@@ -337,15 +337,16 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
         if largest > 3.0 and count < 2:
             continue
         if len(gates) == len(_GATES):
-            restarts = _gated(record, constants, noise, restarts, gates.pop(0))
+            restarts = _gated(record, constants, noise, gates.pop(0))
         likelier = _noise(record, constants, noise, assumed, restarts)
         settled = float(np.max(np.abs(likelier.to_logarithms() - noise.to_logarithms()))) < _NOISE_CONVERGED
         noise = likelier
         if settled and largest < _CONVERGED:
-            gated = _gated(record, constants, noise, restarts, gates.pop(0)) if gates else restarts
+            # Samples that differed from the motion of earlier constants may agree with the present ones.
+            gated = _gated(record, constants, noise, gates.pop(0)) if gates else restarts
             if gated == restarts:
                 return _finished(record, constants, noise, restarts)
-            restarts = gated
+            restarts, share = gated, 1.0
     raise IdentificationError(
         f"the fit of the constants failed: in iteration {_MAX_ROUNDS} they still changed by "
         f"{largest:.2g} standard deviations"
@@ -371,14 +372,12 @@ def first_guess(record: Record) -> MotionConstants:
     return MotionConstants(*(float(value) for value in found))
 
 
-def _gated(
-    record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
-) -> frozenset[int]:
-    """Return the restarts, with the samples beyond the gate.
+def _gated(record: Record, constants: MotionConstants, noise: MotionNoise, gate: float) -> frozenset[int]:
+    """Return the samples beyond the gate, at which the filter restarts.
 
     Raises IdentificationError if they are too many.
     """
-    passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
+    passed = innovations(record, constants, noise, gate=gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(
             f"the fit of the constants failed: {len(passed.restarts)} of {len(record.time)} samples differ "

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.link.telemetry.packets import PacketArray
+from flight.link.events import Severity
+from flight.link.telemetry.packets import PacketArray, to_text
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.errors import KnightCubeError, UsageError
@@ -41,11 +42,19 @@ class IdentificationError(KnightCubeError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizontalField:
-    """Measured horizontal field, T, its standard deviation from the scatter, T, and the number of samples."""
+    """Measured horizontal field.
+
+    Attributes:
+        magnitude: field, T.
+        sigma: standard deviation of the magnitude from the scatter, T.
+        samples: number of samples.
+        offset: offset of the magnetometer that is subtracted, T; 0 without a significant offset.
+    """
 
     magnitude: float
     sigma: float
     samples: int
+    offset: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +96,10 @@ def read_record(run: Run, stale_after: float) -> Record:
         )
     _refuse_impossible(run, label)
     if np.any(control["current_written"][:, 1:].astype(float)):
-        raise UsageError(
-            f"{run.folder}: coils y or z were driven; identification needs a flight with coil x only"
-        )
+        why = next((text for text in reported_problems(run) if text.startswith("coil-broken")), "")
+        because = f", because the flight reported {why}: repair the coil, and fly again" if why else ""
+        cure = because or "; identification needs a flight with coil x only"
+        raise UsageError(f"{run.folder}: coils y or z were driven{cure}")
     time = _sample_times(imu)
     once = np.append(True, np.diff(np.maximum.accumulate(time)) > 0.0)
     time, imu = time[once], imu[once]
@@ -100,19 +110,31 @@ def read_record(run: Run, stale_after: float) -> Record:
             f"identification needs {MIN_SAMPLES} samples and no gap above {_MAX_GAP:g} s"
         )
     quaternion = imu["quaternion"].astype(float)
+    angle = np.unwrap(2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3]))
     saturation = float(label["supply_voltage"][0] / label["coil_resistance"][0, 0])
     limit = min(float(label["current_limit"][0]), saturation)
     switch_time, current, clipped = _currents(control, stale_after, limit)
     return Record(
         time=time,
-        angle=np.unwrap(2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3])),
+        angle=angle,
         rate=imu["rate"][:, 1].astype(float),
         switch_time=switch_time,
         current=current,
         clipped=clipped,
         period=float(label["control_period_ns"][0]) * 1e-9,
-        field=_field(time, imu["field"].astype(float), switch_time, current),
+        field=_field(time, imu["field"].astype(float), angle, switch_time, current),
     )
+
+
+def reported_problems(run: Run) -> list[str]:
+    """Return name, count and first text of each kind of warning and fault that a flight reported."""
+    events = run["event"]
+    events = events[events["severity"] >= Severity.WARNING]
+    names, first, counts = np.unique(events["name"], return_index=True, return_counts=True)
+    return [
+        f"{to_text(names[k])} ({counts[k]}): {to_text(events['text'][first[k]])}"
+        for k in np.argsort(first).tolist()
+    ]
 
 
 def _refuse_impossible(run: Run, label: PacketArray) -> None:
@@ -171,10 +193,21 @@ def _currents(
     )
 
 
+_OFFSET_SIGMAS, _OFFSET_SHARE, _MOST_OFFSET = 6.0, 0.01, 0.5
+"""Smallest significance of an offset of the magnetometer, and its smallest and largest share of the field."""
+_LEAST_ROTATION = 0.1
+"""Smallest rotation (rad, standard deviation) that separates an offset of the magnetometer from the field."""
+
+
 def _field(
-    time: FloatArray, field: FloatArray, switch_time: FloatArray, current: FloatArray
+    time: FloatArray, field: FloatArray, angle: FloatArray, switch_time: FloatArray, current: FloatArray
 ) -> HorizontalField | None:
-    """Return the mean horizontal field (perpendicular to the thread, axis y) while the coils are off."""
+    """Return the mean horizontal field (perpendicular to the thread, axis y) while the coils are off.
+
+    The field rotates with the body, whose rotation about the thread is `angle` (n,), rad, but an offset of
+    the magnetometer does not. If the rotations show a significant offset, the offset is subtracted. Returns
+    None if the coils were never off, or if most of the measured field does not rotate with the body.
+    """
     on = np.flatnonzero(current)
     since = np.full(len(switch_time), -np.inf)  # end of the last non-zero current
     if len(on):
@@ -186,7 +219,18 @@ def _field(
     off &= time - since[np.maximum(at, 0)] > _SETTLED_FIELD
     if np.count_nonzero(off) < 20:
         return None
-    magnitude = np.hypot(field[off, 0], field[off, 2])
+    complex_field = field[off, 0] + 1j * field[off, 2]
+    terms = np.stack([np.exp(1j * angle[off]), np.ones(np.count_nonzero(off))], axis=1)
+    (rotating, offset), *_ = np.linalg.lstsq(terms, complex_field, rcond=None)
+    residual = float(np.sqrt(np.mean(np.abs(complex_field - terms @ [rotating, offset]) ** 2)))
+    inverse = np.linalg.pinv(terms.conj().T @ terms).real
+    sigmas = residual * np.sqrt(np.diag(inverse))
+    strength, constant = float(abs(rotating)), float(abs(offset))
+    rotated = float(np.std(angle[off])) > _LEAST_ROTATION
+    if rotated and constant > max(_OFFSET_SIGMAS * float(sigmas[1]), _OFFSET_SHARE * strength):
+        corrected = HorizontalField(strength, float(sigmas[0]), len(complex_field), constant)
+        return corrected if constant < _MOST_OFFSET * strength else None
+    magnitude = np.abs(complex_field)
     sigma = float(np.std(magnitude, ddof=1) / np.sqrt(len(magnitude)))
     return HorizontalField(float(np.mean(magnitude)), sigma, len(magnitude))
 

@@ -102,6 +102,20 @@ def test_a_mistake_is_one_line_and_exit_status_2(flown: tuple[Path, dict[str, ob
         assert done.stderr.count("\n") == 1
 
 
+def test_a_flight_with_a_broken_coil_names_what_the_flight_reported(tmp_path: Path) -> None:
+    """The flight drives the other coils after it has isolated the coil."""
+    config = tmp_path / "broken.yaml"
+    config.write_text(DEMO.read_text() + "  faults: [{fault: 'coil-x: open'}]\n")
+    done = command("identify", config, "--duration", "40", "--run", tmp_path / "run")
+    assert done.returncode == 2
+    assert "because the flight reported coil-broken (1): coil x" in done.stderr
+    assert "repair the coil, and fly again" in done.stderr
+    config.write_text(DEMO.read_text() + "  faults: [{fault: 'imu: slow', n: 2}]\n")
+    done = command("identify", config, "--run", tmp_path / "other")
+    assert done.returncode == 2
+    assert f"{config}:{len(config.read_text().splitlines())}: `simulation.faults[0].n`" in done.stderr
+
+
 def test_a_flight_too_short_to_fit_is_one_line_and_exit_status_1(tmp_path: Path) -> None:
     done = command("identify", DEMO, "--duration", "3", "--run", tmp_path / "run", "--out", tmp_path / "x")
     assert done.returncode == 1
@@ -149,10 +163,11 @@ def test_the_output_names_the_files_unless_it_is_one_json_object(
 # Texts and values of artificial results.
 
 
-def made(*, white: bool = True, field: bool = True) -> _Identified:
+def made(*, white: bool = True, field: bool = True, offset: float = 0.0) -> _Identified:
     """Return an artificial identification."""
     count = 5
-    measured = HorizontalField(4.567e-5, 1.2e-7, 80) if field else None
+    measured = HorizontalField(4.567e-5, 1.2e-7, 80, offset) if field else None
+    reported = ["imu-silent (2): no byte for 0.12 s"] if offset else []
     time = np.linspace(10.0, 52.0, count)
     record = Record(time, time, time, time, time, np.zeros(count, bool), 0.025, measured)
     innovations: Any = SimpleNamespace(restarts=frozenset({1, 3}))
@@ -173,7 +188,7 @@ def made(*, white: bool = True, field: bool = True) -> _Identified:
         field,
         np.eye(6),
     )
-    return _Identified(Path("runs/one"), demo_config(10.0, camera=False), record, fit, plant)
+    return _Identified(Path("runs/one"), demo_config(10.0, camera=False), record, fit, plant, reported)
 
 
 def test_the_text_states_each_constant_with_its_uncertainty_and_its_configured_value() -> None:
@@ -197,8 +212,15 @@ def test_the_text_states_each_constant_with_its_uncertainty_and_its_configured_v
 def test_the_text_warns_of_coloured_innovations_and_of_a_field_that_was_not_measured() -> None:
     text = identify._text(made(white=False, field=False))
     assert "the innovations are NOT white: the errors are increased accordingly\n" in text
-    assert "field:  not measured because the coils were never off long enough: as configured\n" in text
+    assert "field:  not measured because the coils were never off long enough, or the field did not" in text
     assert "75 % prior, 25 % motion with inertia and dipole" in text
+
+
+def test_the_text_names_what_the_flight_reported_and_the_offset_of_the_magnetometer() -> None:
+    lines = identify._text(made(offset=1e-5)).splitlines()
+    assert lines[1] == "reported by the flight: imu-silent (2): no byte for 0.12 s"
+    assert lines[19].startswith("field:  0.4567 gauss from the magnetometer less its offset of 0.1000 gauss,")
+    assert identify._facts(made(offset=1e-5))["reported"] == ["imu-silent (2): no byte for 0.12 s"]
 
 
 def test_the_json_object_has_the_values_of_the_text() -> None:

@@ -110,6 +110,17 @@ def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
     assert error @ np.linalg.solve(made.covariance[:3, :3], error) < chi2.ppf(0.999, 3)
 
 
+def test_a_gap_in_the_samples_does_not_bias_the_fit() -> None:
+    """In the gap, the prediction by the first constants is far off, but not that by the final constants."""
+    record = fly_bare(USUAL, 60.0)
+    kept = (record.time < 15.0) | (record.time > 27.0)
+    gap = replace(record, time=record.time[kept], angle=record.angle[kept], rate=record.rate[kept])
+    made = fit(gap, NOISE)
+    assert len(made.innovations.restarts) == 0
+    error = motion_error(USUAL, made.constants)
+    assert error @ np.linalg.solve(made.covariance[:3, :3], error) < chi2.ppf(0.999, 3)
+
+
 def test_coloured_noise_is_noticed_and_the_uncertainty_grows() -> None:
     """Coloured noise is detected and increases the uncertainty.
 

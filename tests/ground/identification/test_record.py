@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,24 @@ def test_without_commands_the_coil_falls_to_zero_as_the_driver_lets_it(short: Ru
     at = int(np.searchsorted(record.switch_time, 12.5)) - 1
     assert record.current[at] == 0.0
     assert record.switch_time[at] == pytest.approx(11.975 + 0.25)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_an_offset_of_the_magnetometer_does_not_rotate_and_is_subtracted(short: Run, share: float) -> None:
+    """The field rotates with the body. Without a rotating field, the magnetometer measures no field."""
+    quiet = np.zeros_like(short["control"]["current_written"])
+    stilled = altered(short, "control", current_written=quiet, current_command=quiet)
+    imu = short["imu"]
+    offset = np.array([3e-5, 5e-5, 6e-5])
+    still = np.array([2e-4, 0.0, 4e-4])
+    field = imu["field"] + offset if share else imu["field"]
+    record = recorded(altered(stilled, "imu", field=np.tile(still, (len(imu), 1)) if share == 1.0 else field))
+    if share == 1.0:
+        assert record.field is None
+        return
+    assert record.field is not None
+    assert record.field.magnitude == pytest.approx(4.5e-4, rel=5e-3)
+    assert record.field.offset == pytest.approx(math.hypot(3e-5, 6e-5) if share else 0.0, rel=0.05)
 
 
 def test_the_field_is_taken_only_while_the_coils_are_off(short: Run) -> None:

@@ -61,7 +61,7 @@ def flown(cycles: list[tuple[float, float, float]], samples: int = 240, **label:
                 "device_time_ns": 7_000_000_000 + 25_000_000 * k,
                 "quaternion": [0.0, math.sin(0.01 * k), 0.0, math.cos(0.01 * k)],
                 "rate": [0.0, 0.8, 0.0],
-                "field": [3e-5, 9e-5, 4e-5],
+                "field": [5e-5 * math.cos(0.02 * k), 9e-5, 5e-5 * math.sin(0.02 * k)],
             },
         )
         for k in range(samples)
