@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.link.telemetry.definitions import EVENT
-from flight.link.telemetry.log import find_segments
+from flight.link.telemetry.log import find_runs, find_segments
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     LAYOUTS,
@@ -151,13 +151,22 @@ class Run:
         return LAYOUTS[name].array(b"")
 
 
+def flight_segments(folder: Path) -> list[Path]:
+    """Return the segments of the flight log in a run's folder. Raises UsageError if there are none."""
+    segments = find_segments(folder, "flight")
+    if not segments:
+        runs = find_runs(folder) if folder.is_dir() else []
+        cure = f": give the folder of one run of this archive, such as {runs[-1]}" if runs else ""
+        raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder{cure}")
+    return segments
+
+
 def read_run(folder: Path) -> Run:
     """Read a run's folder. Raises UsageError if the folder has no flight log with a valid packet."""
     folder = Path(folder)
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a run (option --out of the run)")
-    if not find_segments(folder, "flight"):
-        raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder")
+    flight_segments(folder)
     logs = []
     for stem in ("flight", "truth", "performance"):
         try:

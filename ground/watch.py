@@ -33,7 +33,7 @@ from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
-from ground.telemetry import decode, scan
+from ground.telemetry import decode, flight_segments, scan
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -73,10 +73,11 @@ class LogTail:
     def __init__(self, folder: Path) -> None:
         """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""
         if not folder.is_dir():
-            raise UsageError(f"{folder}: no such folder; give the folder of a run, or a flight's socket")
-        segments = find_segments(folder, "flight")
-        if not segments:
-            raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder")
+            problem = (
+                "no such folder or socket; give the folder of a run, or the socket of a flight in progress"
+            )
+            raise UsageError(f"{folder}: {problem}")
+        segments = flight_segments(folder)
         self._folder = folder
         self._path = segments[0]
         self._offset = 0

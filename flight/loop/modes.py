@@ -499,7 +499,8 @@ class ModeControl:
         """
         trigger = COMMANDS.get(mode)
         if trigger is None or mode not in self._modes:
-            return f"{mode.label} cannot be commanded" + (" of this body" if trigger else "")
+            allowed = ", ".join(one.label for one in COMMANDS if one in self._modes and one is not Mode.SLEW)
+            return f"{mode.label} cannot be commanded" + (f" of this body: use {allowed}" if trigger else "")
         answer = self._machine.answer(trigger)
         if answer is TriggerAnswer.REFUSE:
             return f"not while in {self.mode.label}"

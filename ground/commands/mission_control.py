@@ -27,7 +27,7 @@ from ground.commands.options import count, positive
 from ground.link.commanding import terminal_of
 from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.link.terminal import DEFAULTS
-from ground.telemetry import decode
+from ground.telemetry import decode, flight_segments
 from ground.xtce import EPOCH
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -171,10 +171,7 @@ def _failed(process: subprocess.Popen[bytes]) -> bool:
 
 
 def _packets(run: Path) -> list[bytes]:
-    segments = find_segments(run, "flight")
-    if not segments:
-        raise UsageError(f"{run}: no flight log (flight-0001{SUFFIX}) in this folder")
-    data = b"".join(path.read_bytes() for path in segments)
+    data = b"".join(path.read_bytes() for path in flight_segments(run))
     return [data[begin:end] for _, begin, end in walk(data)]
 
 

@@ -53,6 +53,7 @@ from flight.link.security import (
     Vault,
     new_key,
 )
+from flight.link.telemetry.log import find_runs, find_segments
 from flight.link.telemetry.packets import CRC_BYTES
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse, peer_networks
@@ -86,6 +87,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def link(options: argparse.Namespace) -> int:
     """Run the link until a signal arrives. Raises ConfigError, and KnightCubeError for other errors."""
+    if options.log.exists() and not options.log.is_dir():
+        raise ConfigError(f"--log {options.log}", "is not the folder of a run or of an archive")
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -115,6 +118,8 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
         stack.callback(overseer.stopping)
         status = f"link open on {names}"
         _say("; ".join(filter(None, (status, retry.summary()))))
+        if not find_segments((find_runs(log) or [log])[-1], "flight"):
+            _say(f"--log {log}: no flight log yet: telemetry begins with the flight log in this folder")
         overseer.ready(status)
         release = FlownRelease(os.environ)
         if release.note:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from flight.app.cli import main
 from flight.link.security import Vault
 from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
@@ -102,6 +103,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
     while "link open on UDP" not in (line := service.says("")):
         assert "cannot start yet" in line
     assert "started at attempt" in line
+    service.says(f"--log {place}: no flight log yet")
     service.notifies("READY=1")
     for _ in range(2):
         service.notifies("WATCHDOG=1")
@@ -167,6 +169,12 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
     assert service.process.wait(_LONGEST_S) == 0
     assert service.process.stderr is not None
     assert "stopped before the start: link.tcp" in service.process.stderr.read()
+
+
+def test_a_log_that_is_not_a_folder_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = write_linked_config(place)
+    assert main(["link", str(config), "--log", str(config)]) == 2
+    assert f"--log {config}: is not the folder of a run" in capsys.readouterr().err
 
 
 def test_each_call_of_a_start_fails_once_and_the_whole_disk_for_a_while(tmp_path: Path) -> None:
