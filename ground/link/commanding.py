@@ -16,7 +16,7 @@ from pathlib import Path
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files import units
-from flight.link.files.store import Store
+from flight.link.files.store import FileError, Store, write_whole
 from flight.link.files.transfer import CRC32, GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
 from flight.link.frames import LONGEST_FRAME, TELECOMMAND_MASK
 from flight.link.process import directives
@@ -35,6 +35,7 @@ from flight.link.security import (
     new_key,
 )
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
+from flight.link.telemetry.log import SUFFIX
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
 from flight.schema.reader import load
 from ground.link.terminal import (
@@ -305,7 +306,7 @@ class FileSession:
         self._sealer = terminal.sealer(spi, _BLOCK)
         self._units = units.UnitPacker(units.UP)
         self._wanted = {LISTING}
-        self.received = store.received
+        self._store, self.received = store, store.received
         unit_bytes = terminal.packet_bytes - units.UNIT_OVERHEAD_BYTES
         self.entity = Entity(GROUND, store, self._may_come, LONGEST_FILE, now_ns, unit_bytes)
         self.received_ns = now_ns
@@ -421,8 +422,23 @@ class FileSession:
         return self.ended(name) or completed
 
     def close(self, now_ns: int) -> None:
-        """Store the received data."""
+        """Store the received data, and the beginnings of incomplete logs as received logs.
+
+        A flight log is readable up to its last whole packet, so that its beginning can be evaluated before
+        the transfer is complete. Raises FileError if the disk cannot be written.
+        """
         self.entity.close(now_ns)
+        for record in self._store.incoming():
+            if record.finished is None and record.name is not None and record.name.endswith(SUFFIX):
+                count = next((end for begin, end in record.ranges if begin == 0), 0)
+                place = self._store.received / record.name
+                try:
+                    if count > (place.stat().st_size if place.exists() else 0):
+                        place.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                        with self._store.part(record).open("rb") as file:
+                            write_whole(place, file.read(count))
+                except OSError as error:
+                    raise FileError(f"{place}: cannot be written: {error.strerror or error}") from error
 
 
 def sha256_of(path: Path) -> bytes:

@@ -78,7 +78,7 @@ def test_a_folder_without_a_run_is_a_clear_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no flight log"):
         read_run(tmp_path)
     (tmp_path / "archive/run-000007").mkdir(parents=True)
-    with pytest.raises(UsageError, match="one run of this archive, such as .*archive/run-000007"):
+    with pytest.raises(UsageError, match=r"one run of this archive, such as .*archive/run-000007"):
         read_run(tmp_path / "archive")
     (tmp_path / "flight-0001.ccsds").write_bytes(b"not a log")
     with pytest.raises(UsageError, match="no valid packet in the 9 bytes"):

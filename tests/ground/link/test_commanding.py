@@ -15,7 +15,7 @@ from typing import Any, cast
 import pytest
 
 from flight.link.commands import Ping, unpack
-from flight.link.files.store import Store
+from flight.link.files.store import Incoming, Store
 from flight.link.files.units import DOWN, UP, UnitPacker, is_unit
 from flight.link.frames import LONGEST_FRAME
 from flight.link.process import directives
@@ -300,6 +300,31 @@ def test_a_failed_transfer_waits_for_the_reason_of_the_satellite(tmp_path: Path)
     files.take([(0, packet)], 1)
     with pytest.raises(KnightCubeError, match="a: a exists on board"):
         files.ended("a", 7)
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges", "earlier", "kept"),
+    [
+        ("log/flight-0001.ccsds", ((0, 6), (8, 10)), b"", b"012345"),
+        ("log/flight-0001.ccsds", ((0, 6),), b"0123456", b"0123456"),
+        ("log/flight-0001.ccsds", ((2, 6),), b"", b""),
+        ("log/config.yaml", ((0, 6),), b"", b""),
+    ],
+)
+def test_the_beginning_of_an_incomplete_log_can_be_evaluated(
+    tmp_path: Path, name: str, ranges: tuple[tuple[int, int], ...], earlier: bytes, kept: bytes
+) -> None:
+    store = Store(tmp_path)
+    record = Incoming(1, 7, name=name, size=10, kind=0, ranges=ranges)
+    store.save(record)
+    store.part(record).write_bytes(b"0123456789")
+    place = store.received / name
+    if earlier:
+        place.parent.mkdir()
+        place.write_bytes(earlier)
+    session(tmp_path, terminal()).close(1)
+    assert (place.read_bytes() if place.exists() else b"") == kept
+    assert store.part(record).exists(), "the transfer continues"
 
 
 def test_units_of_an_unknown_kind_are_ignored(tmp_path: Path) -> None:
