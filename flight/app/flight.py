@@ -8,6 +8,7 @@ The function `open_flight` opens logs, guardian, devices, workers and channels, 
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import math
 import os
@@ -18,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
@@ -300,7 +301,7 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
     """Open a flight. The run folder is removed from the archive if the opening fails."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
-    request, earlier = _begin_folder(judged.request, judged.merged, config)
+    request, earlier = _begin_folder(judged.request, judged.merged, config, stack)
     unflown = stack.enter_context(ExitStack())
     if request.archive is not None:
         unflown.callback(rmtree, request.out, ignore_errors=True)
@@ -656,13 +657,16 @@ _NEWEST = 4
 """Number of newest runs whose folders are searched for the number of the last boot."""
 
 
-def _begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:
+def _begin_folder(
+    request: RunRequest, text: str, config: Config, stack: ExitStack
+) -> tuple[RunRequest, list[Path]]:
     """Create the folder of the run, which is the next folder of the archive if there is an archive.
 
     Return the request with the path of the new folder, and the folders of the newest earlier runs.
 
-    Raises UsageError for a folder that already contains a run, and for a folder that cannot be written. A
-    flight computer with an archive flies despite disk errors, and its logs wait until the disk works.
+    Raises UsageError for a folder that already contains a run or that another flight uses, and for a folder
+    that cannot be written. A flight computer with an archive flies despite disk errors, and its logs wait
+    until the disk works.
     """
     earlier: list[Path] = []
     if request.archive is not None:
@@ -675,12 +679,28 @@ def _begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRe
         raise UsageError(f"{out} already contains a run: give another folder, or remove this one")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "config.yaml").write_text(text, encoding="utf-8")
+        file = stack.enter_context((out / "config.yaml").open("a", encoding="utf-8"))
+        _lock(out, file)
+        file.truncate(0)
+        file.write(text)
+        file.flush()
     except OSError as error:
         if request.archive is not None and error.errno in DISK_TROUBLE:
             return request, earlier
         raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
     return request, earlier
+
+
+def _lock(out: Path, file: IO[str]) -> None:
+    """Lock the folder of a run by its open file `config.yaml`. Raises UsageError for a folder in use."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UsageError(f"{out}: another flight uses this folder: give another folder") from error
+    except OSError:  # a file system without locks
+        return
+    if any(out.glob("*.ccsds")):  # a flight that ended since the folder was searched
+        raise UsageError(f"{out} already contains a run: give another folder, or remove this one")
 
 
 def _open_log(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -61,5 +62,10 @@ def utc_ns() -> int:
 
 
 def default_folder(config_path: Path) -> Path:
-    """Return the default folder of a run, which is named after its configuration and the time."""
-    return Path("runs") / f"{config_path.stem}-{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
+    """Return the default folder of a run, which is named after its configuration and the time.
+
+    If the folder exists already, because another flight began in the same second, a number is added.
+    """
+    name = f"{config_path.stem}-{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(folder for folder in (Path("runs") / one for one in names) if not folder.exists())

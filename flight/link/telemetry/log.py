@@ -486,7 +486,7 @@ def _clear(folder: Path, stem: str, overwrite: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     old = find_segments(folder, stem)
     if old and not overwrite:
-        raise UsageError(f"{old[0]} exists: give another folder, or ask for it to be overwritten")
+        raise UsageError(f"{old[0]} exists: give another folder, or remove the log")
     for path in old:
         path.unlink()
 

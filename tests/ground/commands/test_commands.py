@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import os
@@ -16,6 +17,7 @@ import pytest
 
 from flight.app.cli import main
 from flight.app.cli.run import progress_on
+from flight.app.run import default_folder
 from flight.loop.flight_loop import FlightProgress
 from ground.telemetry import read_run
 from tests.ground.report.synthetic import Recipe, make_run
@@ -90,6 +92,33 @@ def test_a_mistake_is_one_line_and_exit_status_2(
     assert complaint in error
     assert error.count("\n") == 1
     assert output == ""
+
+
+def test_a_folder_of_a_starting_flight_keeps_its_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The flight that is about to start has not yet opened its log."""
+    with (tmp_path / "config.yaml").open("w") as file:
+        file.write("name: mine\n")
+        file.flush()
+        fcntl.flock(file, fcntl.LOCK_EX)
+        status, _, error = obeyed(capsys, "run", DEMO, "--duration", "1", "--out", tmp_path)
+    assert status == 2
+    assert "another flight uses this folder: give another folder" in error
+    assert (tmp_path / "config.yaml").read_text() == "name: mine\n"
+
+
+def test_flights_of_one_second_have_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flight.app.run.utc_ns", lambda: 1_700_000_000 * 10**9)
+    names = []
+    for _ in range(3):
+        folder = default_folder(Path("config/orbit.yaml"))
+        folder.mkdir(parents=True)
+        names.append(folder.name)
+    assert names == [f"orbit-20231114-221320{end}" for end in ("", "-2", "-3")]
 
 
 def test_a_run_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
