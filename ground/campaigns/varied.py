@@ -9,7 +9,7 @@ import re
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from textwrap import fill
@@ -53,12 +53,14 @@ class Variation:
         text: text of the distribution as given by the user.
         draw: function that returns the drawn value, given a random generator and the configured number.
         relative: whether the drawn value depends on the configured number.
+        choices: the values of a distribution `a|b|c`; empty for other distributions.
     """
 
     key: str
     text: str
     draw: Draw
     relative: bool
+    choices: tuple[Any, ...] = ()
 
 
 def variation_of(text: str) -> Variation:
@@ -66,25 +68,28 @@ def variation_of(text: str) -> Variation:
     key, equals, spread = (part.strip() for part in text.partition("="))
     if not equals or not re.fullmatch(r"\w+(\.\w+|\[\d+\])*", key):
         raise UsageError(f"--vary {text!r}: give {_FORMS}")
+    if "|" in spread:
+        scalars = (read_document(f"value: {one.strip()}\n", "value") for one in spread.split("|"))
+        values = tuple(scalar.values["value"] for scalar in scalars)
+        return Variation(
+            key, spread, lambda chance, _: values[int(chance.integers(len(values)))], False, values
+        )
     found = _distribution(spread)
     if found is None:
-        raise UsageError(f"--vary {text!r}: the distribution {spread!r} is not known: give {_FORMS}")
+        wrong = "has its limits in the wrong order, or a limit of 0" if ".." in spread else "is not known"
+        raise UsageError(f"--vary {text!r}: the distribution {spread!r} {wrong}: give {_FORMS}")
     return Variation(key, spread, *found)
 
 
 def _distribution(spread: str) -> tuple[Draw, bool] | None:
     """Return the attributes `draw` and `relative` of a variation, or None for an unknown distribution."""
-    if "|" in spread:
-        scalars = (read_document(f"value: {one.strip()}\n", "value") for one in spread.split("|"))
-        values = [scalar.values["value"] for scalar in scalars]
-        return (lambda chance, _: values[int(chance.integers(len(values)))]), False
     if found := re.fullmatch(rf"(log )?({_NUMBER})\.\.({_NUMBER})", spread):
         low, high = float(found[2]), float(found[3])
         return None if not low < high or (found[1] and low <= 0.0) else _between(low, high, bool(found[1]))
     found = re.fullmatch(rf"(normal |\+-)?({_NUMBER})(%)?", spread)
-    if not found or not (found[1] or found[3]):
+    if not found or not (found[1] or found[3]) or float(found[2]) < 0.0:
         return None
-    size, relative = abs(float(found[2])) * (0.01 if found[3] else 1.0), bool(found[3])
+    size, relative = float(found[2]) * (0.01 if found[3] else 1.0), bool(found[3])
 
     def around(chance: np.random.Generator, value: float) -> float:
         step = float(chance.standard_normal() if found[1] == "normal " else chance.uniform(-1.0, 1.0))
@@ -112,8 +117,17 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
     base = read_document(text, str(path)).values
     if "simulation" not in base:
         raise UsageError(f"{path}: has no section `simulation`; a campaign needs one, add it")
+    keys = [one.key for one in variations]
     for one in variations:
+        if keys.count(one.key) > 1:
+            raise UsageError(f"--vary {one.key}: is given {keys.count(one.key)} times: give one distribution")
+        if one.key == "simulation.seed":
+            raise UsageError("--vary simulation.seed: each flight has its own seed; --seed changes all seeds")
         _numbers_at(base, one)
+        for value in one.choices:
+            # A value that the configuration check always refuses would never be drawn.
+            only = [_fixed(each, value) if each is one else each for each in variations]
+            _case(base, only, duration, (0, 0))
 
     def cases(runs: int, seed: int) -> list[Case]:
         return [_case(base, variations, duration, (seed, number)) for number in range(runs)]
@@ -125,15 +139,25 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
     return Campaign(name, "flights with drawn values", cases, fly_case, _summarise, 100)
 
 
+def _fixed(one: Variation, value: Any) -> Variation:
+    """Return a variation that always draws the same value."""
+
+    def draw(chance: np.random.Generator, configured: float) -> Any:
+        return value
+
+    return replace(one, draw=draw)
+
+
 def _case(
     base: dict[str, Any], variations: Sequence[Variation], duration: float | None, seed: tuple[int, int]
 ) -> Case:
     """Return the case of a seed, with the complete configuration as text and its random values by key."""
     chance = np.random.default_rng(seed)
     refusal = ""
-    for _ in range(_DRAWS):
+    drawn: dict[str, Any] = {}
+    for refused in range(_DRAWS):
         values = copy.deepcopy(base)
-        drawn: dict[str, Any] = {}
+        drawn = {}
         for one in variations:
             drawn |= _drawn(values, one, chance)
         text = to_yaml(values)
@@ -143,10 +167,11 @@ def _case(
         except KnightCubeError as error:
             refusal = str(error)
             continue
-        parameters = {"config": text, "drawn": drawn, "duration": duration}
+        parameters = {"config": text, "drawn": drawn, "duration": duration, "refused": refused}
         parameters["seed"] = int(chance.integers(2**31))
         return Case(f"flight-{seed[1]:05d}", seed, parameters)
-    raise UsageError(f"{_DRAWS} draws in a row were refused, the last draw because {refusal}: vary less")
+    shown = ", ".join(f"{key} = {value}" for key, value in drawn.items())
+    raise UsageError(f"--vary: each of {_DRAWS} draws is refused, such as {shown}: {refusal}")
 
 
 def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, str]]:
@@ -208,6 +233,7 @@ def fly_case(case: Case) -> Result:
     given = case.parameters
     found: Result = {"key": case.key, "drawn": given["drawn"], "judged": [], "error": ""}
     found |= {name: given[name] for name in ("seed", "duration")}
+    found |= {"refused": given["refused"]} if given.get("refused") else {}
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         config = Path(place) / f"{case.key}.yaml"
         config.write_text(given["config"], encoding="utf-8")
@@ -264,6 +290,7 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
     facts: dict[str, Any] = {
         "flights": len(results),
         "within all limits": len(results) - len(failed),
+        "draws that the configuration check refused": sum(result.get("refused", 0) for result in results),
         "figures": [
             {
                 "figure": name,
@@ -284,8 +311,9 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
     short = facts | {"failed flights": facts["failed flights"][:_MOST_LISTED]}
     if len(failed) > _MOST_LISTED:
         short["further failed flights, in summary.json"] = len(failed) - _MOST_LISTED
-    if not failed:
-        del short["failed flights"]
+    for name in ("failed flights", "draws that the configuration check refused"):
+        if not short[name]:
+            del short[name]
     return Summary(summary(short).text, facts)
 
 

@@ -72,7 +72,7 @@ def test_a_choice_takes_each_value_as_yaml_reads_it() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["key", "key=", "key=5", "=5%", "key=5..1", "key=log 0..5", "k y=5%", "key=5..%"]
+    "text", ["key", "key=", "key=5", "=5%", "key=5..1", "key=log 0..5", "k y=5%", "key=5..%", "key=-10%"]
 )
 def test_another_form_is_refused_with_all_forms(text: str) -> None:
     with pytest.raises(UsageError, match=r"--vary .*KEY=10%"):
@@ -144,9 +144,30 @@ def test_a_key_that_holds_no_number_is_refused(text: str, reason: str) -> None:
     assert reason in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("texts", "reason"),
+    [
+        (["guidance.cost=heat|foo"], r"such as guidance\.cost = foo: .*`guidance\.cost` is 'foo'"),
+        (["coils.foo=1..2"], r"`coils\.foo` is an unknown key"),
+        (["plant.inertia=5%", "plant.inertia=10%"], "plant.inertia: is given 2 times"),
+        (["simulation.seed=1|2"], "each flight has its own seed"),
+    ],
+)
+def test_variations_that_cannot_be_flown_are_refused(texts: list[str], reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
+        varied_campaign(DEMO, [variation_of(text) for text in texts], 10.0).cases(1, 1)
+
+
+def test_the_refused_draws_of_a_case_are_counted() -> None:
+    """Half of the uniform draws within +-200 % are refused, because an inertia is positive."""
+    cases = varied_campaign(DEMO, [variation_of("plant.inertia=200%")], 10.0).cases(40, 1)
+    refused = [case.parameters["refused"] for case in cases]
+    assert 5 <= sum(refused) <= 40
+
+
 def test_draws_that_are_always_refused_end_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(varied, "_DRAWS", 3)
-    with pytest.raises(UsageError, match=r"3 draws in a row were refused, the last draw because .*inertia"):
+    with pytest.raises(UsageError, match=r"each of 3 draws is refused, such as .*inertia"):
         cases(DEMO, "plant.inertia=-2..-1")
 
 
