@@ -17,6 +17,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -38,8 +39,16 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import UsageError
-from sim_hal.assembly import Hardware, StarRenderer, assemble, emulated_camera, fault_generator, sky_objects
-from sim_hal.clock import SimClock, TimedSimulation
+from sim_hal.assembly import (
+    Hardware,
+    OrbitDevices,
+    StarRenderer,
+    assemble,
+    emulated_camera,
+    fault_generator,
+    sky_objects,
+)
+from sim_hal.clock import FaultTimeline, SimClock, TimedSimulation
 from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults import schedule
@@ -171,14 +180,22 @@ def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) ->
     """Return the emulated star camera of a configuration, without other devices and with a known motion.
 
     The camera starts at the attitude at which the body is released and rotates at `rate` (3,), rad/s, camera
-    axes. Raises ConfigError for an invalid world.
+    axes. The faults of the camera in the section `simulation` begin at their times after the opening. Raises
+    ConfigError for an invalid world, and UsageError for a fault that would have no effect in a flight.
     """
     section = request.section()
-    return posed_camera(config, section, SimClock(utc_ns(section.utc)), rate)
+    faults = [one for one in check(section.faults, config, False) if one.kind.device == "camera"]
+    return posed_camera(config, section, SimClock(utc_ns(section.utc)), rate, faults)
 
 
-def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: FloatArray) -> PosedCamera:
-    """Return the star camera of `open_camera`, with the clock `clock`."""
+def posed_camera(
+    config: Config,
+    section: Simulation,
+    clock: SimClock,
+    rate: FloatArray,
+    faults: Sequence[schedule.ScheduledFault] = (),
+) -> PosedCamera:
+    """Return the star camera of `open_camera`, with the clock `clock` and the `faults`."""
     camera = config.camera
     assert camera is not None, "the caller checks that the configuration has a camera"
     begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
@@ -193,7 +210,12 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
 
     expose = StarRenderer(camera, section.sky, section.seed).expose
     device = emulated_camera(camera, section.sky, motion, expose, clock.now_ns, objects)
-    clock.attach(TimedSimulation(lambda _: None, [device]))
+    timeline = FaultTimeline()
+    clock.attach(TimedSimulation(lambda _: None, [timeline, device]))
+    # The faults of a camera use only these parts of the hardware.
+    parts: Any = SimpleNamespace(camera=device, monitor=None, faults=timeline, orbit=OrbitDevices())
+    put(faults, Bench(parts, cast(Any, None), clock.now_ns, fault_generator(section.seed)), begun_ns)
+    timeline.advance(begun_ns)
     return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))
 
 

@@ -95,6 +95,33 @@ def test_frames_of_a_simulated_camera_are_taken_alike(
 
 
 @pytest.mark.parametrize(
+    ("fault", "medians", "status"),
+    [
+        ("camera: black @ 0.25", (331.5, 0.0, 0.0), 0),
+        ("camera: saturated", (65535.0, 65535.0, 65535.0), 0),
+        ("camera: off", (), 1),
+    ],
+)
+def test_a_simulated_camera_has_the_configured_faults(
+    fault: str, medians: tuple[float, ...], status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / "config" / "step_demo.yaml").read_text(encoding="utf-8")
+    config = tmp_path / "small.yaml"
+    small = text.replace("columns: 1024", "columns: 64").replace("rows: 1024", "rows: 64")
+    config.write_text(
+        f"{small}  faults: [{{fault: '{fault}'}}]\n".replace(" @ 0.25'", "', at: 0.25"), "utf-8"
+    )
+    words = ["camera", "--config", str(config), "--count", "3", "--exposure", "0.1", "--json"]
+    assert main(words) == status
+    output = capsys.readouterr()
+    if status:
+        assert "does not answer the trigger" in output.err
+        return
+    found = [frame["median"] for frame in json.loads(output.out)["frames"]]
+    assert found == pytest.approx(medians, rel=0.2)
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--count", "0"], "--count 0"),
