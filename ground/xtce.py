@@ -18,6 +18,7 @@ import struct
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from flight.link.commands import LAYOUTS as COMMANDS
@@ -27,6 +28,7 @@ from flight.link.process.directives import LAYOUTS as DIRECTIVES
 from flight.link.process.directives import NEW_KEY, PORTION
 from flight.link.telemetry.definitions import NO_YES, STAGES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
+from knightcube.errors import UsageError
 from knightcube.gnc.guidance.pointing_target import (
     ARGUMENTS,
     NUMBERS,
@@ -67,6 +69,15 @@ _VERIFIERS = (
 )
 """Stages of a command, with XTCE name, Yamcs's timeout after the release, and name in this software."""
 _SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"  # Yamcs's name for the sequence count of a sent command
+
+
+def epoch_of(text: str) -> str:
+    """Return a UTC in ISO 8601 without time zone, from a text that may have one. Raises UsageError."""
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise UsageError(f"--epoch {text}: give a UTC such as {EPOCH}") from error
+    return text if time.tzinfo is None else time.astimezone(UTC).replace(tzinfo=None).isoformat()
 
 
 def document(
@@ -351,7 +362,10 @@ def main() -> None:
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
     parser.add_argument("--verified", action="store_true", help="add the verification of commands by Yamcs")
     options = parser.parse_args()
-    sys.stdout.write(document(epoch=options.epoch, verified=options.verified))
+    try:
+        sys.stdout.write(document(epoch=epoch_of(options.epoch), verified=options.verified))
+    except UsageError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ from flight.link.telemetry.packets import HEADER_BYTES, LAYOUTS, SECONDARY_BYTES
 from ground.documentation import foreign_modes, layouts_for
 from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
-from ground.xtce import EPOCH, SPACE, TELECOMMANDS, UNUSED, document, spread
+from ground.xtce import EPOCH, SPACE, TELECOMMANDS, UNUSED, document, epoch_of, spread
 from knightcube.errors import KnightCubeError, UsageError
 from knightcube.gnc.guidance.pointing_target import PointingTarget
 
@@ -367,7 +367,11 @@ def main() -> None:
     parser.add_argument("--command-frame-bytes", type=int, default=size, metavar="N", help=text)
     options = parser.parse_args()
     frame_bytes = options.command_frame_bytes
-    write(options.folder, options.gateway, options.http, options.epoch, options.keys, frame_bytes)
+    try:
+        epoch = epoch_of(options.epoch)
+        write(options.folder, options.gateway, options.http, epoch, options.keys, frame_bytes)
+    except KnightCubeError as error:
+        parser.error(str(error))
     sys.stdout.write(f"Yamcs asks for user and password: {USER}, and the one in {options.folder / USERS}\n")
 
 

@@ -26,9 +26,9 @@ from ground.commands.elements import add_stations, predicted
 from ground.commands.options import count, positive
 from ground.link.commanding import terminal_of
 from ground.link.gateway import Gateway, new_token, token_file, token_path
-from ground.link.terminal import DEFAULTS
+from ground.link.terminal import DEFAULTS, PORTS
 from ground.telemetry import decode, flight_segments
-from ground.xtce import EPOCH
+from ground.xtce import EPOCH, epoch_of
 from knightcube.errors import KnightCubeError, UsageError
 
 if TYPE_CHECKING:
@@ -82,6 +82,9 @@ def run(options: argparse.Namespace) -> int:
         raise KnightCubeError(problem)
     if options.speed is not None and options.recorded is None:
         raise UsageError("--speed: replays a recorded run: give --recorded RUN")
+    if options.port >= PORTS:
+        raise UsageError(f"--port {options.port}: must be 1 to {PORTS - 1}")
+    options.epoch = None if options.epoch is None else epoch_of(options.epoch)
     packets = None if options.recorded is None else _packets(options.recorded)
     config = load(options.config)
     section = config.link

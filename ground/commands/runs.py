@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from ground import report as reporting
 from ground.commands.options import print_result
 from ground.messages import ObjectOrbit, orbits_of, write_attitudes, write_orbit_messages, write_tracking_data
 from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
-from ground.telemetry import FORMATS, export, read_run
+from ground.telemetry import FORMATS, Run, export, read_run
 from knightcube.errors import UsageError
 
 
@@ -100,15 +101,28 @@ def run_export(options: argparse.Namespace) -> int:
     """Write the exported files and print their paths."""
     if options.xml and options.tdm is None and options.aem is None:
         raise UsageError("--xml needs a message: add --tdm FILE or --aem FILE")
+    run = read_run(options.run)
     if options.tdm is not None:
-        paths = write_tracking_data(read_run(options.run), options.tdm, options.xml)
+        paths = write_tracking_data(run, options.tdm, options.xml)
     elif options.aem is not None:
-        paths = write_attitudes(read_run(options.run), options.aem, options.xml)
+        paths = write_attitudes(run, options.aem, options.xml)
     else:
-        place = options.out or options.run / FORMATS[options.format]
-        paths = export(read_run(options.run), place, options.format)
+        paths = export(run, options.out or options.run / FORMATS[options.format], options.format)
+    sys.stderr.writelines(f"knightcube: {gap}\n" for gap in _gaps(run))
     print_result(options, {"files": [str(path) for path in paths]}, "".join(f"{path}\n" for path in paths))
     return 0
+
+
+def _gaps(run: Run) -> Iterator[str]:
+    """Yield a warning for each log of a run with packets that are missing in the exported files."""
+    for name, log in run.logs.items():
+        missing, dropped = sum(log.missing.values()), run.dropped_segments(name)
+        if missing or log.skipped_bytes or log.other_versions or dropped:
+            yield (
+                f"the exported files have gaps: in the {name} log {missing} packets are missing, "
+                f"{log.skipped_bytes} bytes are damaged, {log.other_versions} packets have another version, "
+                f"{dropped} old segments were deleted"
+            )
 
 
 _POSITION, _VELOCITY = slice(0, 3), slice(3, 6)

@@ -22,7 +22,8 @@ from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, compile_la
 from flight.loop.body import SteeringState
 from flight.loop.facts import FACTS, StreamState
 from ground import documentation
-from ground.xtce import document, main, spread
+from ground.xtce import document, epoch_of, main, spread
+from knightcube.errors import UsageError
 from knightcube.gnc.guidance.pointing_target import Goal
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.support.xtce_fields import compare, definition_of, shifted
@@ -237,3 +238,20 @@ def test_each_stage_of_a_command_is_verified_by_identifier_sequence_and_stage() 
             [*same, ("verification_stage", "refused"), ("verification_stage", "failed")],
         ),
     }
+
+
+@pytest.mark.parametrize(
+    ("text", "epoch"),
+    [
+        ("2026-11-23T12:00:00", "2026-11-23T12:00:00"),
+        ("2026-11-23T12:00:00Z", "2026-11-23T12:00:00"),
+        ("2026-11-23T12:00:00+02:00", "2026-11-23T10:00:00"),
+        ("foo", None),
+    ],
+)
+def test_an_epoch_is_a_utc(text: str, epoch: str | None) -> None:
+    if epoch is None:
+        with pytest.raises(UsageError, match="--epoch foo: give a UTC such as"):
+            epoch_of(text)
+    else:
+        assert epoch_of(text) == epoch

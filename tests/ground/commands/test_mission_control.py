@@ -478,6 +478,10 @@ def test_wrong_use_is_refused_before_anything_starts(run: Path, monkeypatch: pyt
     stage = Stage(monkeypatch, SLEEP)
     with pytest.raises(UsageError, match="--speed: replays a recorded run: give --recorded RUN"):
         mission_control.run(options("--speed", "2"))
+    with pytest.raises(UsageError, match="--port 99999: must be 1 to 65535"):
+        mission_control.run(options("--port", "99999"))
+    with pytest.raises(UsageError, match="--epoch yesterday: give a UTC such as"):
+        mission_control.run(options("--epoch", "yesterday"))
     with pytest.raises(UsageError, match="no flight log"):
         mission_control.run(options("--recorded", str(run.parent / "none")))
     with pytest.raises(UsageError, match="has no section `link`"):

@@ -87,6 +87,18 @@ def test_two_runs_are_compared_and_drawn_into_a_given_folder(
     assert drawn == [tmp_path] * 2
 
 
+def test_an_export_of_a_damaged_log_states_the_gaps(flown: Path, tmp_path: Path) -> None:
+    whole = command("export", flown, "--out", tmp_path / "whole")
+    assert whole.stderr == ""
+    data = bytearray((flown / "flight-0001.ccsds").read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/flight-0001.ccsds").write_bytes(data)
+    done = command("export", tmp_path / "run", "--out", tmp_path / "csv")
+    assert done.returncode == 0
+    assert "the exported files have gaps: in the flight log 1 packets are missing, " in done.stderr
+
+
 def test_an_export_prints_its_files(flown: Path, tmp_path: Path) -> None:
     done = command("export", flown, "--out", tmp_path / "csv")
     files = sorted((tmp_path / "csv").iterdir())
