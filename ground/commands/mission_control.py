@@ -76,8 +76,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run, spacecraft=None, frame_bytes=None)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run Yamcs, and the gateway unless a run is replayed, until a signal arrives or Yamcs ends."""
+def _check(options: argparse.Namespace) -> None:
+    """Raise KnightCubeError if Yamcs is not installed, and UsageError for options that cannot be used."""
     if problem := yamcs.missing():
         raise KnightCubeError(problem)
     if options.speed is not None and options.recorded is None:
@@ -85,6 +85,11 @@ def run(options: argparse.Namespace) -> int:
     if options.port >= PORTS:
         raise UsageError(f"--port {options.port}: must be 1 to {PORTS - 1}")
     options.epoch = None if options.epoch is None else epoch_of(options.epoch)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run Yamcs, and the gateway unless a run is replayed, until a signal arrives or Yamcs ends."""
+    _check(options)
     packets = None if options.recorded is None else _packets(options.recorded)
     config = load(options.config)
     section = config.link
