@@ -275,6 +275,10 @@ class OrbitPrediction:
         elevation, azimuth, distance = (self._satellite - place).at(self._times(at)).altaz()
         return np.asarray(elevation.degrees), np.asarray(azimuth.degrees), np.asarray(distance.m)
 
+    def elevation(self, station: Station, at: datetime) -> float:
+        """Return the satellite's elevation at one time, degrees, above the horizon of a station."""
+        return float(self._seen_from(station.on_earth(), [at])[0][0])
+
     def elevations(self, station: Station) -> tuple[list[datetime], FloatArray]:
         """Return times within the span, and the satellite's elevation (n,), degrees, at each time."""
         return self._at, self._seen_from(station.on_earth(), self._at)[0]

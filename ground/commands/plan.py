@@ -201,7 +201,7 @@ def _run_orbit(options: argparse.Namespace) -> int:
     begun = time.process_time()
     made = _planned(options, config, config.elements, at)
     solved_s = time.process_time() - begun
-    facts = _orbit_facts(made, at, solved_s)
+    facts = _orbit_facts(made, at, solved_s) | _visibility(made, config.elements, at)
     path = made.plan.path
     nodes = {
         "time_s": path.times.tolist(),
@@ -315,6 +315,19 @@ def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, 
     }
 
 
+def _visibility(made: OrderedSlew, elements: tuple[str, str], at: datetime) -> dict[str, object]:
+    """Return the elevation (deg) of the satellite at the end of a slew to a target on the ground."""
+    goal = made.order.goal
+    if goal.goal is not Goal.GROUND:
+        return {}
+    from ground.passes import OrbitPrediction, Station  # noqa: PLC0415 - loads Skyfield
+
+    latitude, longitude = (math.degrees(number) for number in goal.numbers)
+    place = Station(name="target", latitude_deg=latitude, longitude_deg=longitude)
+    end = at + timedelta(seconds=made.begin + made.plan.horizon)
+    return {"elevation_deg": OrbitPrediction(elements, end, 0.1).elevation(place, end)}
+
+
 def _orbit_text(facts: dict[str, object]) -> str:
     stretched = facts["status"] == SlewStatus.STRETCHED.value
     note = f" ({facts['horizon_asked_s']:g} s is too short)" if stretched else ""
@@ -324,6 +337,11 @@ def _orbit_text(facts: dict[str, object]) -> str:
     assert isinstance(clear, dict)
     assert isinstance(limits, list)
     largest = ", ".join(f"{name} {limit:.4g}" for name, limit in zip("xyz", limits, strict=True))
+    seen = ""
+    if "elevation_deg" in facts:
+        elevation = float(str(facts["elevation_deg"]))
+        hidden = ": the Earth hides it" if elevation < 0.0 else ""
+        seen = f"target:        the satellite ends {elevation:.1f} deg above its horizon{hidden}\n"
     kept = "".join(f"{name + ':':15}{value:.2f} deg outside its cone\n" for name, value in clear.items())
     return (
         f"status:        {facts['status']}\n"
@@ -336,6 +354,6 @@ def _orbit_text(facts: dict[str, object]) -> str:
         f"turn:          {facts['turn_deg']:.2f} deg, the {facts['way_round']} way, "
         f"on a path of {facts['way_deg']:.1f} deg\n"
         f"peak rate:     {facts['peak_rate_deg_s']:.3f} deg/s\n"
-        f"{kept}"
+        f"{kept}{seen}"
         f"solved in:     {facts['processor_s']:.2f} s of processor time, {facts['steps']} steps\n"
     )

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import skyfield.api as skyfield
 
+from flight.schema.bodies import as_orbit
+from flight.schema.document import config_path
+from flight.schema.reader import load
 from tests.ground.commands.in_process import command
 
 PLAN = ("plan", "--orbit", "orbit", "--at", "2026-03-01T12:05:00", "--nodes", "12")
@@ -36,6 +41,23 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
     assert np.abs(facts["dipole_A_m2"]).max() == pytest.approx(
         facts["peak_of_limit"] * facts["dipole_limit_A_m2"][0]
     )
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_target_behind_the_earth_is_named(side: float) -> None:
+    """The target is below the satellite at the end of the slew, or on the opposite side of the Earth."""
+    elements = as_orbit(load(config_path("orbit"))).elements
+    assert elements is not None
+    scale = skyfield.load.timescale(builtin=True)
+    end = scale.from_datetime(datetime(2026, 3, 1, 12, 8, 20, tzinfo=UTC))
+    below = skyfield.wgs84.subpoint_of(skyfield.EarthSatellite(*elements, ts=scale).at(end))
+    longitude = below.longitude.degrees - (0.0 if side > 0.0 else 180.0)
+    goal = f"ground {side * below.latitude.degrees:.3f} {longitude:.3f}"
+    done = command(*PLAN, "--from", "nadir", "--to", goal, "--within", "200")
+    assert done.returncode == 0, done.stderr
+    assert ("the Earth hides it" in done.stdout) == (side < 0.0)
+    line = next(line for line in done.stdout.splitlines() if line.startswith("target:"))
+    assert side * float(line.split("ends ")[1].split(" deg")[0]) > 80.0
 
 
 def test_each_axis_has_the_dipole_limit_of_its_own_coil(tmp_path: Path) -> None:
