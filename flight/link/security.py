@@ -437,7 +437,7 @@ class Gate:
         entry = self._open[spi] or self._read_again(spi)
         data = unprotect(self._cipher(entry), header, self._mask, protected, self._encrypted)
         if data is None:
-            entry, data = self._by_next_key(spi, header, protected)
+            entry, data = self._by_newer_key(entry, header, protected)
         counter = int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big") % (1 << _COUNTER_BITS)
         if counter < entry.unused:
             raise RefusedError(Refusal.REPEATED, spi, counter)
@@ -465,15 +465,25 @@ class Gate:
             known = self._ciphers[entry.spi, entry.generation] = entry.cipher
         return known
 
-    def _by_next_key(self, spi: int, header: bytes, protected: bytes) -> tuple[Association, bytes]:
-        """Return association and data of a frame that already uses the next key. Raises RefusedError."""
-        following = self._vault.read(f"{spi}-{NEXT}") if self._store_every > 1 else None
-        if following is not None:
-            data = unprotect(following.cipher, header, self._mask, protected, self._encrypted)
-            if data is not None:
-                self.replace_key(spi, following.generation, following.key)
-                self._vault.remove(f"{spi}-{NEXT}")
-                return following, data
+    def _by_newer_key(self, entry: Association, header: bytes, protected: bytes) -> tuple[Association, bytes]:
+        """Return association and data of a frame with a newer key than that of `entry`. Raises RefusedError.
+
+        On the ground, another process that shares the folder of keys may already have replaced the key.
+        """
+        spi = entry.spi
+        for name in (spi, f"{spi}-{NEXT}") if self._store_every > 1 else ():
+            newer = self._vault.read(name)
+            if newer is None or newer.generation <= entry.generation:
+                continue
+            data = unprotect(newer.cipher, header, self._mask, protected, self._encrypted)
+            if data is None:
+                continue
+            if name == spi:
+                self._open[spi], self._stored[spi] = newer, newer.unused
+            else:
+                self.replace_key(spi, newer.generation, newer.key)
+                self._vault.remove(name)
+            return newer, data
         raise RefusedError(Refusal.MAC, spi)
 
 

@@ -158,7 +158,7 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
             state.update(tail.new())
         # The link process also sends packets of its own, which do not show that a flight is in progress.
         if not state.newest or (by_link and not state.mode):
-            cause = _cause(state) if by_link else ""
+            cause = _cause(state, tail) if by_link else ""
             sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}{cause}\n")
             return 1
         silent = f"  no packet for {silence():.0f} s" if silence() > SILENT_S else ""
@@ -171,15 +171,15 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
         while not (state.ended or silence() > options.patience or ended.wait(_READ_S)):
             refresh()
     if not state.ended and not ended.is_set():
-        cause = _cause(state) if by_link else ""
+        cause = _cause(state, tail) if by_link else ""
         sys.stderr.write(f"knightcube: no new packet for {silence():.0f} s {where}{cause}\n")
         return 1
     return 0
 
 
-def _cause(state: FlightState) -> str:
+def _cause(state: FlightState, tail: PacketSource) -> str:
     """Return the possible causes and remedies if no packet of a flight arrives over a link."""
-    if not state.newest:
+    if not state.newest or tail.silence > SILENT_S:
         return ": no frame is authentic: check --link, --keys and --spacecraft, and that the link runs"
     return ": the link answers, but the flight does not run, or the link reads another run (its --log)"
 

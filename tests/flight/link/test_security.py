@@ -16,6 +16,7 @@ from flight.link.frames import TELECOMMAND_MASK, close_frame
 from flight.link.security import (
     COPIES,
     HIGHEST_COUNTER,
+    NEXT,
     WINDOW,
     Association,
     Gate,
@@ -195,6 +196,24 @@ def test_after_a_change_of_key_no_frame_is_accepted_twice(
     second.admit(last)
     second.close()
     assert cause(entrance(), last) is Refusal.REPEATED, "stored at the end"
+
+
+def test_every_process_of_the_ground_follows_a_new_key_of_telemetry(sky: Vault, ground: Vault) -> None:
+    """The process that receives the first frame with the new key replaces the key in the shared folder."""
+    gates = [Gate(ground, [1], parse, TELECOMMAND_MASK, store_every=256) for _ in range(3)]
+    sender = Ground(sky)
+    before = sender.frame(b"before")
+    assert [one.admit(before).data for one in gates] == [b"before"] * 3
+    following = Association(1, 2, 0, new_key())
+    ground.write(following, f"1-{NEXT}")
+    sky.write(following)
+    sender = Ground(sky)
+    for data in (b"first", b"second"):
+        frame = sender.frame(data)
+        assert [one.admit(frame).data for one in gates] == [data] * 3
+        assert [cause(one, frame) for one in gates] == [Refusal.REPEATED] * 3
+    assert ground.read(f"1-{NEXT}") is None
+    assert cause(gates[1], before) is Refusal.MAC
 
 
 def test_a_counter_that_cannot_be_stored_lets_nothing_in(
