@@ -447,7 +447,9 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
     if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
         again = _motion(replace(job, camera=solution.camera))
         assert isinstance(again, MotionResult)  # The first and the second fit use the same estimator.
-        return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
+        # Focal length and lens are still uncertain, and their errors are part of the covariance.
+        near = 1.0 - _SCALE_TOLERANCE, 1.0 + _SCALE_TOLERANCE
+        return FrameFound(again, solve_motion(again, solution.camera, near, sky, settings, prior))
     if not job.motion_first:
         # A second fit to a single image would take 50 % more time and improve the accuracy only slightly.
         return FrameFound(motion, solution)

@@ -114,7 +114,7 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
             "use channel 2 of the PWM chip twice: give one of the two coils",
         ),
         ("address: 0x45", "address: 0x40", "is 0x40, which `coils.address` also uses"),
-        ("address: 0x45", "address: 45", r"is 0x2d \(45\), but a chip of type ina219 has 0x40 to 0x4f: did you"),
+        ("address: 0x45", "address: 45", r"is 0x2d \(45\), but a chip of type ina219 has 0x40 to 0x4f"),
         (
             "address: 0x40",
             "address: 40",

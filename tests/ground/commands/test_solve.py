@@ -68,6 +68,21 @@ def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> Non
     assert "give --exposure for the rate" in result.stdout
 
 
+def test_streaks_of_an_unknown_field_are_as_uncertain_as_those_of_a_field_with_a_tolerance(
+    tmp_path: Path,
+) -> None:
+    """The lens is uncalibrated in both cases."""
+    frame = sky_frame(np.random.default_rng(32), 40.0, 0.2)
+    path = _written(frame, tmp_path / "streaks.png")
+
+    def sigmas(*words: str) -> np.ndarray:
+        done = command("solve", path, "--exposure", "0.2", "--json", *words)
+        assert done.returncode == 0, done.stderr
+        return np.sqrt(np.diag(json.loads(done.stdout)["covariance_rad2"]))
+
+    assert sigmas() == pytest.approx(sigmas("--fov", "12"), rel=0.3)
+
+
 def test_the_date_takes_aberration_off(picture: Path) -> None:
     """The option for the date removes stellar aberration, which changes the attitude by at most 20.5".
 
