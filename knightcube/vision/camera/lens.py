@@ -24,7 +24,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import ArgumentError, KnightCubeError
 from knightcube.vision.frame import grey_image
 
@@ -406,6 +406,14 @@ def fold_of(k1: float, k2: float) -> float:
 _LAST_CHANGE = 1e-9
 _MOST_INVERSIONS = 60
 
+_Terms = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""Terms of the image errors of a `DistortedPinhole`, with lengths in px.
+
+The terms are: image centre (x, y), displaced centre (x, y), `scale`, coefficients of the second and fourth
+power of the distance, square of the distance of the fold, p1 and p2 divided by the focal length, aspect, and
+shear.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class DistortedPinhole(Pinhole):
@@ -414,7 +422,9 @@ class DistortedPinhole(Pinhole):
     Unlike a `Lens`, the camera has derivatives of the distortion, and images all directions in front of it.
     The distorted point is d(u) = u (1 + scale + cubic s + fourth s^2) + t(u), where u is the distance from
     the image centre and s is the square of |u| relative to the distance of the corner. The matrix A and the
-    tangential distortion t are those of `Lens`.
+    tangential distortion t are those of `Lens`. Beyond the fold, at which the distorted distance has a
+    maximum, the radial distortion is that of the fold, so that stars far outside the image do not appear in
+    the image.
 
     Attributes:
         shift: displacement (x, y) of the image centre, px.
@@ -430,6 +440,17 @@ class DistortedPinhole(Pinhole):
     fourth: float = 0.0
     tangential: tuple[float, float] = (0.0, 0.0)
     shape: tuple[float, float] = (0.0, 0.0)
+    _terms: _Terms = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        Pinhole.__post_init__(self)
+        (x, y), (right, down) = self.centre, self.shift
+        square = x * x + y * y
+        fold = fold_of(self.cubic / (1.0 + self.scale), self.fourth / (1.0 + self.scale)) ** 2 * square
+        radial = self.scale, self.cubic / square, self.fourth / square**2, fold
+        p1, p2 = (each / self.focal_length for each in self.tangential)
+        terms = x, y, x + right, y + down, *radial, p1, p2, *self.shape
+        object.__setattr__(self, "_terms", tuple(map(float, terms)))
 
     @classmethod
     def of(cls, camera: Pinhole | Lens) -> DistortedPinhole:
@@ -480,80 +501,178 @@ class DistortedPinhole(Pinhole):
 
     def distorted(self, points: FloatArray) -> FloatArray:
         """Return the image positions (..., 2), px, with lens distortion, of ideal `points` (..., 2), px."""
-        away = points - np.array(self.centre)
-        moved = away * (1.0 + self._growth(away)) + self._tangential(away, away)
-        return np.asarray(moved @ self._pixels() + np.array(self.centre) + np.array(self.shift))
+        return _distorted(_rows(points), self._terms).reshape(points.shape)
 
     def undistorted(self, points: FloatArray) -> FloatArray:
         """Return the ideal positions (..., 2), px, of image `points` (..., 2), px, with lens distortion."""
-        shifted = points - np.array(self.centre) - np.array(self.shift)
-        away = shifted = shifted @ np.linalg.inv(self._pixels())
-        for _ in range(_MOST_INVERSIONS):
-            before = away
-            away = (shifted - self._tangential(before, before)) / (1.0 + self._growth(before))
-            if not np.any(np.abs(away - before) > _LAST_CHANGE):
-                break
-        return np.asarray(away + np.array(self.centre))
+        return _ideal_points(_rows(points), self._terms).reshape(points.shape)
+
+    def image_motion(
+        self, points: FloatArray, velocity: FloatArray, acceleration: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the image positions, velocities and accelerations of ideal points, each (m, 2) px."""
+        return _image_motion(_rows(points), _rows(velocity), _rows(acceleration), self._terms)
 
     def jacobian(self, points: FloatArray) -> FloatArray:
         """Return the Jacobian (m, 2, 2) of the lens distortion at ideal `points` (m, 2) px."""
-        away = points - np.array(self.centre)
-        slope = 2.0 * self._slopes(away)[0]
-        radial = (1.0 + self._growth(away))[..., None] * np.eye(2) + slope[..., None] * (
-            away[:, :, None] * away[:, None, :]
-        )
-        tangential = [2.0 * self._tangential(away, axis) for axis in np.eye(2)]
-        return np.asarray(self._pixels() @ (radial + np.stack(tangential, axis=-1)))
+        still = np.zeros(points.shape)
+        columns = [self.image_motion(points, still + axis, still)[1] for axis in np.eye(2)]
+        return np.stack(columns, axis=-1)
 
-    def curvature(self, points: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the acceleration (m, 2), px per exposure^2, of image points due to the distortion.
 
-        The ideal `points` (m, 2), px, move with a constant `velocity` (m, 2), px per exposure.
-        """
-        away = points - np.array(self.centre)
-        slope, change = self._slopes(away)
-        closing = np.sum(away * velocity, axis=1, keepdims=True)
-        square = np.sum(velocity**2, axis=1, keepdims=True)
-        radial = 2.0 * slope * (2.0 * closing * velocity + square * away) + 4.0 * change * closing**2 * away
-        return np.asarray((radial + 2.0 * self._tangential(velocity, velocity)) @ self._pixels())
+def _rows(points: FloatArray) -> FloatArray:
+    """Return points (..., 2) as a contiguous array (m, 2), for compiled functions."""
+    return np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
 
-    @property
-    def _corner_square(self) -> float:
-        return float(np.sum(np.square(self.centre)))
 
-    def _squares(self, away: FloatArray) -> tuple[FloatArray, float]:
-        """Return the squares (..., 1) of distances relative to the corner, and the square of the fold.
+def _radial_numpy(away: FloatArray, terms: _Terms) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the relative radial displacement (m, 1) at distances (m, 2), px, and two derivatives of it.
 
-        Beyond the fold, at which the distorted distance has a maximum, the distortion is that of the fold, so
-        that stars far outside the image do not appear in the image.
-        """
-        fold = fold_of(self.cubic / (1.0 + self.scale), self.fourth / (1.0 + self.scale)) ** 2
-        return np.minimum(np.sum(away**2, axis=-1, keepdims=True) / self._corner_square, fold), fold
+    The derivatives are with respect to the square of the distance.
+    """
+    scale, cubic, fourth, fold = terms[4:8]
+    whole = np.sum(away**2, axis=1, keepdims=True)
+    square = np.minimum(whole, fold)
+    growth = scale + square * (cubic + square * fourth)
+    slope = np.where(whole < fold, cubic + 2.0 * fourth * square, 0.0)
+    return growth, slope, np.where(whole < fold, 2.0 * fourth, 0.0)
 
-    def _growth(self, away: FloatArray) -> FloatArray:
-        """Return the relative radial displacement (..., 1) at distances (..., 2), px, from the centre."""
-        square, _ = self._squares(away)
-        return np.asarray(self.scale + square * (self.cubic + square * self.fourth))
 
-    def _slopes(self, away: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the first and second derivatives (m, 1) of `_growth` with respect to |away|^2, 1/px^2."""
-        square, fold = self._squares(away)
-        first = (self.cubic + 2.0 * self.fourth * square) / self._corner_square
-        second = np.full_like(square, 2.0 * self.fourth / self._corner_square**2)
-        return np.where(square < fold, first, 0.0), np.where(square < fold, second, 0.0)
+def _tangential_numpy(one: FloatArray, other: FloatArray, terms: _Terms) -> FloatArray:
+    """Return the symmetric bilinear form (m, 2), px, of the tangential distortion of two distances (m, 2)."""
+    across = one[:, :1] * other[:, 1:] + one[:, 1:] * other[:, :1]
+    own, cross, squares = np.array(terms[9:7:-1]), np.array(terms[8:10]), one * other
+    return np.asarray(own * (np.sum(squares, axis=1, keepdims=True) + 2.0 * squares) + cross * across)
 
-    def _tangential(self, one: FloatArray, other: FloatArray) -> FloatArray:
-        """Return the symmetric bilinear form (..., 2), px, of the tangential distortion of two distances."""
-        across = one[..., :1] * other[..., 1:] + one[..., 1:] * other[..., :1]
-        along = np.array(self.tangential[::-1])
-        squares = one * other
-        total = np.sum(squares, axis=-1, keepdims=True)
-        form = along * (total + 2.0 * squares) + along[::-1] * across
-        return np.asarray(form / self.focal_length)
 
-    def _pixels(self) -> FloatArray:
-        aspect, shear = self.shape
-        return np.array([[1.0 + aspect, shear], [shear, 1.0 - aspect]])
+def _pixels_numpy(terms: _Terms) -> FloatArray:
+    """Return the matrix A (2, 2) of pixels that are not square."""
+    aspect, shear = terms[10:]
+    return np.array([[1.0 + aspect, shear], [shear, 1.0 - aspect]])
+
+
+def _distorted_numpy(points: FloatArray, terms: _Terms) -> FloatArray:
+    away = points - np.array(terms[:2])
+    moved = away * (1.0 + _radial_numpy(away, terms)[0]) + _tangential_numpy(away, away, terms)
+    return np.asarray(moved @ _pixels_numpy(terms) + np.array(terms[2:4]))
+
+
+@compiled_form_of(_distorted_numpy)
+def _distorted(points: FloatArray, terms: _Terms) -> FloatArray:
+    image = np.empty_like(points)
+    for k in range(len(points)):
+        x, y = points[k, 0] - terms[0], points[k, 1] - terms[1]
+        growth, _, _ = _radial(x, y, terms)
+        right, down = _tangential(x, y, x, y, terms)
+        _set_point(image, k, x * (1.0 + growth) + right, y * (1.0 + growth) + down, terms)
+        image[k, 0] += terms[2]
+        image[k, 1] += terms[3]
+    return image
+
+
+def _image_motion_numpy(
+    points: FloatArray, velocity: FloatArray, acceleration: FloatArray, terms: _Terms
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    away, pixels = points - np.array(terms[:2]), _pixels_numpy(terms)
+    growth, slope, change = _radial_numpy(away, terms)
+    whole = 1.0 + growth
+
+    def along(step: FloatArray) -> FloatArray:
+        """Return the derivative of the distortion along a step (m, 2)."""
+        closing = np.sum(away * step, axis=1, keepdims=True)
+        radial = whole * step + 2.0 * slope * closing * away
+        return np.asarray(radial + 2.0 * _tangential_numpy(away, step, terms))
+
+    closing = np.sum(away * velocity, axis=1, keepdims=True)
+    square = np.sum(velocity**2, axis=1, keepdims=True)
+    bent = 2.0 * slope * (2.0 * closing * velocity + square * away) + 4.0 * change * closing**2 * away
+    bent += 2.0 * _tangential_numpy(velocity, velocity, terms) + along(acceleration)
+    return _distorted_numpy(points, terms), along(velocity) @ pixels, bent @ pixels
+
+
+@compiled_form_of(_image_motion_numpy)
+def _image_motion(
+    points: FloatArray, velocity: FloatArray, acceleration: FloatArray, terms: _Terms
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    image, pace, bent = np.empty_like(points), np.empty_like(points), np.empty_like(points)
+    for k in range(len(points)):
+        x, y = points[k, 0] - terms[0], points[k, 1] - terms[1]
+        u, v, a, b = velocity[k, 0], velocity[k, 1], acceleration[k, 0], acceleration[k, 1]
+        growth, slope, change = _radial(x, y, terms)
+        whole, closing, gained = 1.0 + growth, x * u + y * v, 2.0 * slope * (x * a + y * b)
+        right, down = _tangential(x, y, x, y, terms)
+        _set_point(image, k, whole * x + right, whole * y + down, terms)
+        image[k, 0] += terms[2]
+        image[k, 1] += terms[3]
+        right, down = _tangential(x, y, u, v, terms)
+        turned = 2.0 * slope * closing
+        _set_point(pace, k, whole * u + turned * x + 2.0 * right, whole * v + turned * y + 2.0 * down, terms)
+        outward = gained + 2.0 * slope * (u * u + v * v) + 4.0 * change * closing * closing
+        right, down = _tangential(u, v, u, v, terms)
+        right_too, down_too = _tangential(x, y, a, b, terms)
+        bent_x = whole * a + outward * x + 2.0 * turned * u + 2.0 * (right + right_too)
+        bent_y = whole * b + outward * y + 2.0 * turned * v + 2.0 * (down + down_too)
+        _set_point(bent, k, bent_x, bent_y, terms)
+    return image, pace, bent
+
+
+def _ideal_points_numpy(points: FloatArray, terms: _Terms) -> FloatArray:
+    shifted = (points - np.array(terms[2:4])) @ np.linalg.inv(_pixels_numpy(terms))
+    away = shifted
+    for _ in range(_MOST_INVERSIONS):
+        before = away
+        moved = shifted - _tangential_numpy(before, before, terms)
+        away = moved / (1.0 + _radial_numpy(before, terms)[0])
+        if not np.any(np.abs(away - before) > _LAST_CHANGE):
+            break
+    return np.asarray(away + np.array(terms[:2]))
+
+
+@compiled_form_of(_ideal_points_numpy)
+def _ideal_points(points: FloatArray, terms: _Terms) -> FloatArray:
+    out = np.empty_like(points)
+    aspect, shear = terms[10], terms[11]
+    scale = 1.0 / (1.0 - aspect * aspect - shear * shear)
+    for k in range(len(points)):
+        right, down = points[k, 0] - terms[2], points[k, 1] - terms[3]
+        first = scale * ((1.0 - aspect) * right - shear * down)
+        second = scale * ((1.0 + aspect) * down - shear * right)
+        x, y = first, second
+        for _ in range(_MOST_INVERSIONS):
+            growth, _, _ = _radial(x, y, terms)
+            along, across = _tangential(x, y, x, y, terms)
+            before_x, before_y = x, y
+            x, y = (first - along) / (1.0 + growth), (second - across) / (1.0 + growth)
+            if not (abs(x - before_x) > _LAST_CHANGE or abs(y - before_y) > _LAST_CHANGE):
+                break
+        out[k, 0], out[k, 1] = x + terms[0], y + terms[1]
+    return out
+
+
+@loop_helper
+def _radial(x: float, y: float, terms: _Terms) -> tuple[float, float, float]:
+    """Return the values of `_radial_numpy` at one distance."""
+    square, fold = x * x + y * y, terms[7]
+    if square >= fold:
+        return terms[4] + fold * (terms[5] + fold * terms[6]), 0.0, 0.0
+    growth = terms[4] + square * (terms[5] + square * terms[6])
+    return growth, terms[5] + 2.0 * terms[6] * square, 2.0 * terms[6]
+
+
+@loop_helper
+def _tangential(x: float, y: float, u: float, v: float, terms: _Terms) -> tuple[float, float]:
+    """Return the values of `_tangential_numpy` for the distances (x, y) and (u, v)."""
+    p1, p2 = terms[8], terms[9]
+    across, total = x * v + y * u, x * u + y * v
+    return p2 * (total + 2.0 * x * u) + p1 * across, p1 * (total + 2.0 * y * v) + p2 * across
+
+
+@loop_helper
+def _set_point(points: FloatArray, k: int, x: float, y: float, terms: _Terms) -> None:
+    """Set row k of `points` to A (x, y)."""
+    aspect, shear = terms[10], terms[11]
+    points[k, 0] = (1.0 + aspect) * x + shear * y
+    points[k, 1] = shear * x + (1.0 - aspect) * y
 
 
 def streak_camera(camera: CameraModel) -> Pinhole:

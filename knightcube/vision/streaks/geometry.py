@@ -53,10 +53,7 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
     found = _paths_of(view, motion, ideal, time) if shaken else _ideal_paths(view, terms, ideal, time)
     if not isinstance(pinhole, DistortedPinhole):
         return StarPaths(*found)
-    position, velocity, acceleration = found
-    jacobian = pinhole.jacobian(position)
-    bent = (jacobian @ acceleration[..., None])[..., 0] + pinhole.curvature(position, velocity)
-    return StarPaths(pinhole.distorted(position), (jacobian @ velocity[..., None])[..., 0], bent)
+    return StarPaths(*pinhole.image_motion(*found))
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:

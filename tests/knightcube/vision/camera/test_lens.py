@@ -10,10 +10,14 @@ from hypothesis import strategies as st
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import (
     CameraModel,
+    DistortedPinhole,
     Exposures,
     Lens,
     LensError,
     Pinhole,
+    _distorted,
+    _ideal_points,
+    _image_motion,
     _undistorted,
     streak_camera,
 )
@@ -303,6 +307,17 @@ def test_a_direction_beyond_the_fold_of_the_distortion_is_not_in_the_image() -> 
     places = streak_camera(lens).project(vectors)
     assert (np.diff(places[:, 0]) > 0.0).all()
     assert not lens.contains(places[1:]).any()
+
+
+def test_the_compiled_distortion_equals_that_in_numpy() -> None:
+    camera = DistortedPinhole(1024, 768, 2900.0, (3.0, -2.0), 1e-3, -0.12, 0.02, (0.02, -0.03), (0.02, 0.01))
+    # Some of the points are beyond the fold, and one is undefined.
+    points = np.random.default_rng(4).uniform(-1500.0, 2500.0, (60, 2))
+    points[7] = np.nan
+    velocity, acceleration = np.random.default_rng(5).normal(0.0, 50.0, (2, 60, 2))
+    for function in (_distorted, _ideal_points):
+        assert_forms_agree(function, points, camera._terms)
+    assert_forms_agree(_image_motion, points[8:], velocity[8:], acceleration[8:], camera._terms)
 
 
 @pytest.mark.parametrize(("k1", "k2"), [(-0.3, 0.2), (-0.2, 0.0), (0.4, -0.1), (0.1, 0.2)])
