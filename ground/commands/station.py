@@ -20,6 +20,7 @@ from flight.app.cli import to_json
 from flight.app.service import EndingSignals
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
+from flight.schema.document import config_path
 from ground.commands.options import positive
 from ground.link.commanding import add_link_options, ground_files_folder, terminal_of
 from ground.link.gateway import ADDRESS, Gateway, new_token, token_file, token_path
@@ -298,7 +299,7 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--to", metavar="SOCKET", help="send commands to the flight's UNIX socket or HOST:PORT")
     text = "simulate this configuration in real time, with the log in RUN"
-    way.add_argument("--fly", metavar="CONFIG", type=Path, help=text)
+    way.add_argument("--fly", metavar="CONFIG", type=config_path, help=text)
     add_link_options(parser, way)
     text = "kept frames of the camera (default those of RUN; with --link as received by `files`)"
     parser.add_argument("--frames", metavar="FOLDER", type=Path, help=text)

@@ -37,6 +37,7 @@ from flight.link.security import (
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.log import SUFFIX
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
+from flight.schema.document import config_path
 from flight.schema.reader import load
 from ground.link.terminal import (
     ADDRESSES,
@@ -109,7 +110,7 @@ def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExc
     way.add_argument("--link", metavar="ADDRESS", help=text)
     parser.add_argument("--keys", type=Path, metavar="FOLDER", help="keys of the ground, needed with --link")
     text = "configuration of the flight, whose section `link` describes frames and their coding"
-    parser.add_argument("--config", type=Path, metavar="CONFIG", help=text)
+    parser.add_argument("--config", type=config_path, metavar="CONFIG", help=text)
     text = f"spacecraft identifier of the link (default that of --config, or {DEFAULTS.spacecraft})"
     parser.add_argument("--spacecraft", type=int, metavar="N", help=text)
     text = f"length of the link's telemetry frames (default that of --config, or {DEFAULTS.frame_bytes})"

@@ -417,6 +417,8 @@ def test_the_settings_of_the_link_are_those_of_the_configuration_and_the_options
     assert (described.command_frame_bytes, described.encrypted) == (200, False)
     coding = described.coding
     assert (coding.randomiser, coding.reed_solomon, coding.cltu) == ("long", 4, "randomised")
+    with pytest.raises(UsageError, match=r"orbit.yaml: has no section `link`"):
+        commanding.terminal_of(parser.parse_args([*words, "--config", "orbit"]))
     for wrong in (["--spacecraft", "5000"], ["--frame-bytes", "5"]):
         with pytest.raises(UsageError, match=f"{wrong[0]} {wrong[1]}: must be "):
             commanding.terminal_of(parser.parse_args([*words, *wrong]))
