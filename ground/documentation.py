@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from flight.link.commands import DUMP_PARAMETERS, LOAD_PARAMETERS, POINT, SLEW
 from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
-from flight.link.events import EVENTS, ORBITAL, TESTBED, Mode, Reaction, Severity
+from flight.link.events import EVENTS, FOREIGN_MODES, Mode, Reaction, Severity
 from flight.link.process.directives import LAYOUTS as DIRECTIVE_LAYOUTS
 from flight.link.process.directives import SCHEDULE
 from flight.link.telemetry.definitions import Field, Packet
@@ -243,8 +243,8 @@ def main() -> None:
 Object = dict[str, Any]
 Body = Literal["testbed", "orbit"]
 """Kind of the controlled body: a body on a thread (testbed), or a satellite in orbit."""
-_FOREIGN = {"testbed": (POINT.name, ORBITAL), "orbit": (SLEW.name, TESTBED)}
-"""Command and modes that each kind of body refuses."""
+_FOREIGN = {"testbed": POINT.name, "orbit": SLEW.name}
+"""Command that each kind of body refuses."""
 _TENSOR = re.compile(r"(?:[xyz]{2} ){5}[xyz]{2}")
 """Pattern of the component names of a symmetric matrix in the description of a field."""
 _COMPONENTS = {3: list("xyz"), 4: list("xyzw"), 9: [a + b for a in "xyz" for b in "xyz"]}
@@ -261,13 +261,13 @@ _OWN_FORM = frozenset({LOAD_PARAMETERS.name, DUMP_PARAMETERS.name})
 
 def layouts_for(body: Body | None, layouts: Mapping[str, Layout]) -> dict[str, Layout]:
     """Return the commands that a kind of body accepts; all commands if the kind of body is not known."""
-    foreign = _FOREIGN[body][0] if body is not None else ""
+    foreign = _FOREIGN[body] if body is not None else ""
     return {name: layout for name, layout in layouts.items() if name != foreign}
 
 
 def foreign_modes(body: Body | None) -> frozenset[Mode]:
     """Return the modes that a kind of body does not have; the set is empty if the body is not known."""
-    return _FOREIGN[body][1] if body is not None else frozenset()
+    return FOREIGN_MODES[body] if body is not None else frozenset()
 
 
 def commands_for(body: Body | None, layouts: Mapping[str, Layout]) -> list[Object]:

@@ -718,5 +718,8 @@ ORBITAL = POINTING | {Mode.ACQUIRE}
 TESTBED = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
 """Modes that exist only on a testbed."""
 
+FOREIGN_MODES = {"testbed": ORBITAL, "orbit": TESTBED}
+"""Modes that each kind of body does not have."""
+
 STEERING = POINTING | TESTBED
 """Modes in which the planner and the controller steer the attitude."""

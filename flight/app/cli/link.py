@@ -23,6 +23,7 @@ from flight.app.service import (
     retried_start,
 )
 from flight.link.coding import LinkCodes
+from flight.link.events import FOREIGN_MODES
 from flight.link.frames import (
     LONGEST_FRAME,
     TELECOMMAND_HEADER,
@@ -173,6 +174,7 @@ def _open(
         idle_rate=section.idle_rate,
         encrypted=section.encrypt_telemetry,
         codes=codes,
+        foreign_modes=FOREIGN_MODES.get(config.body, frozenset()),
     )
     station = Station(settings, vault, lines, control, LogFollower(log), clock)
     return station, ", ".join(line.name for line in lines)

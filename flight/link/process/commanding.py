@@ -370,8 +370,9 @@ _WITH_MODE = {
 class Scheduling:
     """Scheduler that executes time-tagged commands. Times are UTC in ns since 1970."""
 
-    def __init__(self, timetable: Timetable) -> None:
-        self._timetable = timetable
+    def __init__(self, timetable: Timetable, foreign: frozenset[Mode] = frozenset()) -> None:
+        """Execute the entries of a timetable; commands to the `foreign` modes are refused."""
+        self._timetable, self._foreign = timetable, foreign
         self._mode: int | None = None
         # Texts of the newest entries that were due and their results, by SPI and counter.
         self._past: dict[tuple[int, int], tuple[str, str]] = {}
@@ -449,7 +450,9 @@ class Scheduling:
 
     def _add(self, scheduled: Scheduled, done: Report, utc_ns: int) -> str:
         at_ns = utc_of(scheduled.at)
-        command_of_words(scheduled.words)
+        mode = final_mode(command_of_words(scheduled.words))
+        if mode in self._foreign:
+            raise CommandError(f"{scheduled.words}: this body has no mode {mode.label}")
         if at_ns <= utc_ns:
             raise TimetableError(f"{scheduled.at} has passed: it is {_utc(utc_ns)}")
         return text_of(self._timetable.add(at_ns, done.spi, done.counter, scheduled.words))

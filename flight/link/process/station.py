@@ -22,6 +22,7 @@ from typing import Any, Protocol
 from flight.link import commands
 from flight.link.coding import LONGEST_CLTU, FrameDecoder, Framing, LinkCodes
 from flight.link.commands import CommandError, CommandPacker, filter_datagrams
+from flight.link.events import Mode
 from flight.link.files.store import files_folder
 from flight.link.files.units import UP, is_unit
 from flight.link.frames import TELECOMMAND_HEADER, TELECOMMAND_MASK, TELEMETRY_MASK, open_telecommand
@@ -427,6 +428,7 @@ class StationSettings:
         idle_rate: data rate (bytes/s) up to which frames of idle data are sent.
         encrypted: whether telemetry is encrypted in addition to its authentication.
         codes: encoders and decoders of the lines; the decoders count corrected errors.
+        foreign_modes: modes that the body does not have, for which no command can be scheduled.
     """
 
     spacecraft: int
@@ -437,6 +439,7 @@ class StationSettings:
     idle_rate: float = 0.0
     encrypted: bool = True
     codes: LinkCodes = field(default_factory=LinkCodes)
+    foreign_modes: frozenset[Mode] = frozenset()
 
 
 class Station:
@@ -484,7 +487,7 @@ class Station:
         self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
         self._playback = Playback(self._downlink, log)
-        self._scheduling = Scheduling(Timetable(vault.folder, vault.restored))
+        self._scheduling = Scheduling(Timetable(vault.folder, vault.restored), settings.foreign_modes)
         self._report(*self._scheduling.beginning())
         if vault.restored:
             self.report_problem("keys", RESTORED)

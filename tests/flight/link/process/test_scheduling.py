@@ -23,7 +23,7 @@ from flight.link.commands import (
     unpack,
     words_of,
 )
-from flight.link.events import Mode
+from flight.link.events import FOREIGN_MODES, Mode
 from flight.link.files.store import overwrite
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import (
@@ -250,6 +250,25 @@ def test_a_due_command_that_cannot_be_removed_from_the_disk_is_reported_once_and
     assert link.stages(later) == ["accepted", "completed"]
     monkeypatch.undo()
     assert texts(link, send(link, Listing()))[-1] == "1 scheduled"
+
+
+@pytest.mark.parametrize(
+    ("body", "accepted", "refused"),
+    [
+        ("orbit", ("point sun", "mode detumble", "safe", "ping 1"), ("slew 0.2", "mode hold")),
+        ("testbed", ("slew 0.2", "mode hold", "safe"), ("point sun", "mode sun", "mode point")),
+        ("own", ("slew 0.2", "point sun", "mode hold"), ()),
+    ],
+)
+def test_a_command_to_a_mode_that_the_body_does_not_have_is_not_scheduled(
+    tmp_path: Path, body: str, accepted: tuple[str, ...], refused: tuple[str, ...]
+) -> None:
+    scheduling = Scheduling(Timetable(tmp_path), FOREIGN_MODES.get(body, frozenset()))
+    done = Report(1, 12, Stage.COMPLETED, "schedule", "")
+    for words in (*accepted, *refused):
+        (answer,) = scheduling.obey(Scheduled("2099-01-01T00:00:00", words), done, 0)
+        assert answer.stage is (Stage.COMPLETED if words in accepted else Stage.FAILED)
+        assert words in accepted or "this body has no mode " in answer.text
 
 
 def _scheduling(tmp_path: Path, mode: Mode | None = Mode.HOLD) -> tuple[Scheduling, int]:
