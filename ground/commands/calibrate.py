@@ -68,6 +68,8 @@ def run(options: argparse.Namespace) -> int:
     if lens is None:
         for path, picture in pictures:
             sys.stderr.write(f"{path}: {picture.reason}\n")
+        if options.fov is not None:
+            sys.stderr.write(f"--fov {options.fov:g}: without --fov, fields from 4 to 60 deg are searched\n")
         return 1
     mirrored = "mirrored:     yes; the lens is that of the pictures as they are\n" if found.mirrored else ""
     facts = _facts(lens, pictures) | {"mirrored": found.mirrored}

@@ -112,6 +112,8 @@ def _mask(options: argparse.Namespace, pixels: Image) -> BoolArray | None:
     if options.mask is None:
         return None
     hidden = read_image(options.mask) > 0
+    if hidden.all():
+        raise UsageError(f"--mask {options.mask}: every pixel is above 0: pixels above 0 show the spacecraft")
     if hidden.shape != pixels.shape:
         sizes = [f"{shape[1]} x {shape[0]}" for shape in (hidden.shape, pixels.shape)]
         raise UsageError(f"--mask {options.mask}: {sizes[0]} pixels, but {options.image} has {sizes[1]}")

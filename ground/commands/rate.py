@@ -44,6 +44,13 @@ from knightcube.vision.streaks.streak_result import (
 
 LIKELIHOOD = "likelihood"
 
+_CURES = {
+    StreakStatus.TOO_SHORT: "expose longer; `knightcube solve` gives the attitude without a rate",
+    StreakStatus.TOO_FEW: "expose longer, or check the focus and the lens cap",
+    StreakStatus.BLACK: "take the lens cap off, or expose longer",
+    StreakStatus.SATURATED: "expose for a shorter time, or correct --saturation",
+}
+"""What to do about each reason why a picture gives no rate."""
 _SHUTTER = (
     "shutter:       not described, included in the uncertainty: give --line-time, 0 for all rows at once\n"
 )
@@ -199,7 +206,8 @@ def _reason(found: FrameMotion) -> str:
 def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:
     lines = [f"status:        {found.status.value}"]
     if _reason(found):
-        lines.append(f"why:           {_reason(found)}")
+        cure = f": {_CURES[found.status]}" if found.status in _CURES else ""
+        lines.append(f"why:           {_reason(found)}{cure}")
     if found.rate is not None and found.covariance is not None:
         sigma = np.sqrt(np.diag(found.covariance))
         size = float(np.linalg.norm(found.rate))

@@ -46,8 +46,11 @@ from knightcube.vision.star_tracker import (
 )
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings
+from knightcube.vision.streaks.streak_result import REASONS
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
+DATES = 1900, 2100
+"""Years in which the velocity of the Earth is known."""
 IMAGE = "image"
 """Name of the attitude method that fits the star positions in the image."""
 
@@ -97,6 +100,9 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Solve the picture, and print and draw the solution. The exit status is 1 without a solution."""
     check_new(options.wcs)
+    if options.date is not None and not DATES[0] <= options.date.year < DATES[1]:
+        years = f"{DATES[0]} to {DATES[1]}"
+        raise UsageError(f"--date {options.date:%Y-%m-%d}: give the time of the picture, from {years}")
     pixels = read_picture(options)
     tracker, exposure, axis_sigma = _tracker(options, pixels)
     begin = time.perf_counter()
@@ -217,7 +223,9 @@ def _motion_facts(solution: StarSolution) -> dict[str, Any] | None:
 def _text(solution: StarSolution, seconds: float, axis_sigma: float | None = None) -> str:
     lines = [f"status:           {solution.status}"]
     if not solution:
-        lines.append(f"reason:           {solution.reason}")
+        motion = solution.frame.motion
+        detail = "" if motion is None else motion.reason or REASONS.get(motion.status, "")
+        lines.append(f"reason:           {solution.reason}{f': {detail}' if detail else ''}")
         return "\n".join(lines) + "\n"
     sigma = ARCSECONDS * np.sqrt(np.diag(solution.covariance))
     stars, frame = solution.stars, solution.frame

@@ -474,5 +474,7 @@ def _text(verdict: CheckResult) -> str:
         if result.faults:
             lines.append(("injected", "; ".join(result.faults)))
     lines += [("problem", problem) for problem in verdict.problems]
-    lines.append(("verdict", "not ready" if verdict.problems else "ready"))
+    warned = result is not None and result.ending.warnings and not result.faults
+    ready = "ready, with warnings: see above" if warned else "ready"
+    lines.append(("verdict", "not ready" if verdict.problems else ready))
     return "".join(f"{name + ':' if name else '':15}{text}\n" for name, text in lines)

@@ -126,6 +126,11 @@ def test_pictures_without_stars_are_named_with_the_reason_and_exit_status_1(tmp_
     done = command("calibrate", path)
     assert done.returncode == 1
     assert "cloud.png" in done.stderr
+    assert "without --fov" not in done.stderr
+    assert (
+        "--fov 9: without --fov, fields from 4 to 60 deg are"
+        in command("calibrate", path, "--fov", "9").stderr
+    )
 
 
 def test_a_picture_that_is_given_twice_counts_once(pictures: list[Path], tmp_path: Path) -> None:

@@ -171,6 +171,14 @@ def test_a_mistake_is_reported_with_exit_status_2(words: list[str], complaint: s
     assert "Traceback" not in done.stderr
 
 
+def test_a_mask_that_hides_the_whole_picture_is_refused(folder: Path, tmp_path: Path) -> None:
+    mask = tmp_path / "mask.png"
+    pillow.fromarray(np.ones((512, 512), np.uint8)).save(mask)
+    done = command("horizon", folder / "limb.png", "--fov", "67", "--mask", mask)
+    assert done.returncode == 2
+    assert "every pixel is above 0" in done.stderr
+
+
 def test_an_uncertain_field_of_view_is_in_the_uncertainty(tmp_path: Path) -> None:
     """A field of view that is 5 % wrong does no harm if its error is given, in frames of several seeds.
 

@@ -85,6 +85,7 @@ def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path)
     pillow.fromarray(noise).save(path, compress_level=1)
     done = command("rate", path, "--fov", "5", "--exposure", "1", "--json")
     assert done.returncode == 1
+    assert "expose longer" in command("rate", path, "--fov", "5", "--exposure", "1").stdout
     facts = json.loads(done.stdout)
     assert facts["rate_rad_s"] is None
     assert facts["status"] in {"too-few", "failed", "too-short"}

@@ -444,7 +444,8 @@ KIND = TableKind(
     b"KCSKYIDX",
     _VERSION,
     "sky index",
-    "build it again with `python -m knightcube.vision.startracker.index.build`",
+    "make it with `knightcube index`; "
+    "`python -m knightcube.vision.startracker.index.build` makes the default index",
 )
 PATH = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "knightcube" / f"sky-{_VERSION}.index"

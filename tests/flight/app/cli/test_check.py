@@ -69,6 +69,15 @@ def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path)
     assert done.stdout.endswith("noticed:       no faults; no warnings\nverdict:       ready\n")
 
 
+def test_warnings_of_the_flight_are_in_the_verdict(tmp_path: Path) -> None:
+    """No path exists for a body whose inertia is a thousand times as large."""
+    plant = {**yaml.safe_load(DEMO.read_text())["plant"], "inertia": 1.05}
+    done = command("check", write(tmp_path, DEMO, camera="none", plant=plant))
+    assert done.returncode == 0, done.stderr
+    assert "warnings planner-failed (" in done.stdout
+    assert done.stdout.endswith("verdict:       ready, with warnings: see above\n")
+
+
 def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
     """The check fails if the simulated coils carry a hundredth of the current that is configured."""
     world = {**yaml.safe_load(DEMO.read_text())["simulation"], "truth": {"resistance": [2300.0] * 3}}
