@@ -76,6 +76,19 @@ def tools(tmp_path: Path) -> Tools:
     return Tools(tmp_path)
 
 
+def test_the_program_of_the_sources_needs_no_installation(tmp_path: Path) -> None:
+    """On a bench, `deploy/coils-off` of a clone finds its tool in the sources."""
+    (tmp_path / "i2cset").write_text("#!/bin/sh\nexit 1\n")
+    (tmp_path / "i2cset").chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "KNIGHTCUBE_I2C": str(tmp_path / "none")}
+    environment["STATE_DIRECTORY"] = str(tmp_path)
+    done = subprocess.run(
+        [DEPLOY / "coils-off"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert f"smbus_byte: {tmp_path}/none, address 0x40: No such file or directory" in done.stderr
+
+
 def test_the_coils_are_zeroed_by_i2cset_first(tools: Tools) -> None:
     tools.put("i2cset", 0)
     tools.put("python3", 0)
