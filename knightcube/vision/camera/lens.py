@@ -531,15 +531,26 @@ def _radial_numpy(away: FloatArray, terms: _Terms) -> tuple[FloatArray, FloatArr
     The derivatives are with respect to the square of the distance.
     """
     scale, cubic, fourth, fold = terms[4:8]
-    whole = np.sum(away**2, axis=1, keepdims=True)
-    square = np.minimum(whole, fold)
-    growth = scale + square * (cubic + square * fourth)
-    slope = np.where(whole < fold, cubic + 2.0 * fourth * square, 0.0)
-    return growth, slope, np.where(whole < fold, 2.0 * fourth, 0.0)
+    whole = np.einsum("ij,ij->i", away, away)[:, None]
+    square = whole if fold == np.inf else np.minimum(whole, fold)
+    growth, slope, change = (
+        scale + square * (cubic + square * fourth),
+        cubic + 2.0 * fourth * square,
+        2.0 * fourth,
+    )
+    if fold == np.inf:
+        return growth, slope, np.array(change)
+    inside = whole < fold
+    return growth, slope * inside, change * inside
 
 
 def _tangential_numpy(one: FloatArray, other: FloatArray, terms: _Terms) -> FloatArray:
-    """Return the symmetric bilinear form (m, 2), px, of the tangential distortion of two distances (m, 2)."""
+    """Return the symmetric bilinear form (m, 2), px, of the tangential distortion of two distances (m, 2).
+
+    Without tangential distortion, the result is a single zero.
+    """
+    if terms[8] == terms[9] == 0.0:
+        return np.zeros(1)
     across = one[:, :1] * other[:, 1:] + one[:, 1:] * other[:, :1]
     own, cross, squares = np.array(terms[9:7:-1]), np.array(terms[8:10]), one * other
     return np.asarray(own * (np.sum(squares, axis=1, keepdims=True) + 2.0 * squares) + cross * across)
@@ -576,18 +587,19 @@ def _image_motion_numpy(
     away, pixels = points - np.array(terms[:2]), _pixels_numpy(terms)
     growth, slope, change = _radial_numpy(away, terms)
     whole = 1.0 + growth
+    image = (whole * away + _tangential_numpy(away, away, terms)) @ pixels + np.array(terms[2:4])
 
     def along(step: FloatArray) -> FloatArray:
         """Return the derivative of the distortion along a step (m, 2)."""
-        closing = np.sum(away * step, axis=1, keepdims=True)
+        closing = np.einsum("ij,ij->i", away, step)[:, None]
         radial = whole * step + 2.0 * slope * closing * away
         return np.asarray(radial + 2.0 * _tangential_numpy(away, step, terms))
 
-    closing = np.sum(away * velocity, axis=1, keepdims=True)
-    square = np.sum(velocity**2, axis=1, keepdims=True)
+    closing = np.einsum("ij,ij->i", away, velocity)[:, None]
+    square = np.einsum("ij,ij->i", velocity, velocity)[:, None]
     bent = 2.0 * slope * (2.0 * closing * velocity + square * away) + 4.0 * change * closing**2 * away
     bent += 2.0 * _tangential_numpy(velocity, velocity, terms) + along(acceleration)
-    return _distorted_numpy(points, terms), along(velocity) @ pixels, bent @ pixels
+    return image, along(velocity) @ pixels, bent @ pixels
 
 
 @compiled_form_of(_image_motion_numpy)
@@ -617,7 +629,9 @@ def _image_motion(
 
 
 def _ideal_points_numpy(points: FloatArray, terms: _Terms) -> FloatArray:
-    shifted = (points - np.array(terms[2:4])) @ np.linalg.inv(_pixels_numpy(terms))
+    shifted = points - np.array(terms[2:4])
+    if terms[10] != 0.0 or terms[11] != 0.0:
+        shifted = shifted @ np.linalg.inv(_pixels_numpy(terms))
     away = shifted
     for _ in range(_MOST_INVERSIONS):
         before = away
