@@ -275,10 +275,13 @@ class PtyLine(DeviceEnd):
         select.select([self._near], [], [], max(0, due_ns - now_ns) * 1e-9)
 
     def close(self) -> None:
-        """Close the pseudo-terminal and remove the symbolic link. Calling it twice is safe."""
+        """Close the pseudo-terminal and remove the symbolic link. Calling it twice is safe.
+
+        A link that another emulator has set to its own device is kept.
+        """
         if self._near < 0:
             return
-        if self._link is not None:
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.name:
             self._link.unlink(missing_ok=True)
         os.close(self._near)
         os.close(self._far)

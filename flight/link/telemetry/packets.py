@@ -146,10 +146,13 @@ class Layout:
 def compile_layouts(packets: Iterable[Packet]) -> dict[str, Layout]:
     """Return the layouts of packets by name. Raises TelemetryError, for example for an APID used twice."""
     layouts = {packet.name: Layout(packet) for packet in packets}
-    apids = [layout.packet.apid for layout in layouts.values()]
-    if len(set(apids)) != len(apids):
-        raise TelemetryError("two packets of the definition table share an APID")
+    named: dict[int, str] = {}
     for name, layout in layouts.items():
+        apid = layout.packet.apid
+        if (first := named.setdefault(apid, name)) != name:
+            raise TelemetryError(
+                f"packets {first} and {name} share the APID 0x{apid:x}: give one another APID"
+            )
         names = [field.name for field in layout.packet.fields]
         if len({*names, "time_ns"}) != len(names) + 1:
             raise TelemetryError(f"packet {name}: a field's name is used twice, or is 'time_ns'")

@@ -23,6 +23,7 @@ from hal.drivers.vn100 import Vn100
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import CorruptData, NotResponding
 from knightcube.astro.quaternion import angle_about_axis_y
+from sim_hal.emulators.serial_line import PtyLine
 from tests.hal.vn100.bench_line import MISSION
 
 COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "vn100"]
@@ -256,3 +257,12 @@ def test_wrong_use_ends_with_status_2_and_no_traceback(arguments: list[str]) -> 
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
+
+
+def test_a_link_that_another_emulator_has_taken_over_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "unit"
+    first, second = (PtyLine(115200, np.random.default_rng(seed), path) for seed in (1, 2))
+    first.close()
+    assert os.readlink(path) == second.name
+    second.close()
+    assert not path.is_symlink()

@@ -148,7 +148,7 @@ def test_a_number_cannot_be_packed_as_text() -> None:
 
 def test_a_table_that_cannot_work_is_refused() -> None:
     one = Packet("one", 1, "-", "-", (Field("a", "u1", "-", "-"),))
-    with pytest.raises(TelemetryError, match="share an APID"):
+    with pytest.raises(TelemetryError, match="packets one and two share the APID 0x1"):
         compile_layouts([one, Packet("two", 1, "-", "-", one.fields)])
     with pytest.raises(TelemetryError, match="used twice"):
         compile_layouts([Packet("one", 1, "-", "-", one.fields * 2)])
