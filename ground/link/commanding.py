@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import os
 import socket
+import sys
 import tempfile
 import time
 from collections import deque
@@ -214,6 +215,9 @@ def command(
     found = _followed(terminal, packet, spi, seconds, show, ended)
     if spi == COMMAND_SPIS[1] or any(report.stage is Stage.REPEATED for report in found):
         terminal.learn_counters(_STATUS_S)
+        for lost in terminal.lost_spis:
+            cure = f"set a new key by `--spi {COMMAND_SPIS[1]} new-key {lost}`"
+            sys.stderr.write(f"knightcube: the satellite has lost the counter of SPI {lost}: {cure}\n")
     return found
 
 

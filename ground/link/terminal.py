@@ -38,6 +38,7 @@ _STORE_EVERY = 256  # number of telemetry frames between two writes of the anti-
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
+_LOST = -2  # value of `highest` in the packet `link` for an SPI whose counter is lost
 PORTS = 1 << 16  # number of TCP and UDP ports
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
 FRAME_OVERHEAD_BYTES = frames.TELECOMMAND_HEADER.size + security.OVERHEAD_BYTES + CRC_BYTES
@@ -116,6 +117,7 @@ class Terminal:
             restart.
         idle_frames: number of received frames of idle data.
         packet_bytes: longest packet that a telecommand frame can carry, bytes.
+        lost_spis: SPIs of commands whose counter the satellite has lost, according to the newest telemetry.
     """
 
     def __init__(
@@ -135,6 +137,7 @@ class Terminal:
         self._expected: dict[int, int] = {}  # next counter of each SPI
         self._codes = codes or settings.codes()
         self._learned = False
+        self.lost_spis: tuple[int, ...] = ()
         self.lost_frames = self.idle_frames = 0
         self.packet_bytes = settings.command_frame_bytes - FRAME_OVERHEAD_BYTES
         spis, mask, encrypted = security.TELEMETRY_SPIS, frames.TELEMETRY_MASK, settings.encrypted
@@ -245,6 +248,11 @@ class Terminal:
         """
         self._learned = True
         (row,) = LAYOUTS[LINK.name].array(packet)
+        self.lost_spis = tuple(
+            spi
+            for spi, highest in zip(security.COMMAND_SPIS, row["highest"], strict=False)
+            if highest == _LOST
+        )
         for spi, highest, generation in zip(
             security.COMMAND_SPIS, row["highest"], row["generation"], strict=False
         ):

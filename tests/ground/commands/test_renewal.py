@@ -218,7 +218,7 @@ def test_activate_succeeds_only_if_the_trial_has_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, stages: list[str], status: int, error: str
 ) -> None:
     terminal = Mock()
-    terminal.gate.refused = Counter()
+    terminal.gate.refused, terminal.lost_spis = Counter(), ()
     reports = [Report(1, 7, Stage[stage], "activate", "text") for stage in stages]
     terminal.follow.side_effect = [reports, *[[]] * 1000]
     monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: terminal)

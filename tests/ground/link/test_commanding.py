@@ -49,6 +49,7 @@ class FakeTerminal:
         self.names: list[Any] = []
         self.gate = SimpleNamespace(admitted=0, refused=Counter())
         self.learned = 0
+        self.lost_spis: tuple[int, ...] = ()
 
     def sealer(self, spi: int, block: int) -> Any:
         return SimpleNamespace(name=spi, block=block, _name=spi)
@@ -125,6 +126,13 @@ def test_the_counters_are_raised_if_they_may_be_too_low(spi: int, last: Stage, l
     double = terminal(None, [report(last, spi=spi)])
     commanding.command(double, b"x", spi, 2.0, lambda _: None)
     assert double.learned == learned
+
+
+def test_a_counter_that_the_satellite_has_lost_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    double = terminal(None, [report(Stage.COMPLETED, spi=2)])
+    double.lost_spis = (1,)
+    commanding.command(double, b"x", 2, 2.0, lambda _: None)
+    assert "lost the counter of SPI 1: set a new key by `--spi 2 new-key 1`" in capsys.readouterr().err
 
 
 def test_a_ping_follows_each_silence_so_that_a_restarted_link_knows_the_ground() -> None:

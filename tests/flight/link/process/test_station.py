@@ -129,6 +129,17 @@ def test_a_ground_with_an_older_copy_of_its_keys_continues_above_the_highest_cou
     assert unpack(link.obeyed[-1]) == Ping(3)
 
 
+def test_the_ground_receives_which_counters_the_satellite_has_lost(link: BothEnds) -> None:
+    link.turn(1.1)
+    assert link.terminal.lost_spis == ()
+    for path in link.sky.folder.glob("spi-1.*"):
+        path.unlink()
+    link.restart()
+    link.terminal.send(packet(Ping(1)), spi=2)
+    link.turn(1.1)
+    assert link.terminal.lost_spis == (1,)
+
+
 COUNTERS = [0, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1]
 SALT = 0x9ABCDEF0 << 64
 
