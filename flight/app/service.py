@@ -63,7 +63,14 @@ from flight.link.telemetry.log import Recorder
 from flight.loop.facts import EventLog
 from flight.loop.state import LARGEST_FILE, LinuxFiles, replace_file, service_folder
 from flight.schema import reader as configuration
-from flight.schema.document import ConfigError, UnreadConfigError, checked_length, no_such_file, read_text
+from flight.schema.document import (
+    ConfigError,
+    UnreadConfigError,
+    checked_length,
+    no_such_file,
+    not_utf_8,
+    read_text,
+)
 from flight.schema.sections import Config
 from hal.buses import system
 from hal.buses.system import ServiceManager, SystemClock
@@ -652,7 +659,7 @@ def _text(path: Path, data: bytes) -> str:
     try:
         return checked_length(data.decode("utf-8"), path)
     except UnicodeDecodeError as error:
-        raise ConfigError(str(path), f"cannot be read: {error}") from error
+        raise not_utf_8(path, error) from error
 
 
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:

@@ -234,8 +234,14 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise UnreadConfigError(str(path), f"cannot be read: {error}") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(str(path), f"cannot be read: {error}") from error
+        raise not_utf_8(path, error) from error
     return checked_length(text, path)
+
+
+def not_utf_8(path: Path, error: UnicodeDecodeError) -> ConfigError:
+    """Return the error for a file that is not UTF-8, with the wrong byte."""
+    byte = error.object[error.start]
+    return ConfigError(str(path), f"is not UTF-8, byte 0x{byte:02x}: save the file as text in UTF-8")
 
 
 def names() -> list[str]:
@@ -350,6 +356,7 @@ def _read_once(text: str, name: str) -> Document:
         mark = getattr(error, "problem_mark", None)
         where = f"{name}:{mark.line + 1}" if mark else name
         problem = getattr(error, "problem", None) or str(error)
+        problem += next((cure for text, cure in _YAML_CURES.items() if text in problem), "")
         raise ConfigError(where, f"is not YAML: {problem.splitlines()[0]}") from error
     if not isinstance(values, dict):
         raise ConfigError(name, "must be a mapping of sections, see config/step_demo.yaml")
@@ -481,10 +488,19 @@ def _key_problem(message: str, shape: Any, path: str, dotted: str) -> tuple[str,
     return dotted, f"has a wrong key: {_plain(message)}"
 
 
+_YAML_CURES = {
+    "'\\t'": ": indent with spaces",
+    "another document": ": remove the line `---`",
+    "expected <block end>": ": check brackets, commas and the indentation",
+}
+"""What to do about texts that are not YAML, by a part of the message of the parser."""
+
+
 def _unit_hint(dotted: str, value: Any, message: str) -> str:
     """Return a hint about a number with a unit, and about an angle in rad that a key expects in deg."""
     if isinstance(value, str) and "a number" in message and re.match(r"\s*[-+]?[0-9]", value):
-        return ": write the number without a unit"
+        quoted = re.fullmatch(r"\s*[-+]?[0-9.]+([eE][-+]?[0-9]+)?\s*", value)
+        return f": write the number without {'quotes' if quoted else 'a unit'}"
     if dotted.endswith("_deg") and isinstance(value, int | float) and " >" in message and 0.0 < value < 6.3:
         return f": the unit is deg, and {value:g} rad are {math.degrees(value):.4g} deg"
     return ""

@@ -129,6 +129,8 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
         ("name: step-demo", "name: a\nname: b", "`name` is given twice, first in line"),
         ("name: step-demo", "name: [", "is not YAML"),
+        ("  inertia:", "\tinertia:", "is not YAML: .*: indent with spaces"),
+        ("inertia: 1.05e-3", "inertia: '1.05e-3'", r"is '1.05e-3': .*\): write the number without quotes"),
         ("plant:", "plant: 3\nplant2:", "`plant` is 3"),
         ("thread_stiffness", "stiff", "`plant.stiff` is an unknown key"),
         ("supply_voltage", "supply", "`coils.supply` is an unknown key, did you mean `supply_voltage`"),

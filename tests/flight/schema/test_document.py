@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
+from flight.app.service import accepted_config
 from flight.schema.document import (
     MODULES,
     ConfigError,
@@ -378,3 +379,13 @@ def test_a_list_that_another_user_owns_or_a_fifo_permits_nothing(tmp_path: Path)
     for file in (path, fifo, link):
         with pytest.raises(ConfigError, match="add it as a line"):
             imported("simulation.world", "math:tau", {}, {MODULES: str(file)})
+
+
+@pytest.mark.parametrize("read", [read_text, lambda path: accepted_config(path, {}).text])
+def test_a_file_in_another_encoding_names_the_byte_and_the_cure(
+    tmp_path: Path, read: Callable[[Path], str]
+) -> None:
+    path = tmp_path / "latin.yaml"
+    path.write_bytes("name: café\n".encode("latin-1"))
+    with pytest.raises(ConfigError, match="is not UTF-8, byte 0xe9: save the file as text in UTF-8"):
+        read(path)
