@@ -27,7 +27,9 @@ _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)(?:\+([0-9]+))?")
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that name a picture file."""
-    parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, BMP, FITS, or see --raw")
+    parser.add_argument(
+        "image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, BMP, PGM, FITS, or see --raw"
+    )
     text = (
         "IMAGE is raw pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16, "
         "or 1280x960x16+512 after a header of 512 bytes"

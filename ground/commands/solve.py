@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Determine where a picture of the sky points: right ascension, declination and roll (the position "
         "angle of up, from north through east), ICRS; which stars it shows; and, from star streaks, "
-        "how the camera turned. PNG, TIFF, JPEG, BMP or FITS. Without --fov or --camera all fields from "
+        "how the camera turned. PNG, TIFF, JPEG, BMP, PGM or FITS. Without --fov or --camera all fields from "
         f"{UNKNOWN_FOV_DEG[0]:g} to {UNKNOWN_FOV_DEG[1]:g} deg are searched."
     )
     parser.epilog = "example: knightcube solve night.jpg --fov 11.4 --overlay solved.png"

@@ -103,7 +103,7 @@ def test_own_pictures_of_any_kind_are_solved_or_refused_with_a_reason(tmp_path: 
         assert declination == pytest.approx(math.degrees(sky.declination), abs=0.01)
         assert line.endswith(", mirrored") == (name == "mirrored.tif")
     assert lines[4].startswith("dark.jpg: no-stars: ")
-    assert lines[5].startswith("notes.txt: is not a PNG, TIFF, JPEG, BMP or FITS image")
+    assert lines[5].startswith("notes.txt: is not a PNG, TIFF, JPEG, BMP, PGM or FITS image")
 
 
 def test_the_step_of_its_example_is_optimal_within_its_horizon() -> None:

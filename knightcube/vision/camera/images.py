@@ -1,4 +1,4 @@
-"""Reads image files as arrays (PNG, TIFF, JPEG and BMP through Pillow, and FITS) and writes images.
+"""Reads image files as arrays (PNG, TIFF, JPEG and BMP through Pillow, FITS and PGM) and writes images.
 
     pixels = read_image("night.fits")      # counts (rows, columns), unchanged from the file
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
@@ -23,6 +23,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import re
 import struct
 import sys
 import warnings
@@ -219,18 +220,43 @@ _OTHER_BYTES = {
 
 
 def read_image(path: Path | str, *, upright: bool = True) -> Image:
-    """Return the image (rows, columns) of a FITS, PNG, TIFF, JPEG or BMP file.
+    """Return the image (rows, columns) of a FITS, PNG, TIFF, JPEG, BMP or PGM file.
 
     The format is recognised by the file's content, not by its name. The pixels are uint8 or uint16. The
     pixels of FITS files may also be signed, 32-bit or floating-point. Colour images are converted to
     luminance (ITU-R BT.601). Photographs are rotated according to the orientation in their EXIF data unless
     `upright` is false: then rows and columns are those of the camera's detector, as a calibrated lens needs
-    them. All formats except FITS need Pillow. Raises UsageError if the file is missing, damaged or in an
-    unsupported format, if pixels are not finite, or if Pillow is not installed.
+    them. All formats except FITS and PGM need Pillow. Raises UsageError if the file is missing, damaged or
+    in an unsupported format, if pixels are not finite, or if Pillow is not installed.
     """
     path = Path(path)
-    content = _fits_content(path)
-    return fits_image(content, str(path)) if content else _through_pillow(path, upright)
+    if content := _fits_content(path):
+        return fits_image(content, str(path))
+    with suppress(OSError), path.open("rb") as file:
+        if file.read(2) == b"P5":
+            return grey_map_image(path.read_bytes(), str(path))
+    return _through_pillow(path, upright)
+
+
+_SPACE = rb"(?:\s|#[^\n]*\n)+"
+_GREY_MAP = re.compile(rb"P5" + _SPACE + rb"(\d{1,7})" + _SPACE + rb"(\d{1,7})" + _SPACE + rb"(\d{1,5})\s")
+"""Header of a binary PGM file: columns, rows and largest count, between spaces and comments."""
+
+
+def grey_map_image(content: bytes, name: str) -> Image:
+    """Return the counts (rows, columns), uint8 or uint16, in the bytes of a binary PGM file (Netpbm, P5).
+
+    Raises UsageError, with the file's `name` in its message, for a damaged file.
+    """
+    found = _GREY_MAP.match(content)
+    columns, rows, largest = (int(number) for number in found.groups()) if found else (0, 0, 0)
+    if found is None or not (columns and rows and 0 < largest < 1 << 16):
+        raise UsageError(f"{name}: is damaged: its PGM header has no columns, rows and largest count")
+    kind = np.dtype("u1") if largest < 256 else np.dtype(">u2")
+    if len(content) - found.end() < columns * rows * kind.itemsize:
+        raise UsageError(f"{name}: ends before the last of {columns} x {rows} pixels: it was cut short")
+    pixels = np.frombuffer(content, kind, columns * rows, found.end())
+    return pixels.reshape(rows, columns).astype(kind.newbyteorder("="))
 
 
 def read_raw(path: Path, columns: int, rows: int, bits: int, header: int | None = 0) -> Image:
@@ -278,13 +304,17 @@ _EXIF_FOLDER, _EXPOSURE_TIME = 0x8769, 0x829A
 def stated_exposure(path: Path) -> float | None:
     """Return the exposure time (s) in the metadata of an image file, or None.
 
-    The metadata are EXPTIME or EXPOSURE of a FITS file, and ExposureTime of the EXIF data of other files.
+    The metadata are EXPTIME or EXPOSURE of a FITS file, those of a frame that a flight kept (`keep_frame`),
+    and ExposureTime of the EXIF data of other files.
     Raises UsageError if a FITS file cannot be read.
     """
     value: Any = None
     # Damaged metadata are ignored; `read_image` reports damaged files.
     with suppress(ImportError, OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError):
-        if content := _fits_content(path):
+        kept = path.read_bytes() if path.suffix.lower() == ".pgm" else b""
+        if kept.startswith(b"P5\n# {"):
+            value = facts_of(kept).get("exposure_s")
+        elif content := _fits_content(path):
             header = _first_image(content, str(path))[0]
             value = next((header[key] for key in ("EXPTIME", "EXPOSURE") if key in header), None)
         else:
@@ -338,7 +368,7 @@ def _through_pillow(path: Path, upright: bool) -> Image:
             picture.load()
             return _upright(_grey(path, picture), picture, upright)
     except UnidentifiedImageError as error:
-        raise UsageError(f"{path}: is not a {', '.join(FORMATS)} or FITS image: convert it") from error
+        raise UsageError(f"{path}: is not a {', '.join(FORMATS)}, PGM or FITS image: convert it") from error
     except pillow.DecompressionBombError as error:
         raise UsageError(f"{path}: has too many pixels: {error}") from error
     # Pillow raises exceptions of many types for damaged files.

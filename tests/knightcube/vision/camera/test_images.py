@@ -22,6 +22,7 @@ from knightcube.vision.camera.images import (
     fits_image,
     grey_stretch,
     keep_frame,
+    portable_grey_map,
     read_image,
     stated_exposure,
     write_picture,
@@ -186,14 +187,14 @@ def test_pixels_of_another_kind_are_refused(tmp_path: Path) -> None:
 def test_a_file_that_is_not_an_image_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS") as caught:
+    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP, PGM or FITS") as caught:
         read_image(path)
     assert "\n" not in str(caught.value)
 
 
 def test_a_gif_is_refused(tmp_path: Path) -> None:
     pillow.fromarray(EIGHT).save(tmp_path / "a.gif")
-    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS"):
+    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP, PGM or FITS"):
         read_image(tmp_path / "a.gif")
 
 
@@ -412,6 +413,27 @@ def test_a_full_disk_loses_only_the_stored_frame(tmp_path: Path) -> None:
     keep_frame(KeptFrames(tmp_path / "file" / "frames", 3, "a"), np.zeros((2, 2), np.uint8), {})
     with pytest.raises(ValueError, match="no kept frame"):
         facts_of(b"P5\n2 2\n255\n")
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_frame_that_a_flight_kept_is_read_with_its_exposure(
+    tmp_path: Path, kind: type[np.unsignedinteger]
+) -> None:
+    pixels = np.arange(20 * 30).reshape(20, 30).astype(kind)
+    path = tmp_path / "frame.pgm"
+    path.write_bytes(portable_grey_map(pixels, {"exposure_s": 0.4}))
+    assert read_image(path).dtype == kind
+    assert np.array_equal(read_image(path), pixels)
+    assert stated_exposure(path) == 0.4
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(UsageError, match="ends before the last of 30 x 20 pixels"):
+        read_image(path)
+    path.write_bytes(b"P5 # by another program\n30 20 # size\n4095\n" + pixels.astype(">u2").tobytes())
+    assert np.array_equal(read_image(path), pixels)
+    assert stated_exposure(path) is None
+    path.write_bytes(b"P5\n30 0\n255\n")
+    with pytest.raises(UsageError, match="its PGM header has no columns, rows and largest count"):
+        read_image(path)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
