@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from flight.schema.bodies import OrbitConfig
-from flight.schema.devices import Camera, UnitCalibration, WideCamera, driver_of
+from flight.schema.devices import Camera, CameraLens, UnitCalibration, WideCamera, driver_of, lens_model
 from flight.schema.devices import camera_model as lens_of
 from flight.schema.document import ConfigError
 from flight.schema.sections import Config
@@ -305,9 +305,24 @@ def emulated_camera(
 ) -> EmulatedCamera:
     """Return the star camera on a moving body, with the given `mounting` (4,) or the configured mounting."""
     mounting = np.array(camera.mounting) if mounting is None else mounting
+    if sky.lens is not None:
+        mounting = multiply(_between_axes(camera, sky.lens), mounting)
     readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
     tracks = no_objects if objects is None else objects.tracks
     return EmulatedCamera(motion, expose, now_ns, readout_ns, mounting, scan_ns, tracks)
+
+
+def _between_axes(camera: Camera, true: CameraLens) -> FloatArray:
+    """Return the rotation (4,) from the camera axes of the configuration to the axes of the true lens.
+
+    The mounting of a camera is measured with the true lens: it holds for the direction in which the pixel on
+    the configured optical axis looks.
+    """
+    lens = lens_model(true, camera.columns, camera.rows)
+    x, y, z = lens.unit_vectors(np.array([lens_of(camera).centre]))[0]
+    sine = math.hypot(x, y)
+    angle = math.atan2(sine, z)
+    return from_rotation_vector(np.array([y, -x, 0.0]) * (angle / sine if sine > 0.0 else 1.0))
 
 
 def fault_generator(seed: int) -> np.random.Generator:
@@ -319,9 +334,9 @@ def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
     """Return the optics and detector of an emulated star camera."""
     from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415 - see above
 
-    lens = lens_of(camera)
+    lens = camera.lens if sky.lens is None else sky.lens
     return StarCameraModel(
-        lens=lens if isinstance(lens, Lens) else None,
+        lens=None if lens is None else lens_model(lens, camera.columns, camera.rows),
         columns=camera.columns,
         rows=camera.rows,
         field_of_view=float(np.deg2rad(camera.field_of_view_deg)),

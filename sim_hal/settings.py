@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from flight.schema.devices import Battery, Winding
+from flight.schema.devices import Battery, CameraLens, Winding
 from flight.schema.document import Inertia, NotNegative, Positive, Quaternion, Section
 from hal.interfaces.devices import MOST_COILS
 
@@ -184,7 +184,8 @@ class SkySection(Section, frozen=True, kw_only=True):
     The model of Sease 2013, chapter 2, corresponds to `psf: bilinear` and `noise: uniform`. In orbit, stray
     light saturates a frame if the boresight is within `sun_exclusion_deg` of the Sun or within
     `earth_exclusion_deg` of sunlit ground, and whenever one of them is in the field of view. The default
-    exclusion angles are typical of a star tracker with a baffle that fits into a CubeSat.
+    exclusion angles are typical of a star tracker with a baffle that fits into a CubeSat. The value `lens`
+    describes the true lens, by default that of the camera section.
     """
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
@@ -195,6 +196,7 @@ class SkySection(Section, frozen=True, kw_only=True):
     full_well: Positive = 20000.0
     readout: NotNegative = 0.05
     line_time: NotNegative = 0.0
+    lens: CameraLens | None = None
     psf: Literal["integrated", "bilinear"] = "integrated"
     noise: Literal["poisson", "uniform"] = "poisson"
     sun_exclusion_deg: ExclusionAngle = 40.0

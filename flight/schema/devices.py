@@ -603,9 +603,13 @@ def camera_model(camera: Camera | WideCamera) -> CameraModel:
     """Return the calibrated lens of a camera, or a pinhole with its field of view. Raises LensError."""
     if camera.lens is None:
         return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
-    lens = camera.lens
+    return lens_model(camera.lens, camera.columns, camera.rows)
+
+
+def lens_model(lens: CameraLens, columns: int, rows: int) -> Lens:
+    """Return a lens in front of a detector of `columns` x `rows` pixels. Raises LensError."""
     shape = lens.aspect, lens.shear, lens.p1, lens.p2
-    return Lens(camera.columns, camera.rows, lens.focal_length, lens.centre, lens.k1, lens.k2, *shape)
+    return Lens(columns, rows, lens.focal_length, lens.centre, lens.k1, lens.k2, *shape)
 
 
 def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:

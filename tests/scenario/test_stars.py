@@ -9,10 +9,11 @@ import pytest
 
 from flight.schema import reader as configuration
 from flight.schema.bodies import as_testbed
+from flight.schema.devices import CameraAccuracy, CameraLens
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.support.attitude_errors import assert_solved, star_errors
-from tests.support.flights import TEXT, Rigged, demo_config, event_names, fly
+from tests.support.flights import TEXT, Rigged, demo_config, demo_world, event_names, fly
 
 _LOST, _TRACKED = 0, 1
 
@@ -123,3 +124,28 @@ def test_a_distorted_lens_that_the_configuration_describes_is_corrected(tmp_path
     streaks = run["streak"][run["streak"]["status"] == b"rate"]
     assert len(streaks) == 2
     assert streaks["accepted"].all()
+
+
+def test_a_lens_unlike_its_description_is_learned_and_does_not_bias_the_attitude(tmp_path: Path) -> None:
+    """The true lens differs by one standard deviation in focal length, optical axis and distortion.
+
+    The configured mounting holds for the pixel on the configured optical axis, although the true axis is
+    elsewhere.
+    """
+    config, world = demo_config(43.0), demo_world()
+    assert config.camera is not None
+    accuracy = CameraAccuracy(focal_length=0.001)
+    camera = configuration.replace(config.camera, accuracy=accuracy)
+    config = configuration.replace(config, camera=camera, steps=config.steps[:1])
+    lens = CameraLens(focal_length=2906.6, centre=(513.5, 509.5), k1=0.08)
+    section = configuration.replace(world, sky=configuration.replace(world.sky, lens=lens))
+    run = fly(config, tmp_path, section=section)
+    assert_solved(run)
+    assert run["stars"]["accepted"].all()
+    error, covariance = star_errors(run)
+    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+    assert np.mean(squares) < 6.0
+    assert np.abs(error[-3:]).max() < 0.2 / 2906.6
+    learned = run["lens"][-1]
+    assert learned["focal_length"] == pytest.approx(2906.6, abs=0.3)
+    assert learned["centre"] == pytest.approx([513.5, 509.5], abs=0.5)
