@@ -230,7 +230,7 @@ def _field(
     if rotated and constant > max(_OFFSET_SIGMAS * float(sigmas[1]), _OFFSET_SHARE * strength):
         corrected = HorizontalField(strength, float(sigmas[0]), len(complex_field), constant)
         return corrected if constant < _MOST_OFFSET * strength else None
-    magnitude = np.abs(complex_field)
+    magnitude = np.hypot(field[off, 0], field[off, 2])
     sigma = float(np.std(magnitude, ddof=1) / np.sqrt(len(magnitude)))
     return HorizontalField(float(np.mean(magnitude)), sigma, len(magnitude))
 
