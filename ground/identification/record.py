@@ -92,7 +92,8 @@ def read_record(run: Run, stale_after: float) -> Record:
     control, imu, label = run["control"], run["imu"], run["run"]
     if len(control) < 2 or len(imu) < MIN_SAMPLES or not len(label):
         raise IdentificationError(
-            f"{run.folder}: {len(imu)} samples and {len(control)} control cycles: the run is too short"
+            f"{run.folder}: {len(imu)} samples and {len(control)} control cycles: the run is too short, "
+            f"identification needs {MIN_SAMPLES} samples"
         )
     _refuse_impossible(run, label)
     if np.any(control["current_written"][:, 1:].astype(float)):
