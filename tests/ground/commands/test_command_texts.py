@@ -120,9 +120,9 @@ def test_a_motion_without_rate_or_covariance_prints_none(missing: str) -> None:
 def test_without_a_rate_the_reason_is_printed() -> None:
     none = motion(status=StreakStatus.TOO_FEW, rate=None, covariance=None, length=math.nan, residual=math.nan)
     reason = REASONS[StreakStatus.TOO_FEW]
-    assert rate._text(none, ()).splitlines() == [
-        "status:        too-few", f"why:           {reason}", "streaks:       2 found, 1 used",
-    ]  # fmt: skip
+    status, why, streaks = rate._text(none, ()).splitlines()
+    assert (status, streaks) == ("status:        too-few", "streaks:       2 found, 1 used")
+    assert why.startswith(f"why:           {reason}: "), "the remedy follows the reason"
     facts = rate._facts(none, (), "harris")
     assert facts == {
         "method": "harris", "status": "too-few", "reason": reason, "rate_rad_s": None,
