@@ -118,6 +118,6 @@ def test_the_field_is_measured_half_a_second_after_the_coils_went_off() -> None:
 def test_a_flight_of_200_samples_is_long_enough() -> None:
     assert len(flown([(0.0, 0.0, 0.0), (0.2, 0.0, 0.0)], samples=200).time) == 200
     with pytest.raises(
-        IdentificationError, match="199 samples .* too short, identification needs 200 samples"
+        IdentificationError, match=r"199 samples .* too short, identification needs 200 samples"
     ):
         flown([(0.0, 0.0, 0.0), (0.2, 0.0, 0.0)], samples=199)
