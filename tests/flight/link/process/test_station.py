@@ -131,7 +131,7 @@ def test_a_ground_with_an_older_copy_of_its_keys_continues_above_the_highest_cou
 
 def test_the_ground_receives_which_counters_the_satellite_has_lost(link: BothEnds) -> None:
     link.turn(1.1)
-    assert link.terminal.lost_spis == ()
+    assert not link.terminal.lost_spis
     for path in link.sky.folder.glob("spi-1.*"):
         path.unlink()
     link.restart()
