@@ -27,6 +27,7 @@ from flight.schema.devices import (
     UnitSection,
     V4l2Device,
     WideCamera,
+    camera_model,
     fitted_devices,
     structure_mask,
     with_drivers,
@@ -44,6 +45,7 @@ from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
+from knightcube.vision.camera.lens import LensError
 
 Refuse = Callable[[str, str], None]
 """Function that raises the error about a value; its arguments are the value's dotted name and the problem."""
@@ -415,8 +417,13 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
         refuse(f"link.{named}", str(error))
 
 
+# Largest distance of the optical axis from the image centre along a side of the image, relative to the side.
+_MOST_OFF_CENTRE = 0.25
+
+
 def _check_wide_camera(dotted: str, camera: WideCamera, first: WideCamera, refuse: Refuse) -> None:
     _check_length(f"{dotted}.mounting", camera.mounting, refuse)
+    _check_lens(dotted, camera, refuse)
     try:
         structure_mask(camera, of_file=False)
     except UsageError as error:
@@ -427,7 +434,23 @@ def _check_wide_camera(dotted: str, camera: WideCamera, first: WideCamera, refus
             refuse(f"{dotted}.{name}", problem)
 
 
+def _check_lens(dotted: str, camera: Camera | WideCamera, refuse: Refuse) -> None:
+    """Refuse a lens that cannot be that of the camera, such as a lens calibrated with another image size."""
+    if camera.lens is None:
+        return
+    try:
+        camera_model(camera)
+    except LensError as error:
+        refuse(f"{dotted}.lens", f"is refused: {error}")
+        return
+    (x, y), (columns, rows) = camera.lens.centre, (camera.columns, camera.rows)
+    if abs(x - 0.5 * columns) > _MOST_OFF_CENTRE * columns or abs(y - 0.5 * rows) > _MOST_OFF_CENTRE * rows:
+        problem = f"is ({x:g}, {y:g}): far from the centre of an image of {columns} x {rows} pixels"
+        refuse(f"{dotted}.lens.centre", f"{problem}; give the lens of a calibration with images of this size")
+
+
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
+    _check_lens("camera", camera, refuse)
     if camera.exposure >= camera.period:
         refuse("camera.exposure", "must be shorter than `camera.period`")
     if camera.streak_exposure is not None:

@@ -162,6 +162,16 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
         (f"{{at: {SECOND_TARGET},", "{at: 0.0,", r"`targets\[1\].at` is 0.0: .* in order of time"),
         ("fine_period: 10.0", "fine_period: 3.0", "`camera.fine_period` is 3: .* least `camera.period` .5"),
         ("[0.1, 1.0]", "[1.0, 0.1]", "`camera.streak_exposure`.*must be a minimum"),
+        (
+            "columns: 512",
+            "lens: {focal_length: 2900.0, centre: [514.0, 509.0]}\n  columns: 512",
+            r"`camera.lens.centre` is \(514, 509\): .* 512 x 512 pixels; give the lens of",
+        ),
+        (
+            "columns: 512",
+            "lens: {focal_length: 1450.0, centre: [256.0, 255.0], k1: -50.0}\n  columns: 512",
+            "`camera.lens` is refused: k1 -50.0",
+        ),
         ("point: sun}", "point: moon}", r"`targets\[0\].point` is 'moon'.*nadir"),
         (
             "point: sun}",
