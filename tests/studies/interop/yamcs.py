@@ -65,7 +65,7 @@ _BRIEF: list[tuple[str, dict[str, Any]]] = [
     ("safe", {"reason": "end of pass"}),
     ("play", {"run": 0, "begin": 0, "end": 2}),
     ("stop-playback", {}),
-    ("schedule", {"at": "2099-01-01T00:00:00", "words": "point ground 52.5deg 13.4deg roll 90deg"}),
+    ("schedule", {"at": "2099-01-01T00:00:00", "words": "slew -0.3"}),
     ("list-schedule", {}),
     ("unschedule", {"number": 0}),
     ("list-files", {"entity": "another-ground-station", "under": ""}),
