@@ -8,11 +8,11 @@ import os
 import socket
 import sys
 import tempfile
-import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import get_type_hints
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
@@ -40,6 +40,7 @@ from flight.link.telemetry.log import SUFFIX
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
 from flight.schema.document import config_path
 from flight.schema.reader import load
+from flight.schema.sections import Link
 from ground.link.terminal import (
     ADDRESSES,
     DEFAULTS,
@@ -57,9 +58,7 @@ _BLOCK = 64  # number of frame counters reserved at once, because each reservati
 _SILENCE_S = 5.0
 """Time (s) without telemetry after which the ground sends a ping while it awaits the reports on a command."""
 _STATUS_S = 1.5  # longest time (s) to wait for the packet `link`, which is sent once a second
-_REASON_S = 2.0  # longest time (s) to wait for the satellite's reason for the end of a transfer
-_RANGES = {"spacecraft": (0, 1023), "frame_bytes": (128, 2048)}
-"""Permitted values of the link's settings, as in the configuration (`flight.schema.sections.Link`)."""
+_REASON_NS = 2_000_000_000  # longest time (ns) to wait for the satellite's reason for the end of a transfer
 _REPEAT_NS = 5_000_000_000  # time (ns) after which an unanswered command is sent again
 _BURST_S = 0.05  # longest time (s) over which unused transmission capacity accumulates
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
@@ -145,10 +144,12 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
     if section is None:
         raise UsageError(f"{options.config}: has no section `link`")
     settings = TerminalSettings.of(section)
-    for name, (low, high) in _RANGES.items():
+    hints = get_type_hints(Link, include_extras=True)
+    for name in ("spacecraft", "frame_bytes"):
         if (value := getattr(options, name)) is not None:
-            if not low <= value <= high:
-                raise UsageError(f"--{name.replace('_', '-')} {value}: must be {low} to {high}")
+            (limits,) = hints[name].__metadata__
+            if not limits.ge <= value <= limits.le:
+                raise UsageError(f"--{name.replace('_', '-')} {value}: must be {limits.ge} to {limits.le}")
             settings = replace(settings, **{name: value})
     return open_terminal(options.link, options.keys, settings)
 
@@ -317,10 +318,10 @@ class FileSession:
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
-        self._failed: list[tuple[Progress, float]] = []  # failed transfers, each with the time (s) to wait
+        self._failed: list[tuple[Progress, int]] = []  # failed transfers; when (ns) to stop waiting
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
-        self._credit, self._credit_ns = 0.0, now_ns
+        self._credit, self._credit_ns = 0.0, now_ns  # transmission capacity at the last call of `transmit`
 
     def ask(self, directive: Directive, now_ns: int) -> None:
         """Send a command and repeat it until the satellite answers.
@@ -399,10 +400,10 @@ class FileSession:
         self.entity.ended.clear()
         for one in found:
             if one.condition != 0:
-                self._failed.append((one, time.monotonic() + _REASON_S))
+                self._failed.append((one, self._credit_ns + _REASON_NS))
         for one, until in self._failed:
             # The satellite's reason is in the packet `transfer`, which may follow the end of the transfer.
-            if (one.source, one.number) in self._texts or time.monotonic() >= until:
+            if (one.source, one.number) in self._texts or self._credit_ns >= until:
                 raise KnightCubeError(f"{one.name}: {self.reason_of(one)}")
         return bool(found) and not self._failed
 

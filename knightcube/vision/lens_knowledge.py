@@ -25,7 +25,6 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.lens import (
-    FOURTH_AS,
     SHAPE_TERMS,
     UNSTATED,
     CameraKnowledge,
@@ -314,6 +313,8 @@ _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
 """
 _SECOND_TERM = 1.0 / 3.0
 """Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
+_FOURTH_AS = -0.3, 1.2
+"""Coefficients of the least-squares fit of 1 and r^2 to r^4 over an image, with r = 1 at the corners."""
 _FOURTH_LEFT = 0.058
 """RMS error, over the image, of the approximation of a fourth power by a constant and a quadratic term."""
 _PSF_PRIOR, _PSF_NOISE = 0.3, 0.05
@@ -458,7 +459,7 @@ class LensKnowledge:
         including the effect of the focal length.
         """
         f, square = float(self.values[0]), (math.hypot(*self.configured.ideal.centre) / self.values[0]) ** 2
-        constant, quadratic = FOURTH_AS
+        constant, quadratic = _FOURTH_AS
         by = np.zeros((5, len(self.values)))
         by[0, 0], by[0, 4] = 1.0 / f, constant * square**2
         by[1, 1] = by[2, 2] = by[4, _LINE_TIME] = 1.0

@@ -9,7 +9,9 @@ tangents d = u (1 + k1 |u|^2 + k2 |u|^4) + (2 p1 u_x u_y + p2 (|u|^2 + 2 u_x^2),
 u_x u_y) (Brown 1966, radial and tangential terms). The matrix A = ((1 + aspect, shear), (shear, 1 - aspect))
 describes pixels that are not square. Beyond the field angle at which the distorted radius reaches its
 maximum, the distortion polynomial folds back: two field angles give the same pixel. A `Lens` images no
-direction beyond the fold of its distortion, and raises LensError if the fold lies within the detector.
+direction beyond the fold of its distortion, and raises LensError if the fold lies within the detector. A
+`DistortedPinhole` has the same image as a `Lens`, and also the derivatives of the distortion along the paths
+of stars.
 
 The class `Exposures` computes the exposure time at which streaks are long enough for an accurate rate.
 """
@@ -318,7 +320,7 @@ class Lens:
         """The angle from the boresight to the farthest corner of the detector, rad."""
         if self.p1 == self.p2 == self.aspect == self.shear == 0.0:
             return math.atan(float(self._undistorted(np.array([self._corner()]))[0]))
-        return float(np.arccos(np.min(self.unit_vectors(self._corners())[:, 2])))
+        return float(np.arccos(np.min(self.unit_vectors(_corners(self.columns, self.rows))[:, 2])))
 
     def _corner(self) -> float:
         """Return the largest distance of a corner of the detector from the axis, in focal lengths."""
@@ -327,10 +329,6 @@ class Lens:
             max(place + 0.5, side - 0.5 - place) for place, side in ((x, self.columns), (y, self.rows))
         )
         return math.hypot(across, down) / self.focal_length
-
-    def _corners(self) -> FloatArray:
-        right, bottom = self.columns - 0.5, self.rows - 0.5
-        return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def _limit(self) -> float:
         """Return the distorted tangent of the field angle whose undistorted tangent is `reach`."""
@@ -486,9 +484,7 @@ class DistortedPinhole(Pinhole):
     @property
     def half_diagonal(self) -> float:
         """The angle from the axis to the farthest corner of the detector, rad."""
-        right, bottom = self.columns - 0.5, self.rows - 0.5
-        corners = np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
-        away = self.undistorted(corners) - np.array(self.centre)
+        away = self.undistorted(_corners(self.columns, self.rows)) - np.array(self.centre)
         return float(np.arctan(np.hypot(*away.T).max() / self.focal_length))
 
     def project(self, vectors: FloatArray) -> FloatArray:
@@ -694,6 +690,12 @@ def streak_camera(camera: CameraModel) -> Pinhole:
     return camera if isinstance(camera, Pinhole) else DistortedPinhole.of(Lens.of(camera))
 
 
+def _corners(columns: int, rows: int) -> FloatArray:
+    """Return the positions (4, 2), px, of the corners of a detector."""
+    right, bottom = columns - 0.5, rows - 0.5
+    return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
+
+
 def check_camera(camera: CameraModel) -> None:
     """Raise ArgumentError unless `camera` is a `Pinhole` or a `Lens`."""
     if not isinstance(camera, Pinhole | Lens):
@@ -747,9 +749,6 @@ class MountedCamera:
         """Transform rays (..., 3) from camera axes to body axes."""
         return np.asarray(rays @ self.to_camera)
 
-
-FOURTH_AS = -0.3, 1.2
-"""Coefficients of the least-squares fit of 1 and r^2 to r^4 over an image, with r = 1 at the corners."""
 
 UNSTATED = 30e-6
 """Standard deviation (s) of an unknown line time of a rolling shutter, for a typical readout time of 30 ms.

@@ -834,15 +834,15 @@ def detect_objects(
     rotation = finite_array("rate", rate, (3,)) * exposure
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     none = DetectedObjects((), np.empty((0, 3)), np.empty((0, 3, 3)))
-    simple = streak_camera(camera)
-    if not _keeps_stars(rotation, simple):
+    model = streak_camera(camera)
+    if not _keeps_stars(rotation, model):
         angle = float(np.linalg.norm(rotation))
         reason = f"no star remains in the image during a rotation by {angle:.3g} rad: check rate and exposure"
         return replace(none, reason=reason)
     saturation = None if settings.saturation is None else (settings.saturation - zero) / unit
     settings = replace(settings, gain=gain_in_counts(settings.gain, unit), saturation=saturation)
     ends = EndpointSettings(gain=settings.gain, saturation=settings.saturation)
-    report = detect(pixels, simple, rotation, exposure, ends, settings)
+    report = detect(pixels, model, rotation, exposure, ends, settings)
     if report is None:
         return replace(none, reason=f"fewer than {ends.least_streaks} significant streaks")
     if problem := _problem_of_rate(report):

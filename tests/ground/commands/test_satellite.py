@@ -437,6 +437,7 @@ class Session:
         self._reports: list[Report] = []
         self.entity = SimpleNamespace(ended=[], transfers=list)
         self._failed: list[Any] = []
+        self._credit_ns = 0
         self._texts = {(one.source, one.number): "no room" for _, ended in turns for one in ended}
 
     def ask(self, directive: Any, _: int) -> None:
@@ -544,6 +545,12 @@ def test_a_failed_transfer_is_an_error_with_its_reason(tmp_path: Path) -> None:
         work(Session(tmp_path, ([report(Stage.FAILED)], []))).obey(options)
     with pytest.raises(KnightCubeError, match="signal"):
         work(Session(tmp_path, ([], [])), ended=True).obey(options)
+    unexplained: Any = Session(tmp_path, ([], []))
+    unexplained.entity.ended.append(ending("a", condition=4))
+    assert not unexplained.ended("a"), "the satellite's reason may follow"
+    unexplained._credit_ns = 3_000_000_000
+    with pytest.raises(KnightCubeError, match="a: "):
+        unexplained.ended("a")
     silent = Session(tmp_path, ([], []))
     silent.received_ns = -(10**30)
     with pytest.raises(KnightCubeError, match="no packet"):
