@@ -151,5 +151,7 @@ def emulate(emulation: Emulation, section: Ina226Section) -> EmulatedIna226:
 # --8<-- [end:emulator]
 
 # --8<-- [start:registration]
-INA226 = Driver("power_monitor", Ina226Section, open_monitor, probe, emulate, check=check)
+INA226 = Driver(
+    "power_monitor", Ina226Section, open_monitor, probe, emulate, check=check, addresses=(0x40, 0x4F)
+)
 # --8<-- [end:registration]

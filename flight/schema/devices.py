@@ -691,6 +691,7 @@ class Driver:
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils
             off in any state of the chips; the guardian executes these writes if the flight process fails.
+        addresses: lowest and highest I2C address to which the address pins of the chip can be set.
     """
 
     kind: str
@@ -701,25 +702,29 @@ class Driver:
     files: Callable[[Any], Sequence[str]] = nothing
     check: Callable[[Any], object] = nothing
     off: Callable[[Any], Sequence[tuple[int, int, int]]] = nothing
+    addresses: tuple[int, int] = (0, 0x7F)
 
 
-def _ours(kind: str, section: type[Any], name: str, *more: str) -> Driver:
-    """Return the registration of a built-in driver, with functions in `flight.app.devices`."""
+def _ours(kind: str, section: type[Any], name: str, *more: str, **values: Any) -> Driver:
+    """Return the registration of a built-in driver, with functions in `flight.app.devices`.
+
+    The words `more` name optional functions of the registration, and `values` are its other attributes.
+    """
     words = ("open", "probe", "files", *more)
     functions: dict[str, Any] = {word: later(f"flight.app.devices:{word}_{name}") for word in words}
     emulate = None if kind == "camera" else later(f"sim_hal.emulation:emulate_{name}")
-    return Driver(kind, section, emulate=emulate, **functions)
+    return Driver(kind, section, emulate=emulate, **functions, **values)
 
 
 VN100 = _ours("inertial_unit", InertialUnitSection, "vn100", "check")
 SENSORS = _ours("inertial_unit", SensorsSection, "sensors")
 MAGNETOMETER = _ours("magnetometer", MagnetometerSection, "sensors")
-PCA9685 = _ours("coils", Coils, "pca9685", "check", "off")
-DRV8830 = _ours("coils", Coils, "drv8830", "check", "off")
-INA219 = _ours("power_monitor", PowerMonitorSection, "ina219", "check")
+PCA9685 = _ours("coils", Coils, "pca9685", "check", "off", addresses=(0x40, 0x77))
+DRV8830 = _ours("coils", Coils, "drv8830", "check", "off", addresses=(0x60, 0x68))
+INA219 = _ours("power_monitor", PowerMonitorSection, "ina219", "check", addresses=(0x40, 0x4F))
 UBLOX = _ours("gps", Gps, "ublox")
 NMEA = _ours("gps", Gps, "nmea")
-ADS1115 = _ours("solar_strings", SolarStringsSection, "ads1115")
+ADS1115 = _ours("solar_strings", SolarStringsSection, "ads1115", addresses=(0x48, 0x4B))
 V4L2 = _ours("camera", V4l2Device, "v4l2")
 ARAVIS = _ours("camera", AravisDevice, "aravis")
 

@@ -28,6 +28,7 @@ from flight.schema.devices import (
     V4l2Device,
     WideCamera,
     camera_model,
+    driver_of,
     fitted_devices,
     structure_mask,
     with_drivers,
@@ -325,30 +326,21 @@ def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
                 yield f"{key}.device.{name}", place, place
 
 
-_CHIP_ADDRESSES = {
-    "pca9685": (0x40, 0x77),
-    "drv8830": (0x60, 0x68),
-    "ina219": (0x40, 0x4F),
-    "ads1115": (0x48, 0x4B),
-}
-"""Lowest and highest I2C address to which the address pins of each chip can be set [data sheets]."""
-
-
 def _check_addresses(config: Config, refuse: Refuse) -> None:
     """Refuse I2C addresses that a chip cannot have, such as the decimal number 45 for 0x45."""
-    found = [("coils.address", config.coils.driver, config.coils.address)]
-    for key, _, section in fitted_devices(config):
+    for key, kind, section in fitted_devices(config):
         strings = enumerate(getattr(section, "strings", ()))
-        found += [(f"{key}.strings[{k}].address", section.driver, one.address) for k, one in strings]
-        if isinstance(section, PowerMonitorSection):
-            found.append((f"{key}.address", section.driver, section.address))
-    for key, driver, address in found:
-        low, high = _CHIP_ADDRESSES.get(driver, (0, 0x7F))
-        if not low <= address <= high:
-            meant = int(str(address), 16)
-            hint = f": did you mean 0x{meant:02x}?" if low <= meant <= high else ""
-            chip = f"0x{address:02x} ({address}), but a chip of type {driver} has 0x{low:02x} to 0x{high:02x}"
-            refuse(key, f"is {chip}{hint}")
+        found = [(f"{key}.strings[{k}].address", one.address) for k, one in strings]
+        # The section of a driver from another package may use the key for an address that is not on I2C.
+        if isinstance(getattr(section, "address", None), int):
+            found.append((f"{key}.address", section.address))
+        low, high = driver_of(kind, section, key).addresses
+        for name, address in found:
+            if not low <= address <= high:
+                meant = int(str(address), 16)
+                hint = f": did you mean 0x{meant:02x}?" if low <= meant <= high else ""
+                chip = f"a chip of type {section.driver} has 0x{low:02x} to 0x{high:02x}"
+                refuse(name, f"is 0x{address:02x} ({address}), but {chip}{hint}")
 
 
 def _check_connections(config: Config, refuse: Refuse) -> None:

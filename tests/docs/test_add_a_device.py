@@ -106,6 +106,7 @@ def test_the_driver_of_the_page_flies_by_the_commands_of_the_page(folder: Path) 
     [
         ("averages: 64", "averages: many", r"ina226.yaml:6: `power_monitor.averages` is 'many'"),
         ("averages: 64", "average: 64", "is an unknown key, did you mean `averages`"),
+        ("address: 0x44", "address: 0x50", r"is 0x50 \(80\), but .* has 0x40 to 0x4f"),
         ("ina226:INA226", "ina226:INA227", "cannot be imported"),
         ("ina226:INA226", "ina226:Ina226", "not a Driver"),
     ],
