@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -56,7 +55,7 @@ from sim_hal.faults.catalogue import Bench, listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, put, scheduled
 from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
-from sim_hal.settings import CageTruth, FreeBodySection, Simulation
+from sim_hal.settings import CageTruth, FreeBodySection, Simulation, utc_seconds
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
@@ -98,6 +97,7 @@ class SimulationRequest:
         section = configuration.simulation_section(self.text, name, Simulation)
         if section is None:
             raise ConfigError(name, "has no `simulation` section")
+        utc_seconds(section.utc)  # raises ConfigError
         return section
 
 
@@ -321,8 +321,8 @@ class LockStep:
 
 
 def utc_ns(label: str) -> int:
-    """Return the time since 1970 (ns) of an ISO 8601 time. Raises ValueError for invalid text."""
-    return round(datetime.fromisoformat(label).timestamp()) * 1_000_000_000
+    """Return the time since 1970 (ns) of an ISO 8601 time, UTC without a time zone. Raises ConfigError."""
+    return round(utc_seconds(label)) * 1_000_000_000
 
 
 def build_lockstep(

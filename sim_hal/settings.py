@@ -8,19 +8,32 @@ worst case, and zero switches the disturbance off.
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from flight.schema.devices import Battery, CameraLens, Winding
-from flight.schema.document import Inertia, NotNegative, Positive, Quaternion, Section
+from flight.schema.document import ConfigError, Inertia, NotNegative, Positive, Quaternion, Section
 from hal.interfaces.devices import MOST_COILS
 
 Vector = tuple[float, float, float]
 PerCoil = Annotated[tuple[float, ...], Meta(min_length=1, max_length=MOST_COILS)]
 Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
+
+
+def utc_seconds(utc: str) -> float:
+    """Return the time since 1970 (s) of an ISO 8601 time, which is UTC unless the text has a time zone.
+
+    Raises ConfigError for another text.
+    """
+    try:
+        found = datetime.fromisoformat(utc)
+    except ValueError as error:
+        raise ConfigError("simulation.utc", f"is {utc!r}: give a UTC such as 2026-03-20T12:00:00Z") from error
+    return (found.replace(tzinfo=UTC) if found.tzinfo is None else found).timestamp()
 
 
 class OrbitSection(Section, frozen=True, kw_only=True):

@@ -361,7 +361,7 @@ def _read_once(text: str, name: str) -> Document:
     if not isinstance(values, dict):
         raise ConfigError(name, "must be a mapping of sections, see config/step_demo.yaml")
     document = Document(values, name, lines, chain=(name,))
-    _refuse_not_finite(values, "", document)
+    _check_plain(values, "", document)
     return document
 
 
@@ -399,13 +399,16 @@ def _lines_of(node: yaml.Node | None, dotted: str) -> Iterator[tuple[str, int]]:
         yield from _lines_of(value, name)
 
 
-def _refuse_not_finite(value: Any, dotted: str, document: Document) -> None:
+def _check_plain(value: Any, dotted: str, document: Document) -> None:
     if isinstance(value, dict):
         for key, child in value.items():
-            _refuse_not_finite(child, join(dotted, str(key)), document)
+            if not isinstance(key, str):
+                cure = "keys are texts; write decimals with a point, such as 4.5, and lists in brackets"
+                raise document.error(join(dotted, str(key)), f"is not a key: {cure}")
+            _check_plain(child, join(dotted, str(key)), document)
     elif isinstance(value, list):
         for index, child in enumerate(value):
-            _refuse_not_finite(child, f"{dotted}[{index}]", document)
+            _check_plain(child, f"{dotted}[{index}]", document)
     elif isinstance(value, float) and not math.isfinite(value):
         raise document.error(dotted, f"is {value!r}: must be a finite number")
 

@@ -24,7 +24,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Protocol
 
 import numpy as np
@@ -37,7 +36,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, UNIX_EPOCH, Shadow, earth_velocity, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.settings import LineOfSight, ObjectState, SkyObject, SkySection, Tumble
+from sim_hal.settings import LineOfSight, ObjectState, SkyObject, SkySection, Tumble, utc_seconds
 from sim_hal.star_camera.image import SourceTrack
 from sim_hal.worlds.orbit import Orbit, propagate, sun_position
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld, World, orbiting, utc_date
@@ -159,7 +158,7 @@ class SkyObjects:
                 orbiting(world, name)
         self._world = world
         self._start_ns = self._epoch_ns = start_ns
-        self._utc = datetime.fromisoformat(utc).timestamp()
+        self._utc = utc_seconds(utc)
         self._date = UNIX_EPOCH + self._utc / DAY
         self._entries = tuple(entries)
         self._orbits = [None if entry.state is None else _GrowingOrbit(entry.state) for entry in entries]

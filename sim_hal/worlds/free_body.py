@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from operator import mul
 from typing import NamedTuple
 
@@ -42,7 +41,7 @@ from knightcube.astro.quaternion import Quaternion, compose, cross, exponential
 from knightcube.compiled import compiled_floats, loop_helper
 from sim_hal.clock import NEVER
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
-from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, TipOff
+from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, TipOff, utc_seconds
 from sim_hal.worlds.orbit import Environment, air_flow, elements, julian_date
 from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
 
@@ -506,7 +505,7 @@ class FreeBody:
         self._factors: list[float] = []
         self.craft = built_craft(section, errors, description, craft)
         self.utc_start = julian_date(utc)
-        self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
+        self._utc_start_ns = round(utc_seconds(utc)) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
         self.environment = Environment(orbit, self.utc_start, weather, multiples)
         self._loads = LoadModel(self.craft, multiples)

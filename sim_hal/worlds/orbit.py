@@ -39,7 +39,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -61,7 +60,7 @@ from knightcube.astro.earth.orientation import (
     north_east_down,
 )
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, UNIX_EPOCH, sunlit_share
-from sim_hal.settings import Disturbances, OrbitSection
+from sim_hal.settings import Disturbances, OrbitSection, utc_seconds
 from sim_hal.worlds.world import Floats, OrbitEnvironment
 
 DEVICE = "orbit"
@@ -207,8 +206,8 @@ def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
 
 
 def julian_date(utc: str) -> float:
-    """Return the Julian date of an ISO 8601 time. Raises ValueError for invalid text."""
-    return UNIX_EPOCH + datetime.fromisoformat(utc).timestamp() / DAY
+    """Return the Julian date of an ISO 8601 time, UTC without a time zone. Raises ConfigError."""
+    return UNIX_EPOCH + utc_seconds(utc) / DAY
 
 
 def elements(orbit: OrbitSection, date: float) -> KeplerianElements:

@@ -10,7 +10,6 @@ not modelled.
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, UNIX_EPOCH
 from sim_hal.clock import NEVER
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
-from sim_hal.settings import FreeBodySection
+from sim_hal.settings import FreeBodySection, utc_seconds
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body import (
     KNIGHTCUBE_SUPPLY,
@@ -74,7 +73,7 @@ class BasiliskWorld:
         self.craft = built_craft(section, errors, description, craft)
         self._attitude, rate = released(section.release, tip_off)
         self._tip_off = np.array(rate)
-        self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS
+        self._utc_start_ns = round(utc_seconds(utc)) * SECOND_NS
         self._start_ns, self._release_ns, self._held = start_ns, NEVER, True
         orbit = elements(section.orbit, julian_date(utc))
         self._scenario = _scenario()(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from time import tzset
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, sunlit_share
+from sim_hal.rig import utc_ns
 from sim_hal.settings import Disturbances, OrbitSection
 from sim_hal.worlds.orbit import (
     RING_CURRENT,
@@ -49,6 +52,23 @@ LOW = KeplerianElements(
     argument_of_perigee=0.9,
     true_anomaly=2.0,
 )
+
+
+@pytest.fixture
+def tokyo(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Set the time zone of the machine, and restore it."""
+    with monkeypatch.context() as patched:
+        patched.setenv("TZ", "Asia/Tokyo")
+        tzset()
+        yield
+    tzset()
+
+
+@pytest.mark.usefixtures("tokyo")
+@pytest.mark.parametrize("utc", ["2026-03-20T12:00:00", "2026-03-20T21:00:00+09:00"])
+def test_a_time_without_a_time_zone_is_utc_on_every_machine(utc: str) -> None:
+    assert julian_date(utc) == DATE
+    assert utc_ns(utc) == 1_774_008_000_000_000_000
 
 
 @pytest.mark.parametrize(

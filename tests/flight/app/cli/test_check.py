@@ -259,6 +259,12 @@ def test_a_configuration_that_is_refused_is_one_line_and_status_2(
             "`targets[0].point` is sun: pointing needs the satellite's position: add `gps`",
         ),
         (
+            "simulation: {utc: '20.3.2026'}",
+            2,
+            "`simulation.utc` is '20.3.2026': give a UTC such as 2026-03-20T12:00:00Z",
+        ),
+        ("craft: {mass: 4,5}", 2, "`craft.5` is not a key: keys are texts; write decimals with a point"),
+        (
             "simulation: {utc: '2027-01-01T00:00:00Z'}",
             None,
             "`elements` do not fit the first revolution of `simulation.free_body.orbit`: largest distance ",
