@@ -198,6 +198,9 @@ class ChangeMode:
     @property
     def text(self) -> str:
         """The command as printable text."""
+        return str(self)
+
+    def __str__(self) -> str:
         return f"mode {self.mode.label}" + (f": {shown(self.reason)}" if self.reason else "")
 
 
