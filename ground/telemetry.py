@@ -164,6 +164,8 @@ def flight_segments(folder: Path) -> list[Path]:
 def read_run(folder: Path) -> Run:
     """Read a run's folder. Raises UsageError if the folder has no flight log with a valid packet."""
     folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is not a folder: give a run's folder, such as {folder.parent}")
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a run (option --out of the run)")
     flight_segments(folder)
@@ -202,11 +204,11 @@ def _dates(run: Run) -> PacketColumn:
     label, times = run["run"], run["event"]["time_ns"].tolist()
     start_ns = int(label["utc_ns"][-1]) if len(label) else 0
     meaning = "UTC by the newest packet run; empty if the flight knew no UTC"
-    texts = [_date(start_ns + time_ns) if start_ns > 0 else "" for time_ns in times]
+    texts = [date_of(start_ns + time_ns) if start_ns > 0 else "" for time_ns in times]
     return PacketColumn("utc", "-", meaning, texts)
 
 
-def _date(utc_ns: int) -> str:
+def date_of(utc_ns: int) -> str:
     """Return a UTC in ns since 1970 as ISO 8601 text with milliseconds; an impossible date is empty."""
     with suppress(OverflowError, ValueError, OSError):
         date = datetime.fromtimestamp(utc_ns // 10**9, UTC)

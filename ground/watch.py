@@ -33,7 +33,7 @@ from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
-from ground.telemetry import decode, flight_segments, scan
+from ground.telemetry import date_of, decode, flight_segments, scan
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -73,15 +73,16 @@ class LogTail:
     def __init__(self, folder: Path) -> None:
         """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""
         if not folder.is_dir():
-            problem = (
-                "no such folder or socket; give the folder of a run, or the socket of a flight in progress"
-            )
-            raise UsageError(f"{folder}: {problem}")
+            if folder.exists():
+                raise UsageError(f"{folder}: is not a folder: give a run's folder, such as {folder.parent}")
+            cure = "give the folder of a run, or the socket of a flight in progress"
+            raise UsageError(f"{folder}: no such folder or socket; {cure}")
         segments = flight_segments(folder)
         self._folder = folder
         self._path = segments[0]
         self._offset = 0
         self._rest = b""
+        self._bytes = self._outside = self._missing = self._others = self._packets = 0
         try:
             age = max(0.0, time.time() - segments[-1].stat().st_mtime)
         except OSError:  # deleted meanwhile
@@ -103,7 +104,26 @@ class LogTail:
             data += self._read()
         found = scan(data)
         self._rest = data[len(data) - found.truncated_bytes :] if found.truncated_bytes else b""
+        self._bytes += found.total_bytes - found.truncated_bytes
+        self._outside += found.skipped_bytes
+        self._missing += sum(found.missing.values())
+        self._others += found.other_versions
+        self._packets += sum(found.counts.values())
         return found.packets
+
+    @property
+    def problem(self) -> str:
+        """Damage of the log, or an empty text; packets that are missing between two reads do not count."""
+        if not self._packets:
+            total = self._bytes + len(self._rest)
+            return f"{self._folder}: no valid packet in the {total} bytes of the flight log"
+        counts = (
+            (self._outside, "bytes are damaged"),
+            (self._missing, "packets are missing"),
+            (self._others, "packets have another version and are not shown"),
+        )
+        found = ", ".join(f"{count} {what}" for count, what in counts if count)
+        return f"{self._folder}: the flight log is damaged: {found}" if found else ""
 
     def _read(self) -> bytes:
         try:
@@ -249,6 +269,11 @@ class FlightState:
         row = self.newest.get(packet)
         return None if row is None else row[name]
 
+    def utc(self, seconds: float) -> str:
+        """Return the UTC of a mission time (s) in ISO 8601, or an empty text while the UTC is not known."""
+        zero = int(self.value("run", "utc_ns") or 0)
+        return date_of(zero + round(seconds * 1e9)) if zero > 0 else ""
+
     @property
     def alarms(self) -> tuple[str, ...]:
         """Names of the conditions that are active in the newest packet `health`."""
@@ -317,21 +342,23 @@ class PlainLines:
         for slot in sorted(set().union(*(found.tolist() for found in slots.values()))):
             inside = {name: rows[slots[name] == slot] for name, rows in packets.items()}
             for event in self._state.update(inside):
-                self._write(event_line(event) + "\n")
+                self._write(event_line(event, self._state.utc(event.time)) + "\n")
             if slot > self._written:
                 self._written = slot
                 self._write(state_line(self._state) + "\n")
 
 
-def event_line(event: LoggedEvent) -> str:
-    """Return an event as a line."""
+def event_line(event: LoggedEvent, utc: str = "") -> str:
+    """Return an event as a line, with its UTC unless the text `utc` is empty."""
     before = f" ({event.suppressed} before it not recorded)" if event.suppressed else ""
-    return f"{event.time:9.3f} s  {named(SEVERITIES, event.severity):8} {event.name}: {event.text}{before}"
+    when = f"{event.time:9.3f} s  {utc}{'  ' if utc else ''}"
+    return f"{when}{named(SEVERITIES, event.severity):8} {event.name}: {event.text}{before}"
 
 
 def state_line(state: FlightState) -> str:
-    """Return a line with time, mode, attitude, coils, cycle slips, active alarms and faults of a flight."""
-    parts = [f"{state.time:9.3f} s ", state.mode or "mode not known", attitude_text(state)]
+    """Return a line with times, mode, attitude, coils, cycle slips, active alarms and faults of a flight."""
+    parts = [f"{state.time:9.3f} s ", state.utc(state.time), state.mode or "mode not known"]
+    parts.append(attitude_text(state))
     written, dipole = state.value("control", "current_written"), state.value("attitude", "dipole")
     if written is not None:
         parts.append("coils " + " ".join(f"{1e3 * current:+.1f}" for current in written) + " mA")
@@ -383,9 +410,10 @@ def panel(state: FlightState, silence: float) -> RenderableType:
         facts.add_row(name, Text.assemble(*line))
     duration = state.value("run", "duration")
     planned = f" of {duration:.0f}" if duration is not None and math.isfinite(duration) else ""
+    times = f"{state.time:.1f} s{planned}  {state.utc(state.time)}".rstrip()
     mode = state.mode or "mode not known"
     colour = _MODE_COLOURS.get(state.mode, "bold black on green")
-    title = Text(" ").join([Text(f" {mode} ", colour), Text(f"{state.time:.1f} s{planned}", "bold")])
+    title = Text(" ").join([Text(f" {mode} ", colour), Text(times, "bold")])
     silent = f"no packet for {silence:.0f} s" if silence > SILENT_S else ""
     end = Text(f"ended: {state.ended}" if state.ended else silent, "bold")
     listed = Table(box=None, pad_edge=False, show_header=False)
@@ -394,7 +422,7 @@ def panel(state: FlightState, silence: float) -> RenderableType:
     for event in list(state.events)[-LISTED_EVENTS:]:
         colour = _SEVERITY_COLOURS[min(event.severity, len(_SEVERITY_COLOURS) - 1)]
         severity = named(SEVERITIES, event.severity)
-        cells = (f"{event.time:9.3f} s", severity, event.name, event.text)
+        cells = (f"{event.time:9.3f} s  {state.utc(event.time)}", severity, event.name, event.text)
         listed.add_row(*(Text(cell, colour) for cell in cells))
     body = Group(facts, Text(), listed)
     return Panel(body, title=title, title_align="left", subtitle=end, subtitle_align="left")

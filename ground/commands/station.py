@@ -22,7 +22,7 @@ from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
 from flight.schema.document import config_path
 from ground.commands.options import positive
-from ground.link.commanding import add_link_options, ground_files_folder, terminal_of
+from ground.link.commanding import add_link_options, flight_address, ground_files_folder, terminal_of
 from ground.link.gateway import ADDRESS, Gateway, new_token, token_file, token_path
 from ground.link.terminal import make_keys
 from ground.watch import (
@@ -137,7 +137,11 @@ def run_watch(options: argparse.Namespace) -> int:
     if folder.is_socket() or (":" in options.flight and not folder.exists()):
         return _watch_socket(options)
     runs = find_runs(folder)
-    return _watch(options, LogTail(runs[-1] if runs else folder), 0.0, "and the log has no stop event")
+    tail = LogTail(runs[-1] if runs else folder)
+    status = _watch(options, tail, 0.0, "and the log has no stop event")
+    if tail.problem:
+        sys.stderr.write(f"knightcube: {tail.problem}\n")
+    return status
 
 
 def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: str) -> int:
@@ -238,6 +242,7 @@ def _facts(state: FlightState) -> dict[str, Any]:
         streams = {name: named(STREAM_STATES, health[name]) for name in STREAMS}
     return {
         "mission_time_s": state.time,
+        "utc": state.utc(state.time) or None,
         "mode": state.mode or None,
         "attitude": attitude_text(state) or None,
         "error_deg": state.error_deg,
@@ -249,6 +254,7 @@ def _facts(state: FlightState) -> dict[str, Any]:
         "events": [
             {
                 "time_s": event.time,
+                "utc": state.utc(event.time) or None,
                 "severity": event.severity,
                 "name": event.name,
                 "text": event.text,
@@ -268,7 +274,7 @@ def _watch_socket(options: argparse.Namespace) -> int:
             answered = True
             found = state.update(answer.packets)
             if not options.json:
-                sys.stdout.writelines(f"{event_line(event)}\n" for event in found)
+                sys.stdout.writelines(f"{event_line(event, state.utc(event.time))}\n" for event in found)
             facts = {"commands": answer.count, "answered_s": answer.delay}
             text = f"{state_line(state)}  answered in {1e3 * answer.delay:.1f} ms"
             sys.stdout.write(to_json(_facts(state) | facts) if options.json else text + "\n")
@@ -332,6 +338,8 @@ def run_console(options: argparse.Namespace) -> int:
     with address, ExitStack() as stack:
         shown = _shown(options, stack)
         shown.read()
+        if shown.trouble:
+            sys.stderr.write(f"knightcube: {shown.trouble}\n")
         page = f"http://127.0.0.1:{address.getsockname()[1]}/"
         access = Access(lambda token: _print(f"for another browser: {page}?token={token}"))
         url = f"{page}?token={access.token}"
@@ -367,9 +375,13 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
         return Console(
             options.link, feed, history, place, by_link, frames=kept, files=files, stations=stations
         )
-    to = options.to
+    to: str | None = options.to
+    flight_trouble: Callable[[], str] = str  # an empty text
+    if to is not None:
+        flight_address(to)
     if options.fly is not None:
-        to = stack.enter_context(flying(options.fly, options.run))
+        flight = stack.enter_context(flying(options.fly, options.run))
+        to, flight_trouble = flight.socket, flight.trouble
     folder = options.run
     runs = find_runs(folder) if folder.is_dir() else []
     folder = runs[-1] if runs else folder
@@ -377,7 +389,9 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     place = FlightSurroundings.of(folder / "config.yaml")
     frames = FrameFolder(options.frames or folder / images.KEPT_FRAMES_FOLDER)
     name, tail, listed = folder.name, LogTail(folder), RunFiles(folder)
-    return Console(name, tail, history, place, forms, frames=frames, files=listed, stations=stations)
+    shown = Console(name, tail, history, place, forms, frames=frames, files=listed, stations=stations)
+    shown.doubts = (flight_trouble, lambda: tail.problem)
+    return shown
 
 
 def _stations(options: argparse.Namespace) -> tuple[str, ...]:

@@ -179,10 +179,14 @@ def _number(name: str, field: Field, given: Any) -> float | int:
             return math.nan
         raise UsageError(f"{name}: {field.name} is missing: {field.meaning}")
     try:
+        if isinstance(given, bool):
+            raise TypeError
+        if not real and isinstance(given, float) and not given.is_integer():
+            raise ValueError
         return float(given) if real else int(given)
     except (TypeError, ValueError, OverflowError) as error:
-        shown = f"{given!r:.40}"
-        raise UsageError(f"{name}: {field.name} = {shown} is not a number: {field.meaning}") from error
+        needed = "a number" if real or isinstance(given, bool) else "a whole number"
+        raise UsageError(f"{name}: {field.name} = {given!r:.40} is not {needed}: {field.meaning}") from error
 
 
 class LinkFeed:
@@ -270,41 +274,81 @@ class LinkFeed:
         self._terminal.close()
 
 
-@contextlib.contextmanager
-def flying(config: Path, out: Path) -> Iterator[str]:
-    """Fly a simulated configuration in real time with logs in `out`, and yield the command socket.
+class FlightProcess:
+    """Flight that the console started.
 
-    The flight ends when the context is left. Raises KnightCubeError if the flight does not start.
+    Attributes:
+        socket: path of the flight's command socket.
     """
+
+    def __init__(self, socket: str, process: subprocess.Popen[str], errors: Path) -> None:
+        """Observe a process whose standard error is written to the file `errors`."""
+        self.socket = socket
+        self._process, self._errors = process, errors
+        self._trouble = ""
+
+    def trouble(self) -> str:
+        """Return the reason why the process failed, or an empty text while it runs or after a clean end."""
+        code = self._process.poll()
+        if code and not self._trouble:
+            said = [line for line in self.errors().splitlines() if line.strip()][-1:] if code > 0 else []
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with exit status {code}"
+            self._trouble = f"the flight process {how}: {said[0] if said else 'start the console again'}"
+        return self._trouble
+
+    def errors(self) -> str:
+        """Return the standard error of the flight, which also has its progress."""
+        return self._errors.read_text(encoding="utf-8", errors="replace").strip()
+
+
+@contextlib.contextmanager
+def flying(config: Path, out: Path) -> Iterator[FlightProcess]:
+    """Fly a simulated configuration in real time with logs in `out`, and yield the process of the flight.
+
+    The flight ends when the context is left. Raises UsageError if `out` contains a flight, and
+    KnightCubeError if the flight does not start, or has failed when the context is left.
+    """
+    if out.is_dir() and find_segments(out, "flight"):
+        raise UsageError(f"{out} already contains a run: give a new folder, or show this run without --fly")
     text = merged_text(read_text(config), str(config))
     parsed = parse(text, str(config))
     if parsed.simulation is None:
         raise UsageError(f"{config}: has real devices; start the flight separately and give its run folder")
+    if parsed.commands != Commands():
+        raise UsageError(f"{config}: has `commands`; start the flight separately and give --to")
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-        socket = f"{place}/commands"
-        if parsed.commands != Commands():
-            raise UsageError(f"{config}: has `commands`; start the flight separately and give --to")
-        own = Path(place) / config.name
+        own, errors = Path(place) / config.name, Path(place) / "errors"
         text = _CAMERA.sub(rf"\1\n  keep_frames: {_FRAMES}", text)
-        own.write_text(f"{text}\ncommands: {{socket: {socket}}}\n", encoding="utf-8")
+        own.write_text(f"{text}\ncommands: {{socket: {place}/commands}}\n", encoding="utf-8")
         words = [sys.executable, "-m", "flight", "run", str(own), "--realtime", "--out", str(out)]
-        flight = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        # A pipe that nobody reads would be full after hours of progress lines, and would block the flight.
+        with errors.open("w", encoding="utf-8") as file:
+            process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=file, text=True)
+        flight = FlightProcess(f"{place}/commands", process, errors)
         try:
-            until = time.monotonic() + _START_S
-            while not (out.is_dir() and find_segments(out, "flight")):
-                if flight.poll() is not None:
-                    raise KnightCubeError(f"the flight did not start: {flight.communicate()[1].strip()}")
-                if time.monotonic() > until:
-                    raise KnightCubeError(f"{out}: no flight log after {_START_S:g} s")
-                time.sleep(0.05)
-            yield socket
+            _await_log(flight, process, out)
+            yield flight
         finally:
-            flight.send_signal(signal.SIGTERM)
+            failed = flight.trouble()
+            process.send_signal(signal.SIGTERM)
             try:
-                flight.communicate(timeout=_END_S)
+                process.wait(timeout=_END_S)
             except subprocess.TimeoutExpired:
-                flight.kill()
-                flight.communicate()
+                process.kill()
+                process.wait()
+        if failed:
+            raise KnightCubeError(failed)
+
+
+def _await_log(flight: FlightProcess, process: subprocess.Popen[str], out: Path) -> None:
+    """Wait for the log of a flight. Raises KnightCubeError if the flight ends or does not write a log."""
+    until = time.monotonic() + _START_S
+    while not (out.is_dir() and find_segments(out, "flight")):
+        if process.poll() is not None:
+            raise KnightCubeError(f"the flight did not start: {flight.errors()}")
+        if time.monotonic() > until:
+            raise KnightCubeError(f"{out}: no flight log after {_START_S:g} s")
+        time.sleep(0.05)
 
 
 _T = TypeVar("_T")

@@ -79,7 +79,8 @@ class Console:
         utc_ns: UTC at mission time zero, ns, or None while unknown.
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: camera frames that the flight has kept.
-        trouble: reason why the last read failed, or an empty text.
+        trouble: reason why the last read failed, or the `doubts` on the flight, or an empty text.
+        doubts: functions that return what is wrong with the log or the flight process, or an empty text.
         files: files of the satellite, or None if the files are not accessible.
         stations: ground stations in the panel of passes until the operator enters other stations.
         settled_ns: newest time (ns) up to which all packets have been received, which the live page shows.
@@ -97,6 +98,7 @@ class Console:
     files: Files | None = None
     stations: tuple[str, ...] = ()
     trouble: str = ""
+    doubts: tuple[Callable[[], str], ...] = ()
     settled_ns: int = 0
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
@@ -117,7 +119,7 @@ class Console:
         except KnightCubeError as error:
             self.trouble = str(error)
             return
-        self.trouble = ""
+        self.trouble = "; ".join(text for doubt in self.doubts if (text := doubt()))
         newest_ns = self.history.span_ns[1]
         self.history.append(packets)
         # Packets of one time may arrive in two reads, so the page shows times up to the previous read.

@@ -60,9 +60,28 @@ _SILENCE_S = 5.0
 _STATUS_S = 1.5  # longest time (s) to wait for the packet `link`, which is sent once a second
 _REASON_NS = 2_000_000_000  # longest time (ns) to wait for the satellite's reason for the end of a transfer
 _REPEAT_NS = 5_000_000_000  # time (ns) after which an unanswered command is sent again
+_HIGHEST_PORT = 65535
 _BURST_S = 0.05  # longest time (s) over which unused transmission capacity accumulates
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TRANSFER = LAYOUTS[TRANSFER.name]
+
+
+def flight_address(to: str) -> str | tuple[str, int]:
+    """Return the path of a flight's UNIX socket, or host and port of its UDP address HOST:PORT.
+
+    Raises UsageError for a file that is not a socket, and for a port that does not exist. A path without a
+    file is returned, because the flight may create the socket later.
+    """
+    host, _, port = to.rpartition(":")
+    path = Path(to)
+    if path.exists() and not path.is_socket():
+        cure = "give the command socket of a flight (`commands.socket` of its configuration), or HOST:PORT"
+        raise UsageError(f"{to}: is not a socket: {cure}")
+    if path.exists() or not (host and port.isascii() and port.isdigit()):
+        return to
+    if not 0 < int(port) <= _HIGHEST_PORT:
+        raise UsageError(f"{to}: port {port}: give a port from 1 to {_HIGHEST_PORT}")
+    return host, int(port)
 
 
 def exchange(to: str, data: bytes, timeout: float) -> bytes:
@@ -72,10 +91,10 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     timeout.
     """
     check_timeout(timeout)
-    host, _, port = to.rpartition(":")
-    if host and port.isdigit() and not Path(to).exists():
+    address = flight_address(to)
+    if isinstance(address, tuple):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-            return _ask(line, (host, int(port)), data, timeout, to)
+            return _ask(line, address, data, timeout, to)
     # The answer's socket is beside the flight's socket, because a flight as a service has no access to /tmp.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
@@ -96,8 +115,6 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
         line.sendto(data, address)
     except OSError as error:
         raise KnightCubeError(f"{to}: no flight listens there: {error.strerror or error}") from error
-    except OverflowError as error:
-        raise UsageError(f"{to}: {error}") from error
     try:
         return line.recv(LONGEST_PACKET)
     except OSError as error:

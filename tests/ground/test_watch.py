@@ -65,11 +65,19 @@ def event(packer: Packer, kind: events.EventKind, time_s: float, text: str) -> b
     return pack(packer, EVENT, time_s, code=kind.code, severity=severity, name=kind.name, text=text)
 
 
+def continued(folder: Path) -> Packer:
+    """Return a packer whose sequence counts continue those of a log."""
+    packer = Packer()
+    for name, count in read_run(folder).flight.counts.items():
+        packer._counts[name] = count
+    return packer
+
+
 @pytest.fixture
 def growing(tmp_path: Path) -> Path:
     """Return the folder of an unfinished run with six seconds of packets and an event of severity fault."""
     folder = make_run(tmp_path / "run", Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
-    packer = Packer()
+    packer = continued(folder)
     with (folder / "flight-0001.ccsds").open("ab") as file:
         file.write(pack(packer, MODE, 5.5, before=0, mode=3, trigger="ready"))
         file.write(pack(packer, HEALTH, 5.6, mode=3, imu=5, coils=2, slips=4))
@@ -78,8 +86,9 @@ def growing(tmp_path: Path) -> Path:
 
 
 def end(folder: Path) -> None:
+    packer = continued(folder)
     with (folder / "flight-0001.ccsds").open("ab") as file:
-        file.write(event(Packer(), events.STOPPED, 6.5, "stopped by SIGTERM"))
+        file.write(event(packer, events.STOPPED, 6.5, "stopped by SIGTERM"))
 
 
 def test_a_flight_that_is_over_is_shown_to_its_end(growing: Path) -> None:
@@ -104,9 +113,44 @@ def test_one_look_as_json_has_mode_currents_streams_and_events(growing: Path) ->
     assert facts["currents_a"] == [0.1, 0.0, 0.0]
     assert (facts["streams"]["imu"], facts["streams"]["coils"]) == ("good", "stale")
     assert facts["events"][-1] == {
-        "time_s": 5.7, "severity": 2, "name": "imu-silent", "text": "0.2 s without a byte", "suppressed": 0
+        "time_s": 5.7, "severity": 2, "name": "imu-silent", "text": "0.2 s without a byte", "suppressed": 0,
+        "utc": "2023-11-14T22:13:25.700Z",
     }  # fmt: skip
     assert command("watch", growing, "--once").stdout.count("\n") == 1
+
+
+def test_each_line_has_mission_time_and_utc(growing: Path) -> None:
+    end(growing)
+    lines = command("watch", growing, "--every", "2").stdout.splitlines()
+    assert all(" s  2023-11-14T22:13:2" in line or " s   2023-11-14T22:13:2" in line for line in lines)
+    assert "    5.700 s  2023-11-14T22:13:25.700Z  fault    imu-silent: 0.2 s without a byte" in lines
+    assert "  2023-11-14T22:13:26.500Z  " in command("watch", growing, "--once").stdout
+    facts = json.loads(command("watch", growing, "--json").stdout)
+    assert (facts["mission_time_s"], facts["utc"]) == (6.5, "2023-11-14T22:13:26.500Z")
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "no valid packet in the 0 bytes of the flight log"),
+        (bytes(5000), "no valid packet in the 5000 bytes of the flight log"),
+        (None, "the flight log is damaged: 7 bytes are damaged"),
+    ],
+)
+def test_a_damaged_log_is_reported(growing: Path, content: bytes | None, problem: str) -> None:
+    log = growing / "flight-0001.ccsds"
+    whole = log.read_bytes()
+    last = len(event(Packer(), events.IMU_SILENT, 5.7, ""))
+    log.write_bytes(whole[:-last] + b"x" * 7 + whole[-last:] if content is None else content)
+    done = command("watch", growing, "--once")
+    assert done.stderr.endswith(f"knightcube: {growing}: {problem}\n")
+
+
+def test_a_file_is_not_called_a_missing_folder(growing: Path) -> None:
+    for name in ("watch", "console", "report", "export"):
+        done = command(name, growing / "flight-0001.ccsds")
+        assert done.returncode == 2
+        assert f"is not a folder: give a run's folder, such as {growing}" in done.stderr
 
 
 def test_a_log_that_stands_still_is_left_after_the_patience_with_status_1(growing: Path) -> None:

@@ -123,6 +123,23 @@ def test_a_flight_is_asked_over_its_socket(monkeypatch: pytest.MonkeyPatch) -> N
     assert none.stderr.endswith(": no answer\n")
 
 
+@pytest.mark.parametrize(
+    ("to", "complaint"),
+    [
+        ("flight-0001.ccsds", "is not a socket: give the command socket of a flight"),
+        ("127.0.0.1:99999", "port 99999: give a port from 1 to 65535"),
+        ("127.0.0.1:0", "port 0: give a port from 1 to 65535"),
+    ],
+)
+def test_an_address_of_no_flight_is_refused(tmp_path: Path, to: str, complaint: str) -> None:
+    run = flight_log(tmp_path / "run")
+    address = str(run / to) if to.startswith("flight") else to
+    for words in (("console", run, "--to", address), ("command", "--to", address, "ping")):
+        done = command(*words)
+        assert done.returncode == 2
+        assert complaint in done.stderr
+
+
 def test_keys_are_made_for_both_ends(tmp_path: Path) -> None:
     done = command("keys", tmp_path / "keys")
     assert done.returncode == 0

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,11 +16,12 @@ import pytest
 from flight.link.commands import ChangeMode, CommandPacker
 from flight.link.events import Mode
 from ground.console import commanding
-from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles
+from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles, flying
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
+from tests.support.places import ROOT
 
 
 class Satellite:
@@ -93,6 +97,49 @@ def test_without_an_answer_it_says_so(satellite: Satellite, monkeypatch: pytest.
     monkeypatch.setattr(commanding, "_ANSWER_S", 0.05)
     with pytest.raises(KnightCubeError, match=r"no answer over the link within 0\.05 s"):
         satellite.feed.send(CommandPacker().pack(ChangeMode(Mode.SAFE), 7))
+
+
+DEMO = ROOT / "config" / "step_demo.yaml"
+WORDY = """
+import pathlib, sys
+sys.stderr.write("progress\\n" * 40_000)
+sys.stderr.flush()
+folder = pathlib.Path(sys.argv[1])
+folder.mkdir()
+(folder / "flight-0001.ccsds").write_bytes(b"")
+sys.exit("knightcube: the disk failed")
+"""
+
+
+def test_a_flight_that_writes_much_goes_on_and_its_failure_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pipe that nobody reads blocks a process after 64 KiB."""
+    monkeypatch.setattr(commanding, "_START_S", 10.0)
+    start, out = subprocess.Popen, tmp_path / "run"
+
+    def stand_in(words: list[str], **streams: Any) -> subprocess.Popen[str]:
+        assert words[-2:] == ["--out", str(out)]
+        return start([sys.executable, "-c", WORDY, str(out)], **streams)
+
+    monkeypatch.setattr(subprocess, "Popen", stand_in)
+    reason = "the flight process ended with exit status 1: knightcube: the disk failed"
+
+    def until_reported() -> str:
+        with flying(DEMO, out) as flight:
+            until = time.monotonic() + 10.0
+            while not flight.trouble() and time.monotonic() < until:
+                time.sleep(0.02)
+            return flight.trouble()
+
+    with pytest.raises(KnightCubeError, match=reason):
+        until_reported()
+
+
+def test_a_new_flight_is_not_shown_by_an_old_log(tmp_path: Path) -> None:
+    (tmp_path / "flight-0001.ccsds").write_bytes(b"")
+    with pytest.raises(UsageError, match="already contains a run: give a new folder"), flying(DEMO, tmp_path):
+        pass
 
 
 class Ends(FiledEnds):

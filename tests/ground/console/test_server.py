@@ -6,6 +6,7 @@ import math
 import shutil
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -24,6 +25,7 @@ from ground.console.commanding import CommandForms, RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console
 from ground.console.surroundings import UNKNOWN, FlightSurroundings
+from ground.watch import LogTail
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.pointing_target import NUMBERS, Goal
@@ -330,6 +332,8 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
         ("none", {}, "none: no such command"),
         ("slew", {"q2": "0.9"}, "q2 = 0.9 must lie within"),
         ("slew", {"q2": "much"}, "'much' is not a number"),
+        ("slew", {"q2": True}, "True is not a number"),
+        ("mode", {"mode": 1.9}, "1.9 is not a whole number"),
         ("ping", {}, "number is missing"),
         ("slew", {"q2": 0.1, "fast": 1}, "no such value: fast"),
         ("slew", "0.1", "a command has"),
@@ -344,6 +348,14 @@ def test_values_that_do_not_form_a_command_are_never_sent(
     status, answer = commanded(folder, name, values, lambda packet: pytest.fail("sent"))
     assert status == 400
     assert complaint in answer["error"]
+
+
+def test_the_confirmation_of_a_command_is_in_words() -> None:
+    forms = CommandForms(None, TELECOMMANDS)
+    assert forms.text("safe", {"reason": "end of pass"}) == "mode safe: end of pass"
+    assert forms.text("mode", {"mode": int(Mode.DETUMBLE)}) == "mode detumble"
+    scheduled = {"at": "2099-01-01T00:00:00", "words": "safe night"}
+    assert forms.text("schedule", scheduled) == "at 2099-01-01T00:00:00: mode safe: night"
 
 
 def test_a_satellite_points_by_named_numbers_and_refuses_what_only_a_testbed_obeys() -> None:
@@ -395,6 +407,15 @@ def test_files_are_listed_downloaded_and_uploaded_whole(
 
     assert asked(folder, ask) == (200, RunFiles(folder).listing())
     put.assert_called_once_with("elements", "tle.txt", b"1 2")
+
+
+def test_doubts_about_a_flight_are_shown_on_the_page(folder: Path) -> None:
+    doubts = ["", "the flight process was killed by signal 9"]
+    with History() as history:
+        console = Console("run", LogTail(folder), history, UNKNOWN, CommandForms(None))
+        console.doubts = tuple(partial(str, text) for text in doubts)
+        console.read()
+    assert console.trouble == doubts[1]
 
 
 def test_without_a_way_to_the_flight_nothing_is_sent(folder: Path) -> None:
