@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from flight.link import events
-from flight.link.telemetry.log import find_runs
+from flight.link.telemetry.log import find_runs, find_segments
 from flight.schema.document import read_document, read_text
+from ground.report.signals import last_time
 from ground.report.text import ARCSECONDS, number, provenance, table
 from ground.telemetry import Run, read_run, text_of
 from knightcube.errors import UsageError
@@ -176,15 +177,18 @@ def _archived(folder: Path) -> Object:
     row |= {"packets": 0, "bad_bytes": 0, "missing_packets": 0}
     try:
         run = read_run(folder)
-    except UsageError:
-        return {**row, "end": "no flight log"}
+    except UsageError as error:
+        logged = find_segments(folder, "flight")
+        return {**row, "end": str(error).removeprefix(f"{folder}: ") if logged else "no flight log"}
     log = run.flight
     if len(run["run"]):
         first = run["run"][0]
         row |= {"config_name": text_of(first["config_name"]), "utc": _label(int(run["run"]["utc_ns"][-1]))}
-    if len(run["control"]):
-        row["duration_s"] = float(run["control"]["time_ns"][-1]) * 1e-9
-    row |= {"packets": sum(log.counts.values()), "bad_bytes": log.skipped_bytes + log.truncated_bytes}
+    row |= {
+        "duration_s": last_time(run),
+        "packets": sum(log.counts.values()),
+        "bad_bytes": log.skipped_bytes + log.truncated_bytes,
+    }
     return row | {"missing_packets": sum(log.missing.values()), "end": _end(run)}
 
 

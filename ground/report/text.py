@@ -9,6 +9,7 @@ from typing import Any
 
 from flight.link.telemetry.definitions import SEVERITIES
 from ground.report.steps import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
+from ground.telemetry import date_of
 
 Object = dict[str, Any]
 Column = tuple[str, int, float] | Callable[[Object], str]
@@ -23,8 +24,10 @@ _MAX_LISTED = 20  # maximum number of lines in the table of failed frames
 def format_report(summary: Object) -> str:
     """Return the whole report, ending in a newline."""
     run, origin = summary["run"], provenance(summary["run"])
+    utc_ns = run.get("utc_ns", 0)
+    start = f"mission time 0 s is {date_of(utc_ns)}" if utc_ns > 0 else ""
     blocks = [
-        [f"Run {run['folder']}: {number(run['duration_s'], 1)} s", *([origin] if origin else [])],
+        [f"Run {run['folder']}: {number(run['duration_s'], 1)} s", *filter(None, (origin, start))],
         _steps(summary),
         _detumbling(summary["detumbling"]),
         _knowledge(summary["knowledge"]),

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flight.app.cli import main
+from flight.link.telemetry.definitions import HEALTH
+from flight.link.telemetry.packets import Packer
 from ground.report import summarise
 from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
 from ground.telemetry import read_run
@@ -136,6 +139,21 @@ def test_each_boot_has_its_row_and_damage_shows(archive: Path) -> None:
     text = format_archive(summarise_archive(archive))
     assert text.startswith(f"Archive {archive}: 3 runs")
     assert [line.split()[0] for line in text.splitlines()[2:]] == ["run-000001", "run-000002", "run-000003"]
+
+
+def test_a_satellite_has_a_duration_and_a_damaged_log_is_not_a_missing_one(tmp_path: Path) -> None:
+    packer = Packer()
+    fields: dict[str, Any] = {}
+    for field in HEALTH.fields:
+        fields[field.name] = [0] * field.count if field.count > 1 else 0
+    contents = (packer.pack(HEALTH, 7_500_000_000, fields), bytes(600))
+    for number, content in enumerate(contents, start=1):
+        folder = tmp_path / f"run-{number:06}"
+        folder.mkdir()
+        (folder / "flight-0001.ccsds").write_bytes(content)
+    satellite, damaged = summarise_archive(tmp_path)["runs"]
+    assert satellite["duration_s"] == 7.5
+    assert damaged["end"] == "no valid packet in the 600 bytes of the flight log"
 
 
 def test_the_command_reports_an_archive_as_text_and_as_json(

@@ -89,6 +89,12 @@ def test_the_origin_of_a_run_is_stated(simulated: bool, realtime: bool, text: st
     assert provenance({}) == ""
 
 
+def test_the_utc_of_mission_time_zero_is_stated() -> None:
+    run = EMPTY["run"] | {"utc_ns": 1_700_000_000_000_000_000}
+    lines = format_report(EMPTY | {"run": run}).splitlines()
+    assert lines[:2] == ["Run runs/a: 12.3 s", "mission time 0 s is 2023-11-14T22:13:20.000Z"]
+
+
 def test_steps_are_listed_with_their_figures() -> None:
     step = {
         "index": 3, "again": False, "from_q2": -0.1, "target_q2": 0.25, "start_s": 10.04,
