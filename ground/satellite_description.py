@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.schema.document import ConfigError
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.mean_elements import FittedElements
 from knightcube.astro.inertia import box_inertia
@@ -34,6 +35,7 @@ _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
 """Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, solar pressure (Pa)."""
 _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
 """Bound of the simulated current error, and assumed current noise, as fractions of the current limit."""
+_NEED_STARS = ("fine_within", "knowledge_deg", "camera_missed_percent")  # requirements with star camera only
 _STRAY_FIELD = 7.4e-5  # field (T) of a coil at the magnetometer at the current limit [configuration `orbit`]
 
 
@@ -198,7 +200,8 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
     moments = ", ".join(f"{moment:.3e}" for moment in values.inertia)
     limits = [coil.current_limit for coil in satellite.coils]
     wide = "" if satellite.wide_cameras else "wide_cameras: [] # no cameras for Sun and horizon\n"
-    knowledge = "" if satellite.field_of_view_deg else "  knowledge_deg: null # no star camera\n"
+    unjudged = () if satellite.field_of_view_deg else _NEED_STARS
+    knowledge = "".join(f"  {key}: null # no star camera\n" for key in unjudged)
     return _laid_out(f"""\
 # {satellite.name}: {satellite.mass:g} kg, {x:g} x {y:g} x {z:g} m. Written by:
 #   {command}
@@ -497,7 +500,7 @@ def _read_utc(text: str) -> str:
     whole = text if text.endswith("Z") else f"{text}Z"
     try:
         julian_date(whole)
-    except ValueError:
+    except ConfigError:
         raise ValueError("give a time such as 2026-03-20T12:00:00") from None
     return whole
 

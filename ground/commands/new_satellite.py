@@ -31,6 +31,9 @@ from sim_hal.worlds.orbit import julian_date
 _WEAK = 3.0
 """Smallest ratio of the coils' torque to the worst disturbance torque for which no warning is printed."""
 
+_LOW_INCLINATION = 10.0
+"""Smallest inclination (deg) without a warning. At 0 deg, a 3U pointed to nadir within 19 deg rms."""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube new-satellite` to the parser."""
@@ -105,7 +108,7 @@ def _written(answers: Answers, force: bool) -> tuple[dict[str, Any], str]:
         "elements": list(made.lines),
         "inclination_deg": satellite.orbit.inclination_deg,
         "derived": asdict(values),
-        "warnings": warnings_of(values),
+        "warnings": warnings_of(satellite, values),
     }
     return facts, _text(satellite, values, path)
 
@@ -268,9 +271,15 @@ def _replace(path: Path, text: str) -> None:
         raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def warnings_of(values: Derived) -> list[str]:
-    """Return warnings about weak coils."""
+def warnings_of(satellite: Satellite, values: Derived) -> list[str]:
+    """Return warnings about weak coils, and about an orbit in which the coils cannot point in all axes."""
     found = []
+    inclination = satellite.orbit.inclination_deg
+    if min(inclination, 180.0 - inclination) < _LOW_INCLINATION:
+        field = (
+            f"at an inclination of {inclination:g} deg the magnetic field is nearly along the orbit normal"
+        )
+        found.append(f"{field}, about which coils have little torque: simulate the pointing of a revolution")
     ratio = values.coil_torque / values.disturbance
     if ratio < _WEAK:
         torque = f"the coils' torque is {ratio:.2g} times the largest disturbance torque"
@@ -297,7 +306,7 @@ def _text(satellite: Satellite, values: Derived, path: Path) -> str:
         ("orbit", f"{shape}, {values.period / 60.0:.1f} min"),
         ("coils", f"{torque} aerodynamic and solar radiation torque"),
         ("detumbling", f"from {satellite.release_deg:g} deg/s within about {values.slow_within:g} s"),
-        *(("warning", text) for text in warnings_of(values)),
+        *(("warning", text) for text in warnings_of(satellite, values)),
         ("next", f"{PROGRAM} check {config}"),
         ("", f"{PROGRAM} run {config} --out runs/{satellite.name}"),
         ("", f"{PROGRAM} report runs/{satellite.name}"),

@@ -270,6 +270,23 @@ def test_weak_coils_are_warned_of(tmp_path: Path) -> None:
     assert "detumbling takes more than" in second
 
 
+@pytest.mark.parametrize(("inclination", "warned"), [("0", True), ("175", True), ("30", False)])
+def test_orbits_in_which_coils_cannot_point_are_warned_of(
+    tmp_path: Path, inclination: str, warned: bool
+) -> None:
+    words = (*GIVEN, "--inclination", inclination, "--out", tmp_path / "m.yaml", "--json")
+    warnings = json.loads(command("new-satellite", *words).stdout)["warnings"]
+    assert any("nearly along the orbit normal" in text for text in warnings) is warned
+
+
+def test_without_a_star_camera_the_report_does_not_judge_star_attitudes(tmp_path: Path) -> None:
+    path = tmp_path / "m.yaml"
+    assert command("new-satellite", *GIVEN, "--star-camera", "none", "--out", path).returncode == 0
+    limits = as_orbit(load(path)).requirements
+    assert (limits.fine_within, limits.knowledge_deg, limits.camera_missed_percent) == (None, None, None)
+    assert limits.slow_within is not None
+
+
 class Terminal(io.StringIO):
     """A test double of a terminal on which given lines are typed."""
 
