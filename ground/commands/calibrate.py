@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from flight.app.cli import PROGRAM
+from flight.app.cli import PROGRAM, complain
 from flight.app.cli.run import seed_number
 from flight.schema import reader as configuration
 from flight.schema.devices import camera_model
@@ -66,11 +66,10 @@ def run(options: argparse.Namespace) -> int:
     pictures = list(zip(options.images, found.images, strict=True))
     lens = found.determined
     if lens is None:
-        for path, picture in pictures:
-            sys.stderr.write(f"{path}: {picture.reason}\n")
+        reasons = [f"{path}: {picture.reason}" for path, picture in pictures]
         if options.fov is not None:
-            sys.stderr.write(f"--fov {options.fov:g}: without --fov, fields from 4 to 60 deg are searched\n")
-        return 1
+            reasons.append(f"--fov {options.fov:g}: without --fov, fields from 4 to 60 deg are searched")
+        return complain("\n".join(reasons), 1)
     mirrored = "mirrored:     yes; the lens is that of the pictures as they are\n" if found.mirrored else ""
     facts = _facts(lens, pictures) | {"mirrored": found.mirrored}
     print_result(options, facts, _text(lens, pictures) + mirrored)

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from flight.app.cli import to_json
+from flight.app.cli import complain, to_json
 from flight.app.service import EndingSignals
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
@@ -164,8 +164,7 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
         # The link process also sends packets of its own, which do not show that a flight is in progress.
         if not state.newest or (by_link and not state.mode):
             cause = _cause(state, tail) if by_link else ""
-            sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}{cause}\n")
-            return 1
+            return complain(f"no state of the flight in {wait:g} s {where}{cause}", 1)
         silent = f"  no packet for {silence():.0f} s" if silence() > SILENT_S else ""
         line = state_line(state) + (f"  ended: {state.ended}" if state.ended else silent)
         facts = _facts(state) | {"silence_s": silence()}
@@ -282,8 +281,8 @@ def _watch_socket(options: argparse.Namespace) -> int:
             if once or ended.wait(_PING_S):
                 return 0
         if not ended.is_set():
-            sys.stderr.write(f"knightcube: {options.flight}: {'no further' if answered else 'no'} answer\n")
-    return 0 if ended.is_set() else 1
+            return complain(f"{options.flight}: {'no further' if answered else 'no'} answer", 1)
+    return 0
 
 
 def configure_console(parser: argparse.ArgumentParser) -> None:

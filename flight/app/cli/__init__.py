@@ -16,7 +16,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from flight import __version__
 from hal.interfaces.errors import DeviceError
@@ -99,12 +99,20 @@ examples:
 """
 
 
+class _Answer:
+    """Whether the command was started with `--json`, and whether its JSON object was made."""
+
+    wanted = made = False
+
+
 def to_json(facts: Any, *, allow_nan: bool = True) -> str:
     """Return the result of a command as one line of JSON, with numbers rounded to 15 digits.
 
     Otherwise, times that are computed from integers in ns would be printed as 15.450000000000001.
     """
-    return json.dumps(_rounded(facts), allow_nan=allow_nan) + "\n"
+    text = json.dumps(_rounded(facts), allow_nan=allow_nan) + "\n"
+    _Answer.made = True
+    return text
 
 
 def _rounded(value: Any) -> Any:
@@ -121,18 +129,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may contain bytes that are not text
     words = list(sys.argv[1:] if arguments is None else arguments)
+    # The option may be abbreviated, as all options of argparse.
+    _Answer.wanted = any(len(word) > 2 and "--json".startswith(word) for word in words)
+    _Answer.made = False
     try:
         return _obey(words)
     except (KnightCubeError, DeviceError) as error:
         # That a planner finds no path is a failure of the command and not a usage error.
         misused = isinstance(error, UsageError) and not isinstance(error, PlanningError)
-        return _complain(str(error), 2 if misused else 1)
+        return complain(str(error), 2 if misused else 1)
     except KeyboardInterrupt:
-        return _complain("interrupted", 130)  # the exit status that shells use for SIGINT
+        return complain("interrupted", 130)  # the exit status that shells use for SIGINT
     except OSError as error:  # such as an invalid file name or a folder without permission
         if error.filename is None:
-            return _complain(error.strerror or str(error), 1)
-        return _complain(f"{error.filename}: {error.strerror}", 2)
+            return complain(error.strerror or str(error), 1)
+        return complain(f"{error.filename}: {error.strerror}", 2)
 
 
 def _obey(words: Sequence[str]) -> int:
@@ -171,9 +182,18 @@ def _complete(parser: argparse.ArgumentParser) -> None:
     argcomplete.autocomplete(parser)
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser that reports wrong arguments also as a JSON object, if the arguments contain `--json`."""
+
+    def error(self, message: str) -> NoReturn:
+        """Report wrong arguments, and end the process with the exit status 2."""
+        _answer_error(message)
+        super().error(message)
+
+
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     available = _available(words)
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=PROGRAM,
         description=_overview(available),
         epilog=_EXAMPLES,
@@ -219,8 +239,19 @@ def _full_names(table: dict[str, tuple[str, str, str]], package: str) -> dict[st
     return {name: (group, purpose, f"{package}.{at}") for name, (group, purpose, at) in table.items()}
 
 
-def _complain(message: str, status: int) -> int:
-    """Print an error message whose control characters are escaped, so that they have no effect."""
+def complain(message: str, status: int) -> int:
+    """Print an error message, also as a JSON object if `--json` is given, and return the exit status.
+
+    Control characters of the message are escaped, so that they have no effect.
+    """
+    _answer_error(message)
     lines = map(shown, message.split("\n"))
     sys.stderr.write("knightcube: " + "\n".join(lines) + "\n")
     return status
+
+
+def _answer_error(message: str) -> None:
+    """Print a JSON object with the error message, if `--json` is given and no JSON object was printed."""
+    if _Answer.wanted and not _Answer.made:
+        sys.stdout.write(to_json({"error": message}))
+        sys.stdout.flush()

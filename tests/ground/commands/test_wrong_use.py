@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
+from flight.app.cli import complain, to_json
 from tests.ground.commands.in_process import command
 from tests.support.places import DEMO
 
@@ -37,6 +39,41 @@ def test_wrong_use_is_status_2(words: str, complaint: str, tmp_path: Path) -> No
     done = command(*words.replace("TMP", str(tmp_path)).split())
     assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
     assert not (tmp_path / "no").exists(), "no folder is made for a picture"
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        ("solve TMP/none.png", 2, "TMP/none.png: cannot be read: No such file or directory"),
+        ("solve", 2, "the following arguments are required: IMAGE"),
+        ("rate TMP/sky.pgm", 2, "give --fov and --exposure, or --camera with a configuration that has them"),
+        ("index --fov 0 --out TMP/a", 2, "argument --fov: 0 is not a positive number"),
+        ("plan --from 2 --to 0", 2, "--from 2: must be -0.68 to 0.68"),
+        ("plan --from 0.1 --to 0 --horizon 0.01", 1, "no path was found"),
+        ("calibrate TMP/sky.pgm --fov 11", 1, "TMP/sky.pgm: all pixels of the frame are equal\n--fov 11: "),
+        ("nothing", 2, "argument COMMAND: invalid choice: 'nothing'"),
+    ],
+)
+def test_a_failed_command_with_json_prints_its_error_as_json(
+    words: str, status: int, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / "sky.pgm").write_bytes(b"P5 64 64 255\n" + bytes(64 * 64))
+    done = command(*words.replace("TMP", str(tmp_path)).split(), "--json")
+    found = json.loads(done.stdout)
+    expected = message.replace("TMP", str(tmp_path))
+    assert (done.returncode, list(found), expected in found["error"]) == (status, ["error"], True), done
+    assert expected.split("\n")[0] in done.stderr
+    assert command(*words.replace("TMP", str(tmp_path)).split()).stdout == ""
+
+
+def test_an_error_after_the_result_prints_no_second_json_object(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flight.app.cli._Answer.wanted", True)
+    monkeypatch.setattr("flight.app.cli._Answer.made", False)
+    printed = to_json({"stars": 7})
+    assert complain("camera.yaml: cannot be written", 1) == 1
+    assert (json.loads(printed), capsys.readouterr().out) == ({"stars": 7}, "")
 
 
 def test_a_method_that_needs_the_field_of_view_asks_for_it(tmp_path: Path) -> None:
