@@ -40,6 +40,7 @@ from knightcube.vision.horizon.limb import (
     FittedLimb,
     LimbView,
     Prior,
+    blur_factor,
     fit_limb,
     fit_profiles,
     limb_gradients,
@@ -123,14 +124,17 @@ def _placed_by_profile(
         return limb
     blur = np.hypot(settings.edges.psf_sigma, _PIXEL_SIGMA) * metres
     edges = select(observation.edges, limb.index)
-    shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
-    rays = limb.rays + shift[:, None] * observation.rays.brighter[limb.index]
+    given = edges.profile, edges.profile_steps, metres * limb.inward
+    fits = fit_profiles(*given, blur)
+    if (factor := blur_factor(*given, blur)) > 1.0:
+        fits = fit_profiles(*given, factor * blur)
+    rays = limb.rays + fits.place[:, None] * observation.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
     # Scan lines whose spacing is smaller than the ground features are not independent.
     correlated = np.sqrt(max(1.0, _CORRELATED / observation.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
-    sigma = correlated * np.hypot(spread, least) * limb.inward * limb.pixel
-    return select(replace(limb, rays=rays, sigma=sigma), sound)
+    sigma = correlated * np.hypot(fits.sigma, least) * limb.inward * limb.pixel
+    return select(replace(limb, rays=rays, sigma=sigma), fits.valid)
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)

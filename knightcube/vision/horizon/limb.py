@@ -462,10 +462,27 @@ _FARTHEST = 2.0
 _LEAST_SAMPLES = 7
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ProfileFits:
+    """Limb positions on n scan lines, fitted to brightness profiles.
+
+    Attributes:
+        place: limb positions (n,), px from the edge towards the bright side.
+        sigma: standard deviations of the limb positions (n,), px.
+        valid: mask of the valid fits (n,).
+        misfit: chi-square per degree of freedom of each profile (n,).
+    """
+
+    place: FloatArray
+    sigma: FloatArray
+    valid: BoolArray
+    misfit: FloatArray
+
+
 def fit_profiles(
     profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the limb positions on n scan lines, px, their standard deviations, px, and a mask of valid fits.
+) -> ProfileFits:
+    """Return the limb positions on n scan lines that are fitted to their brightness profiles.
 
     The profiles (n, m) contain the brightness, or NaN for missing samples, at the positions `steps` (n, m),
     px, relative to the edge, positive towards the bright side. The tangent height decreases by `metres` (n,),
@@ -505,4 +522,39 @@ def fit_profiles(
     )
     sigma = np.sqrt(answer[:, 3, 1] * np.maximum(misfit, 0.3))
     valid = enough & (np.abs(place) < _FARTHEST) & (amounts[:, 1] > 0.2)
-    return place, sigma, valid
+    return ProfileFits(place, sigma, valid, misfit)
+
+
+_WIDER, _WIDEST = 2.0**0.5, 10.0
+"""Ratio of successive trial blurs, and largest trial blur, relative to the stated blur."""
+_BETTER = 0.7
+"""Largest ratio of the misfits with the fitted and with the stated blur at which the fitted blur is used."""
+_BLUR_LINES = 32
+"""Number of scan lines whose profiles determine the blur."""
+
+
+def blur_factor(profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray) -> float:
+    """Return the factor by which the brightness profiles are more blurred than the stated `blur` (n,), m.
+
+    A defocused image would displace the limb by about the excess width of its blur. The factor with the
+    smallest median misfit is used if the misfit is clearly smaller than that of the stated blur; otherwise
+    the factor is 1. See `fit_profiles` for the arguments.
+    """
+    some = slice(None, None, max(1, len(profiles) // _BLUR_LINES))
+    given = profiles[some], steps[some], metres[some]
+
+    def misfit(factor: float) -> float:
+        return math.log(max(float(np.median(fit_profiles(*given, factor * blur[some]).misfit)), 1e-12))
+
+    factor, trials = 1.0, [misfit(1.0)]
+    while factor * _WIDER < _WIDEST and (len(trials) == 1 or trials[-1] < trials[-2]):
+        factor *= _WIDER
+        trials.append(misfit(factor))
+    best = int(np.argmin(trials))
+    if trials[best] > trials[0] + math.log(_BETTER):
+        return 1.0
+    place = float(best)
+    if best < len(trials) - 1:
+        before, least, after = trials[best - 1 : best + 2]
+        place += 0.5 * (before - after) / max(before - 2.0 * least + after, 1e-12)
+    return float(_WIDER**place)

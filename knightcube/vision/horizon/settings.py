@@ -115,7 +115,8 @@ class EdgeSettings:
             level to the bright level.
         contrast: minimum step height of an edge, as a fraction of the range from dark to bright level.
         most: maximum number of edges per scan line; the edges with the darkest dark side are kept.
-        psf_sigma: standard deviation of the blur of the optics, px.
+        psf_sigma: standard deviation of the blur of the optics, px. A larger blur is fitted if the brightness
+            profiles of the limb show it clearly.
         response: response of the detector, or None for a linear detector.
     """
 

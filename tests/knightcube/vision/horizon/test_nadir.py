@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray, Image, tangent_basis
@@ -88,6 +89,30 @@ def test_edges_lie_on_the_true_limb_to_a_fraction_of_a_pixel(day: tuple[EarthSce
     truth = limb_truth(scene, MODEL, height=UNIT_DEPTH_HEIGHT).points
     apart = np.min(np.linalg.norm(edges.points[:, None] - truth[None], axis=2), axis=1)
     assert np.count_nonzero(apart < 0.7) > 25
+
+
+@pytest.mark.parametrize("blur", [0.6, 1.5, 3.0, 4.0])
+def test_a_defocused_camera_gives_a_nadir_within_its_uncertainty(blur: float) -> None:
+    """The limb of a camera whose optics blur more than stated is not displaced by the excess blur."""
+    camera = Pinhole.from_field_of_view(columns=512, rows=512, field_of_view=np.radians(67.0))
+    column, row = np.meshgrid(np.arange(512.0), np.arange(512.0))
+    rays = camera.unit_vectors(np.stack([column.ravel(), row.ravel()], axis=-1))
+    ratios = []
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        altitude, tilt, roll = generator.uniform([4e5, 0.8, 0.0], [8e5, 1.3, 2.0 * np.pi]).tolist()
+        truth = np.array([np.sin(tilt) * np.sin(roll), np.sin(tilt) * np.cos(roll), np.cos(tilt)])
+        distance = 6_371_009.0 + altitude
+        height = distance * np.sin(np.arccos(np.clip(rays @ truth, -1.0, 1.0))) - 6_371_009.0
+        light = 1.0 - np.exp(-np.exp(np.minimum((UNIT_DEPTH_HEIGHT - height) / 8e3, 50.0)))
+        image = 5.0 + gaussian_filter(150.0 * light.reshape(512, 512), blur)
+        image += generator.normal(0.0, 1.0, image.shape)
+        found = find_nadir(image, camera, HorizonKnowledge(altitude=altitude))
+        if found.nadir is not None:
+            error = float(np.arccos(min(1.0, float(found.nadir.direction @ truth))))
+            ratios.append(error / found.nadir.sigma)
+    assert len(ratios) >= 4
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.0
 
 
 def test_a_solution_is_true_if_it_has_a_nadir(day: tuple[EarthScene, Image]) -> None:
