@@ -161,19 +161,21 @@ def orbit_state(
     Args:
         semi_major_axis: semi-major axis, m.
         eccentricity: eccentricity, at least 0 (circle) and below 1.
-        inclination: inclination to the ICRS equator, rad.
+        inclination: inclination to the ICRS equator, 0 to pi rad.
         ascending_node: right ascension of the ascending node, rad.
         argument_of_perigee: argument of perigee, rad.
         true_anomaly: true anomaly, rad.
 
     Raises:
-        UsageError: for elements that are not finite or whose orbit intersects the Earth.
+        UsageError: for elements that are not finite or out of range, or whose orbit intersects the Earth.
     """
     angles = (inclination, ascending_node, argument_of_perigee, true_anomaly)
     if not all(map(math.isfinite, (semi_major_axis, eccentricity, *angles))):
         raise UsageError("the elements of an orbit must be finite")
     if not 0.0 <= eccentricity < 1.0:
         raise UsageError(f"eccentricity is {eccentricity}: it must be 0 to below 1")
+    if not 0.0 <= inclination <= math.pi:
+        raise UsageError(f"inclination is {inclination:g} rad: it must be 0 to pi, in rad instead of degrees")
     if semi_major_axis * (1.0 - eccentricity) <= EARTH_RADIUS:
         raise UsageError(
             f"the perigee lies {semi_major_axis * (1.0 - eccentricity):.0f} m from the Earth's centre:"

@@ -403,15 +403,15 @@ def _priors(
 ) -> tuple[AttitudePrior | None, RatePrior | None]:
     """Return the predicted attitude and rate. Raises ArgumentError for a value that is not possible."""
     attitudes = rates = None
+    attitude_sigma = checked_deviation("attitude_sigma", attitude_sigma, "rad")
+    rate_sigma = checked_deviation("rate_sigma", rate_sigma, "rad/s")
     if attitude is not None:
-        attitude_sigma = checked_deviation("attitude_sigma", attitude_sigma, "rad")
         quaternion = finite_array("attitude", attitude, (4,))
         if abs(math.hypot(*quaternion) - 1.0) > _UNIT_TOLERANCE:
             raise ArgumentError("attitude", f"{attitude!r}: give a quaternion of unit length, scalar last")
         # An uncertainty of half a turn or more leaves every attitude possible.
         attitudes = AttitudePrior(quaternion, attitude_sigma) if attitude_sigma < math.pi else None
     if rate is not None:
-        rate_sigma = checked_deviation("rate_sigma", rate_sigma, "rad/s")
         rates = RatePrior(finite_array("rate", rate, (3,)), rate_sigma)
     return attitudes, rates
 

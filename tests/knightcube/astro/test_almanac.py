@@ -113,6 +113,8 @@ def test_kepler_elements_give_energy_momentum_and_apsides() -> None:
         ({"eccentricity": 1.0}, "eccentricity"),
         ({"semi_major_axis": 6e6}, "perigee"),
         ({"inclination": float("nan")}, "finite"),
+        ({"inclination": 98.0}, "inclination is 98 rad: it must be 0 to pi, in rad instead of degrees"),
+        ({"inclination": -0.1}, "inclination is -0.1 rad"),
     ],
 )
 def test_elements_of_no_orbit_are_refused(wrong: dict[str, float], message: str) -> None:

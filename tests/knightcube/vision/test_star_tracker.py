@@ -228,6 +228,8 @@ def test_an_overexposed_image_and_an_empty_one_are_named(image: Image, reason: s
             "attitude_sigma: -1.0: give a standard deviation of",
         ),
         ({"attitude": np.eye(4)[3], "attitude_sigma": math.nan}, "attitude_sigma: nan"),
+        ({"attitude_sigma": -1.0}, "attitude_sigma: -1.0: give a standard deviation of"),
+        ({"rate_sigma": math.nan}, "rate_sigma: nan: give a standard deviation of"),
         ({"attitude": np.zeros(4)}, "give a quaternion of unit length, scalar last"),
         ({"attitude": np.full(4, np.nan)}, "attitude: [nan, nan, nan, nan]: give finite numbers"),
         (
