@@ -366,7 +366,8 @@ def _wrong_address(kind: str, section: Any, rig: Rig, taken: set[Any]) -> Findin
     where = [address for address, chip in chips.items() if chip == named and address not in taken]
     if where:
         text = f"no answer at 0x{section.address:02x}, but a chip of type {named} answers at 0x{where[0]:02x}"
-        return Finding(kind, "wrong address", text, f"set `address: 0x{where[0]:02x}`, or change its jumpers")
+        cure = f"set `address: 0x{where[0]:02x}`, or change its jumpers"
+        return Finding(kind, "wrong address", text, cure, setting=("address", where[0]))
     listed = ", ".join(f"0x{address:02x}" for address in chips) or "no address"
     text = f"no answer at 0x{section.address:02x}; addresses that answer on its bus: {listed}"
     return Finding(kind, "no answer", text, "check power, SDA, SCL and the address jumpers")
@@ -383,7 +384,7 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     if what == wanted and rate != section.baud_rate:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"
         cure = f"set `baud_rate: {rate}`, or change that of the device"
-        found = Finding(kind, "wrong baud rate", text, cure)
+        found = Finding(kind, "wrong baud rate", text, cure, setting=("baud_rate", rate))
     elif what == wanted == "vn100" and pause:
         text = f"its output arrives on {section.device}, but stops for up to {pause:.2f} s"
         cure = "check plugs and solder joints for loose contact, and its supply"

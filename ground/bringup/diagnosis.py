@@ -57,6 +57,7 @@ class Finding:
         text: measured value and its meaning.
         cure: remedy.
         factor: ratio of actual to configured resistance of a coil, or None.
+        setting: configuration key of the part and its measured value, such as a baud rate, or None.
     """
 
     part: str
@@ -64,6 +65,7 @@ class Finding:
     text: str
     cure: str
     factor: float | None = None
+    setting: tuple[str, int] | None = None
 
     def line(self) -> str:
         """Return the finding as one line."""

@@ -37,7 +37,9 @@ def step_find(session: Session) -> Outcome:
     """Find each device and identify it."""
     found = list(find(session.config, session.rig, session.stack))
     answers = {one.part: f"{one.place}: {one.answer or 'no answer'}" for one in found}
-    return Outcome([one.finding for one in found if one.finding], {"answers": answers})
+    findings = [one.finding for one in found if one.finding]
+    changes = {one.part: dict([one.setting]) for one in findings if one.setting is not None}
+    return Outcome(findings, {"answers": answers}, changes)
 
 
 def expectation(config: Config) -> diagnosis.UnitExpectation:

@@ -608,6 +608,17 @@ def test_each_device_is_found_at_its_place(base: str, tmp_path: Path) -> None:
     assert found.findings == []
 
 
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [("coils", "address", 0x43), ("power_monitor", "address", 0x44), ("inertial_unit", "baud_rate", 57600)],
+)
+def test_a_found_address_or_baud_rate_is_a_measured_value(
+    section: str, key: str, value: int, tmp_path: Path
+) -> None:
+    (found,) = outcomes(session(Case({section: {key: value}}, "", []), tmp_path), "find")
+    assert found.changes == {section: {key: value}}
+
+
 def test_a_sound_bench_has_no_finding(tmp_path: Path) -> None:
     found = outcomes(session(Case({}, "", []), tmp_path), "find rest axes coils dark light focus")
     assert [one.line() for outcome in found for one in outcome.findings] == []
