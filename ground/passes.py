@@ -37,6 +37,8 @@ NEWER = "give newer elements (`knightcube elements` with --fixes or --read)"
 _KNOWN_SHARE = 0.25
 """Standard deviation of the predicted times, as a fraction of the orbital period, above which the revolution
 that passes over a station is unknown."""
+SENDING = timedelta(minutes=1)
+"""Time after the present in which no command is due, because scheduled commands must arrive before."""
 _BETWEEN = timedelta(seconds=1)
 """Time between two commands of different passes, because scheduled commands are due at whole seconds."""
 _LOW_PERIOD_S = 9000.0
@@ -120,16 +122,18 @@ def facts_of(one: Pass) -> dict[str, object]:
 
 
 def scheduled_targets(
-    passes: Sequence[Pass], lead: float = LEAD_S
+    passes: Sequence[Pass], lead: float = LEAD_S, earliest: datetime | None = None
 ) -> list[list[tuple[datetime, PointingTarget]]]:
     """Return UTC and pointing target of the commands for each pass: to the station, and back to nadir.
 
     The passes are in order of rise. The first command of a pass is due `lead` s before the rise, but after
     the last command of the pass before: the satellite points to a station until the pass over this station
-    ends. A pass that ends during an earlier pass has no commands.
+    ends. No command is due before `earliest`. A pass that ends during an earlier pass, or before `earliest`,
+    has no commands.
     """
     found: list[list[tuple[datetime, PointingTarget]]] = []
-    free: datetime | None = None  # end of the latest pass that has commands
+    # End of the latest pass that has commands.
+    free: datetime | None = None if earliest is None else earliest - _BETWEEN
     for one in passes:
         place = (math.radians(one.station.latitude_deg), math.radians(one.station.longitude_deg))
         begin = one.rise - timedelta(seconds=lead)

@@ -7,7 +7,7 @@ import csv
 import sys
 import textwrap
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -355,14 +355,16 @@ def run_passes(options: argparse.Namespace) -> int:
     if options.lead < 0.0:
         raise UsageError(f"--lead {options.lead:g}: must be 0 s or more before the rise")
     prediction, stations, _ = predicted(options)
-    from ground.passes import NEWER, facts_of  # noqa: PLC0415
+    from ground.passes import NEWER, SENDING, facts_of  # noqa: PLC0415
 
     if options.schedule and prediction.timing_error_s > max(options.lead, _UNCERTAIN_S):
         problem = f"the times have a standard deviation of {prediction.timing_error_s:.0f} s"
         cure = f"{NEWER}, or a longer lead"
         raise UsageError(f"--schedule: {problem}, which exceeds --lead {options.lead:g}: {cure}")
     found = prediction.passes(stations)
-    commands = _commands(prediction, found, options.lead) if options.schedule else [[] for _ in found]
+    # The commands of a prediction from now on must still be sent.
+    earliest = prediction.begin + (SENDING if options.begin is None else timedelta(0))
+    commands = _commands(found, options.lead, earliest) if options.schedule else [[] for _ in found]
     if options.json:
         passes = [
             facts_of(one) | ({"schedule": lines} if options.schedule else {})
@@ -376,23 +378,24 @@ def run_passes(options: argparse.Namespace) -> int:
     return 0 if found else 1
 
 
-def _commands(prediction: OrbitPrediction, found: list[Pass], lead: float) -> list[list[str]]:
+def _commands(found: list[Pass], lead: float, earliest: datetime) -> list[list[str]]:
     """Return the commands of each pass as typed, and print a warning for a pass without commands."""
     from ground.passes import scheduled_targets  # noqa: PLC0415
 
     made: list[list[str]] = []
-    for one, targets in zip(found, scheduled_targets(found, lead), strict=True):
+    for one, targets in zip(found, scheduled_targets(found, lead, earliest), strict=True):
         place = f"point ground {one.station.latitude_deg:g} {one.station.longitude_deg:g}"
         made.append(
             [
-                f"schedule {max(at, prediction.begin):%Y-%m-%dT%H:%M:%S} "
-                f"{'point nadir' if target.goal is Goal.NADIR else place}"
+                f"schedule {at:%Y-%m-%dT%H:%M:%S} {'point nadir' if target.goal is Goal.NADIR else place}"
                 for at, target in targets
             ]
         )
         if not targets:
             which = f"{one.station.name}, {one.rise:%Y-%m-%dT%H:%M:%S}"
-            sys.stderr.write(f"{PROGRAM}: {which}: no commands, because an earlier pass lasts longer\n")
+            sys.stderr.write(
+                f"{PROGRAM}: {which}: no commands, because an earlier pass lasts longer, or it ends at once\n"
+            )
     count = sum(map(len, made))
     if count > MOST_ENTRIES:
         problem = f"{count} commands, but the satellite stores {MOST_ENTRIES}: give fewer --days"

@@ -338,7 +338,7 @@ class _Pages:
         stations = request.query.getall("station", [])
         if len(stations) > _MOST_STATIONS:
             raise UsageError(f"{len(stations)} stations: give at most {_MOST_STATIONS}")
-        at, days = self._utc(_real(request, "at")), _real(request, "days")
+        at, days = self._utc(_real(request, "at")), _real(request, "days", "up to a week, in days")
         lines = self._console.surroundings.lines
         if lines is None or at is None:
             raise UsageError(
@@ -432,12 +432,12 @@ class _Pages:
 
 def _predicted(lines: tuple[str, str], begin: datetime, days: float, stations: list[str]) -> dict[str, Any]:
     """Return the passes over stations, each with its scheduled commands: UTC, command words, description."""
-    from ground.passes import OrbitPrediction, facts_of, scheduled_targets, station_of  # noqa: PLC0415 - large
+    from ground.passes import SENDING, OrbitPrediction, facts_of, scheduled_targets, station_of  # noqa: PLC0415 - large
 
     prediction = OrbitPrediction(lines, begin, days)
     found = []
     passes = prediction.passes([station_of(text) for text in stations])
-    for one, targets in zip(passes, scheduled_targets(passes), strict=True):
+    for one, targets in zip(passes, scheduled_targets(passes, earliest=begin + SENDING), strict=True):
         schedule = []
         for utc, target in targets:
             at, words = f"{utc:%Y-%m-%dT%H:%M:%S}", words_of(Point(target))
@@ -457,14 +457,14 @@ async def _command_of(request: web.Request) -> tuple[str, dict[str, Any]]:
     return name, given
 
 
-def _real(request: web.Request, name: str) -> float:
+def _real(request: web.Request, name: str, wanted: str = "the mission time in seconds") -> float:
     text = request.query.get(name, "")
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
     if not abs(value) < MAX_TIME:  # also for NaN
-        raise UsageError(f"{name} = {text!r:.40}: give the mission time in seconds")
+        raise UsageError(f"{name} = {text!r:.40}: give {wanted}")
     return value
 
 

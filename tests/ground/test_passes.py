@@ -139,6 +139,12 @@ def test_overlapping_passes_follow_each_other(
             assert nadir.goal is Goal.NADIR
 
 
+def test_no_command_is_due_before_it_can_be_sent() -> None:
+    passes = [_pass(*span, longitude=0.0) for span in ((-300, 40), (-20, 500), (600, 900))]
+    made = scheduled_targets(passes, earliest=BEGIN + timedelta(seconds=60))
+    assert [[(at - BEGIN).total_seconds() for at, _ in one] for one in made] == [[], [60, 500], [501, 900]]
+
+
 def test_the_sun_at_satellite_and_station_is_that_of_the_ephemeris(prediction: OrbitPrediction) -> None:
     for one in prediction.passes(STATIONS):
         date = julian_date(one.top)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from PIL import Image
 from flight.app.cli import main
 from flight.link.process import directives
 from flight.link.process.directives import Scheduled
-from ground.commands import satellite
+from ground.commands import elements, satellite
 from ground.telemetry import read_run
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
@@ -285,6 +285,20 @@ def test_a_command_of_a_pass_in_progress_is_due_at_the_start(capsys: pytest.Capt
     assert main(["passes", "orbit_3u", "--from", begin, *BERLIN, "--days", "0.01", "--schedule"]) == 0
     first, *_ = capsys.readouterr().out.splitlines()
     assert first == f"schedule {begin} point ground 52.5 13.4"
+
+
+def test_the_commands_of_a_prediction_from_now_on_can_still_be_sent(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> Clock:
+            return cls(2026, 3, 20, 21, 57, tzinfo=tz)
+
+    monkeypatch.setattr(elements, "datetime", Clock)
+    assert main(["passes", "orbit_3u", *BERLIN, "--days", "0.01", "--schedule"]) == 0
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert first == "schedule 2026-03-20T21:58:00 point ground 52.5 13.4"
 
 
 def test_a_station_that_never_sees_the_satellite_has_no_pass(capsys: pytest.CaptureFixture[str]) -> None:

@@ -418,6 +418,11 @@ def test_doubts_about_a_flight_are_shown_on_the_page(folder: Path) -> None:
     assert console.trouble == doubts[1]
 
 
+def test_wrong_days_of_a_prediction_are_named(folder: Path) -> None:
+    status, answer = get(folder, "/api/passes?at=0&days=nan&station=Berlin,52.5,13.4")
+    assert (status, answer["error"]) == (400, "days = 'nan': give up to a week, in days")
+
+
 def test_without_a_way_to_the_flight_nothing_is_sent(folder: Path) -> None:
     status, answer = commanded(folder, "safe", {"reason": ""}, None)
     assert (status, "--to" in answer["error"]) == (400, True)
