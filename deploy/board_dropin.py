@@ -186,7 +186,13 @@ def main(words: list[str]) -> int:
     from flight.app.cli.run import check_values  # noqa: PLC0415 - open_bundle.py does not need the flight,
     from flight.app.flight import placing  # noqa: PLC0415 - which is slow to load
 
+    if not 1 <= len(words) <= 2 or words[0].startswith("-"):
+        sys.stderr.write("usage: board_dropin.py CONFIG [FOLDER]\n")
+        return 2
     path, folder = Path(words[0]), Path(words[1]) if words[1:] else None
+    if folder is not None and not folder.is_dir():
+        sys.stderr.write(f"install: {folder}: no such folder: make it, or give another one\n")
+        return 2
     try:
         check_single(path)
         config = load(path)

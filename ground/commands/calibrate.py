@@ -225,6 +225,8 @@ def run_samples(options: argparse.Namespace) -> int:
     out: Path = options.out
     try:
         out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise UsageError(f"{out}: is not empty, and its files could be replaced: give another --out")
     except OSError as error:
         raise UsageError(f"{out}: cannot be made: {error.strerror or error}") from error
 

@@ -176,7 +176,8 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
         )
         text = "QX QY QZ QW of inertial, LAT LON of ground, RA DEC of object"
         parser.add_argument("goal", choices=[goal.label for goal in Goal])
-        parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help=text)
+        numbers = parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help=text)
+        numbers.required = False  # otherwise argparse names the optional numbers among missing arguments
         parser.add_argument(
             "--roll", type=float, metavar="DEG", help="about the pointing axis (default free)"
         )

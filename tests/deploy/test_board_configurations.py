@@ -11,7 +11,7 @@ import yaml
 from flight.app.cli import main
 from flight.schema import reader
 from flight.schema.bodies import OrbitConfig
-from tests.deploy.scripts import DEPLOY, ROOT, board_dropin, dropin
+from tests.deploy.scripts import DEPLOY, ROOT, board_dropin, dropin, script
 
 TESTBED, ORBIT = (ROOT / "config" / f"board_{name}.yaml" for name in ("testbed", "orbit"))
 
@@ -29,6 +29,26 @@ def test_a_boards_configuration_names_every_device_and_estimates_from_streaks(pa
         assert f'SYMLINK+="{file.removeprefix("/dev/")}"' in named
     assert len(files) == (6 if isinstance(config, OrbitConfig) else 3)
     assert all(f"DeviceAllow={file} rw" in dropin(path) for file in files)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "complaint"),
+    [
+        ("board_dropin", [], "usage: board_dropin.py CONFIG [FOLDER]"),
+        ("board_dropin", ["a", "b", "c"], "usage: board_dropin.py CONFIG [FOLDER]"),
+        ("board_dropin", [str(TESTBED), "/nowhere"], "/nowhere: no such folder"),
+        ("sky_index", [], "usage: sky_index.py [--wanted] CONFIG"),
+        ("sky_index", ["--wanted"], "usage: sky_index.py [--wanted] CONFIG"),
+        ("sky_index", ["--wrong", str(TESTBED)], "usage: sky_index.py [--wanted] CONFIG"),
+        ("sky_index", ["/nowhere/flight.yaml"], "/nowhere/flight.yaml: cannot be read"),
+    ],
+)
+def test_wrong_arguments_of_the_installer_s_programs_are_one_line(
+    name: str, words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script(name).main(words) == 2
+    said = capsys.readouterr().err
+    assert (complaint in said, said.count("\n")) == (True, 1)
 
 
 def test_the_installer_takes_the_testbed_with_streaks_by_default() -> None:

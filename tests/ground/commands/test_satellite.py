@@ -211,6 +211,15 @@ def test_a_table_of_parameters_cannot_be_scheduled(capsys: pytest.CaptureFixture
     assert "knightcube command schedule UTC: error: argument WHAT" in capsys.readouterr().err
 
 
+def test_the_optional_numbers_of_a_goal_are_not_named_as_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        words("point")
+    assert capsys.readouterr().err.endswith("the following arguments are required: goal\n")
+    made = satellite._command_of(words("point", "sun"))
+    assert isinstance(made, Point)
+    assert made.target.numbers == ()
+
+
 def test_options_may_stand_behind_the_command() -> None:
     assert words("slew", "0.2", "--json", "--timeout", "7").timeout == 7.0
     assert words("slew", "0.2").timeout == 2.0

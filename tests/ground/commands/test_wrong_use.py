@@ -83,6 +83,24 @@ def test_a_method_that_needs_the_field_of_view_asks_for_it(tmp_path: Path) -> No
     assert "give --fov or --camera" in done.stderr
 
 
+@pytest.mark.parametrize("name", ["found.jpg", "found.TIFF", "found.fits"])
+def test_an_overlay_has_the_name_of_its_format(tmp_path: Path, name: str) -> None:
+    (tmp_path / "sky.pgm").write_bytes(bytes(64 * 64))
+    words = ("solve", tmp_path / "sky.pgm", "--raw", "64x64x8", "--fov", "15", "--overlay", tmp_path / name)
+    done = command(*words)
+    assert done.returncode == 2
+    assert f"{name}: a PNG file is written: give a name that ends in .png" in done.stderr
+    assert not (tmp_path / name).exists()
+
+
+def test_samples_replace_no_file(tmp_path: Path) -> None:
+    (tmp_path / "stars.png").write_bytes(b"mine")
+    done = command("samples", "--out", tmp_path)
+    assert done.returncode == 2
+    assert f"{tmp_path}: is not empty, and its files could be replaced: give another --out" in done.stderr
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"mine"]
+
+
 def test_a_command_to_nobody_ran_and_failed(tmp_path: Path) -> None:
     done = command("command", "--to", tmp_path / "none", "ping")
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
