@@ -183,6 +183,10 @@ _MOST_SPREAD = 10.0
 _LEAST_INERTIA = 0.05
 # Largest dipole moment of a coil per kg of the satellite, A m^2/kg: a tenth of the mass is saturated iron.
 _MOST_DIPOLE = 20.0
+# Largest residual dipole of a satellite with magnetic control, per kg of its mass, A m^2/kg.
+_MOST_RESIDUAL = 0.5
+# Largest field of the Earth in orbit, T: at the poles, at the lowest altitude.
+_EARTH_FIELD = 6.5e-5
 # Largest ratio of the current that the supply can drive to the limit of the current.
 _MOST_SURPLUS = 100.0
 
@@ -201,6 +205,10 @@ def _check_units(craft: Craft, coils: Coils, refuse: Refuse) -> None:
     if not least <= trace <= most:
         limits = f"{heaviest:.3g} kg in {box} have {least:.2g} to {most:.2g}"
         refuse("craft.inertia", f"has moments with a sum of {trace:.4g} kg m^2, but {limits}: give kg m^2")
+    residual = math.hypot(*craft.residual_dipole)
+    if residual > _MOST_RESIDUAL * heaviest:
+        limit = f"more than {_MOST_RESIDUAL * heaviest:.3g} A m^2, the most for {heaviest:.3g} kg"
+        refuse("craft.residual_dipole", f"has {residual:.4g} A m^2, {limit}: give A m^2 instead of mA m^2")
     for index, coil in enumerate(coils.windings):
         dipole = coil.strength() * (coil.current_limit or coils.current_limit)
         if dipole > _MOST_DIPOLE * heaviest:
@@ -227,6 +235,9 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
     if abs(cosine) > 1e-6:
         degrees = math.degrees(math.acos(cosine))
         refuse("pointing.across", f"is {degrees:.1f} deg from `pointing.axis`: must be 90 deg from it")
+    if config.inertial_unit.field_range < _EARTH_FIELD:
+        problem = f"is {config.inertial_unit.field_range:g}: a satellite measures up to {_EARTH_FIELD:g} T"
+        refuse("inertial_unit.field_range", f"{problem}, the largest field of the Earth: give T")
     if config.camera is not None:
         _check_cones(config.camera, config.pointing.cones, refuse)
 
@@ -357,8 +368,21 @@ def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
         refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
 
 
+# Largest noise of a gyro (rad/s) and of an attitude (rad), and largest range of a magnetometer (T).
+_MOST_OF_UNIT = {
+    "rate_noise": (0.2, "rad/s", "deg/s", math.pi / 180.0),
+    "angle_noise": (0.5, "rad", "deg", math.pi / 180.0),
+    "field_range": (0.01, "T", "uT", 1e-6),
+}
+
+
 def _check_unit(kind: str, unit: UnitSection, refuse: Refuse) -> None:
     _check_length(f"{kind}.mounting", unit.mounting, refuse)
+    for name, (most, wanted, other, scale) in _MOST_OF_UNIT.items():
+        value = getattr(unit, name)
+        if value > most:
+            other_unit = f"the unit is {wanted}, and {value:g} {other} are {value * scale:.3g} {wanted}"
+            refuse(f"{kind}.{name}", f"is {value:g}: expected at most {most:g}: {other_unit}")
     for name in ("gyro_matrix", "field_matrix"):
         largest = float(np.abs(np.array(getattr(unit.calibration, name)) - np.eye(3)).max())
         if largest > _LARGEST_CORRECTION:
