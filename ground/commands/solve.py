@@ -33,7 +33,7 @@ from ground.sky import bodies_in, header_text, sky_facts, sky_text
 from knightcube.astro.arrays import Image
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.catalogue import PROPER_NAMES
-from knightcube.astro.earth.sun import julian_date
+from knightcube.astro.earth.sun import FIRST_YEAR, LAST_YEAR, julian_date
 from knightcube.errors import UsageError
 from knightcube.reference.star_identification import DEFAULT_METHOD, METHODS, method_of
 from knightcube.vision.camera.images import grey_stretch, rows_reversed, write_picture
@@ -49,8 +49,6 @@ from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings
 from knightcube.vision.streaks.streak_result import REASONS
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
-DATES = 1900, 2100
-"""Years in which the velocity of the Earth is known."""
 IMAGE = "image"
 """Name of the attitude method that fits the star positions in the image."""
 
@@ -100,8 +98,8 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Solve the picture, and print and draw the solution. The exit status is 1 without a solution."""
     check_new(options.wcs)
-    if options.date is not None and not DATES[0] <= options.date.year < DATES[1]:
-        years = f"{DATES[0]} to {DATES[1]}"
+    if options.date is not None and not FIRST_YEAR <= options.date.year < LAST_YEAR:
+        years = f"{FIRST_YEAR} to {LAST_YEAR}"
         raise UsageError(f"--date {options.date:%Y-%m-%d}: give the time of the picture, from {years}")
     pixels = read_picture(options)
     tracker, exposure, axis_sigma = _tracker(options, pixels)

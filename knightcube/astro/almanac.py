@@ -18,11 +18,29 @@ from knightcube.astro.earth import geomagnetism
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orbit_knowledge import LOWEST_RADIUS, elements_of, propagated
 from knightcube.astro.earth.orientation import julian_epoch, terrestrial_time
-from knightcube.astro.earth.sun import SPEED_OF_LIGHT, Shadow, earth_from_sun, julian_date, sunlit_share
+from knightcube.astro.earth.sun import (
+    DAY,
+    SPEED_OF_LIGHT,
+    Shadow,
+    earth_from_sun,
+    ephemeris_date,
+    julian_date,
+    sunlit_share,
+)
 from knightcube.errors import ArgumentError, UsageError
 
 _LOWEST_HEIGHT = -12e3
 """Smallest height (m) above the ellipsoid, which is below every point of the Earth's surface."""
+_FARTHEST = 10.0 * EARTH_RADIUS
+"""Largest distance (m) from the Earth's centre at which the field is that of the Earth's core.
+
+The magnetopause is at about ten Earth radii on the day side.
+"""
+_LONGEST = 30.0 * DAY
+"""Longest time (s) over which an orbit is propagated from one state.
+
+The unknown drag displaces a satellite in a low orbit by hundreds to thousands of kilometres in 30 days.
+"""
 
 
 def _position(position: ArrayLike) -> FloatArray:
@@ -60,10 +78,12 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
         position: (3,) geocentric position in ICRS axes, m.
 
     Raises:
-        GeomagneticError: if the time is outside the years of the model.
+        GeomagneticError: if the time is outside the years of the model, or if the position is farther than
+            ten Earth radii from the Earth's centre, where the solar wind determines the field.
         ArgumentError: if the position is not finite or lies deep within the Earth, for example in km.
     """
     at, date = _single_position(position), julian_date(time)
+    _check_near_earth(math.hypot(*at.tolist()))
     geomagnetism.check_year(float(julian_epoch(date)))
     return geomagnetism.field(date, at)
 
@@ -81,15 +101,36 @@ def magnetic_field_on_ground(
 
     Raises:
         GeomagneticError: for a time outside the years of the model, or a position that is not finite, beyond
-            a pole or more than 12 km below the ellipsoid.
+            a pole, more than 12 km below the ellipsoid, or farther than ten Earth radii.
+        ArgumentError: for a longitude beyond 2 pi rad, which is usually in degrees.
     """
+    _check_angle("longitude", longitude)
     year = float(julian_epoch(julian_date(time)))
     geomagnetism.check_year(year)
     if height < _LOWEST_HEIGHT:
         raise geomagnetism.GeomagneticError(
             f"height {height:g} m: must be above {_LOWEST_HEIGHT:g} m, which is below every ocean"
         )
+    if math.isfinite(height):
+        _check_near_earth(EARTH_RADIUS + height)
     return geomagnetism.field_on_ground_axes(year, latitude, longitude, height)
+
+
+def _check_near_earth(distance: float) -> None:
+    """Raise GeomagneticError for a distance from the Earth's centre, m, at which the model is not valid."""
+    if distance > _FARTHEST:
+        raise geomagnetism.GeomagneticError(
+            f"{distance:.4g} m from the Earth's centre: the model is valid up to {_FARTHEST:.4g} m, ten "
+            "Earth radii: give metres"
+        )
+
+
+def _check_angle(name: str, angle: float, least: float = -2.0 * math.pi, most: float = 2.0 * math.pi) -> None:
+    """Raise ArgumentError for a finite angle (rad) beyond its limits, which is usually in degrees."""
+    if math.isfinite(angle) and not least <= angle <= most:
+        raise ArgumentError(
+            name, f"{angle:g}: give {least:.4g} to {most:.4g} rad; math.radians converts degrees"
+        )
 
 
 def apparent_sun(date: float, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, float]:
@@ -119,13 +160,13 @@ def sun_direction(
         velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
 
     Raises:
-        ArgumentError: if position or velocity is not finite, or if the position lies deep within the Earth,
-            for example in km, except at its centre.
+        ArgumentError: if position or velocity is not finite, if the position lies deep within the Earth, for
+            example in km, except at its centre, or if the time is not in the years 1900 to 2099.
     """
     observer = finite_array("position", position, (3,))
     if observer.any():
         _position(observer)
-    return apparent_sun(julian_date(time), observer, finite_array("velocity", velocity, (3,)))[0]
+    return apparent_sun(ephemeris_date("time", time), observer, finite_array("velocity", velocity, (3,)))[0]
 
 
 def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conical") -> FloatArray:
@@ -139,12 +180,32 @@ def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conic
         shadow: shadow model, either "conical" with penumbra, or "cylindrical" with the values 0 and 1 only.
 
     Raises:
-        ArgumentError: if a position is not finite or lies deep within the Earth, for example in km, and for
-            an unknown shadow model.
+        ArgumentError: if a position is not finite or lies deep within the Earth, for example in km, for a
+            time that is not in the years 1900 to 2099, and for an unknown shadow model.
     """
     at = _position(position)
-    sun = -earth_from_sun(float(terrestrial_time(julian_date(time))))[0]
+    sun = -earth_from_sun(float(terrestrial_time(ephemeris_date("time", time))))[0]
     return sunlit_share(at, sun, shadow)
+
+
+def _check_elements(
+    semi_major_axis: float, eccentricity: float, inclination: float, angles: dict[str, float]
+) -> None:
+    """Raise UsageError for Kepler elements that `orbit_state` refuses; `angles` are the other angles, rad."""
+    sizes = {"semi_major_axis": semi_major_axis, "eccentricity": eccentricity, "inclination": inclination}
+    for name, value in (sizes | angles).items():
+        if not math.isfinite(value):
+            raise ArgumentError(name, f"{value}: the elements of an orbit must be finite")
+    _check_angle("inclination", inclination, 0.0, math.pi)
+    for name, value in angles.items():
+        _check_angle(name, value)
+    if not 0.0 <= eccentricity < 1.0:
+        raise UsageError(f"eccentricity is {eccentricity}: it must be 0 to below 1")
+    if semi_major_axis * (1.0 - eccentricity) <= EARTH_RADIUS:
+        raise UsageError(
+            f"the perigee lies {semi_major_axis * (1.0 - eccentricity):.0f} m from the Earth's centre:"
+            f" it must be above {EARTH_RADIUS:.0f} m: give a larger semi_major_axis, in metres"
+        )
 
 
 def orbit_state(
@@ -164,23 +225,18 @@ def orbit_state(
         inclination: inclination to the ICRS equator, 0 to pi rad.
         ascending_node: right ascension of the ascending node, rad.
         argument_of_perigee: argument of perigee, rad.
-        true_anomaly: true anomaly, rad.
+        true_anomaly: true anomaly, rad. The angles may be -2 pi to 2 pi rad.
 
     Raises:
-        UsageError: for elements that are not finite or out of range, or whose orbit intersects the Earth.
+        UsageError: for elements that are not finite or whose orbit intersects the Earth, and for angles out
+            of range, which are usually in degrees.
     """
-    angles = (inclination, ascending_node, argument_of_perigee, true_anomaly)
-    if not all(map(math.isfinite, (semi_major_axis, eccentricity, *angles))):
-        raise UsageError("the elements of an orbit must be finite")
-    if not 0.0 <= eccentricity < 1.0:
-        raise UsageError(f"eccentricity is {eccentricity}: it must be 0 to below 1")
-    if not 0.0 <= inclination <= math.pi:
-        raise UsageError(f"inclination is {inclination:g} rad: it must be 0 to pi, in rad instead of degrees")
-    if semi_major_axis * (1.0 - eccentricity) <= EARTH_RADIUS:
-        raise UsageError(
-            f"the perigee lies {semi_major_axis * (1.0 - eccentricity):.0f} m from the Earth's centre:"
-            f" it must be above {EARTH_RADIUS:.0f} m"
-        )
+    angles = {
+        "ascending_node": ascending_node,
+        "argument_of_perigee": argument_of_perigee,
+        "true_anomaly": true_anomaly,
+    }
+    _check_elements(semi_major_axis, eccentricity, inclination, angles)
     latus_rectum = semi_major_axis * (1.0 - eccentricity**2)
     cosine, sine = math.cos(true_anomaly), math.sin(true_anomaly)
     in_plane = latus_rectum / (1.0 + eccentricity * cosine) * np.array([cosine, sine])
@@ -211,10 +267,12 @@ def propagate_orbit(
     Args:
         position: (3,) initial position in ICRS axes, m.
         velocity: (3,) initial velocity in ICRS axes, m/s.
-        seconds: (n,) times relative to the initial state, in increasing or decreasing order, s.
+        seconds: (n,) times relative to the initial state, in increasing or decreasing order, s, at most 30
+            days.
 
     Raises:
-        ArgumentError: if a value is not finite, or if the orbit intersects the Earth, for example in km.
+        ArgumentError: if a value is not finite, if the orbit intersects the Earth, for example in km, or if a
+            time is more than 30 days from the initial state.
     """
     at, motion = _single_position(position), finite_array("velocity", velocity, (3,))
     lowest = _perigee(at, motion)
@@ -224,8 +282,17 @@ def propagate_orbit(
             f"{motion.tolist()} m/s gives a perigee {lowest:.0f} m from the Earth's centre, and no satellite "
             f"is below {LOWEST_RADIUS:.0f} m: give the velocity in m/s, in axes that do not rotate",
         )
+    times = np.atleast_1d(finite_array("seconds", seconds))
+    if times.ndim != 1:
+        raise ArgumentError("seconds", f"an array of shape {times.shape}: give times of shape (n,)")
+    if (longest := float(np.abs(times).max(initial=0.0))) > _LONGEST:
+        raise ArgumentError(
+            "seconds",
+            f"{longest:g} s from the state: the orbit is unknown after {_LONGEST:g} s (30 days): give a "
+            "newer state",
+        )
     state, elapsed, states = np.concatenate([at, motion]), 0.0, []
-    for time in np.atleast_1d(finite_array("seconds", seconds)).tolist():
+    for time in times.tolist():
         state, elapsed = propagated(state, time - elapsed), time
         states.append(state)
     found = np.array(states).reshape(-1, 6)

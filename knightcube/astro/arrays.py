@@ -25,10 +25,16 @@ Record = TypeVar("Record")
 def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:
     """Return the argument `name` of a public function as an array of finite numbers.
 
-    Raises ArgumentError for a value that is not finite or not numeric, and for an array whose shape is not
-    one of `shapes`; without `shapes`, every shape is permitted.
+    Raises ArgumentError for a value that is not finite, not numeric or complex, for masked elements, whose
+    values are meaningless, and for an array whose shape is not one of `shapes`; without `shapes`, every shape
+    is permitted.
     """
+    if np.ma.is_masked(value):
+        count = np.count_nonzero(np.ma.getmaskarray(np.ma.asarray(value)))
+        raise ArgumentError(name, f"{count} masked elements: replace them by finite numbers")
     try:
+        if np.iscomplexobj(value):
+            raise TypeError
         found = np.array(value, dtype=float)
     except (TypeError, ValueError):
         raise ArgumentError(name, f"{value!r}: give finite numbers") from None

@@ -23,7 +23,7 @@ from knightcube.astro.arrays import (
     checked_number,
     finite_array,
 )
-from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
+from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.errors import ArgumentError, InputError
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole, check_camera
 from knightcube.vision.frame import grey_image
@@ -248,9 +248,9 @@ class StarTracker:
                 colours are red, green and blue, and a fourth channel of transparency is ignored.
             exposure: exposure time, s. The exposure time is only needed for the rate of streaked stars, and
                 with a predicted rate.
-            utc: date of the image, which is UTC if it has no time zone. The date is used for proper motion
-                and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is None, the
-                epoch of the index is used, without aberration.
+            utc: date of the image, from 1900 to 2099, which is UTC if it has no time zone. The date is used
+                for proper motion and for aberration by the Earth's velocity, which is at most 20.5". If `utc`
+                is None, the epoch of the index is used, without aberration.
             attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
                 predicted positions, which is faster than a search of the whole sky. If the search near the
                 predicted positions does not succeed, the whole sky is searched.
@@ -272,7 +272,7 @@ class StarTracker:
         if utc is not None:
             if not isinstance(utc, datetime):
                 raise ArgumentError("utc", f"{utc!r}: give a datetime, such as datetime(2026, 7, 2, 12, 30)")
-            date = julian_date(utc)
+            date = ephemeris_date("utc", utc)
             sky = sky.at(2000.0 + (date - J2000) / 365.25)
             settings = replace(settings, velocity=earth_velocity(date))
         if self._learn and self.lens is None:

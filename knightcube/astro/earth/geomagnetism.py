@@ -50,9 +50,11 @@ class GeomagneticError(KnightCubeError):
 def check_year(year: float) -> None:
     """Raise GeomagneticError for a decimal year outside the validity of the model."""
     if not FIRST_YEAR <= year <= LAST_YEAR:
+        # Two digits would show a year within the range for a day outside of it.
+        digits = 4 if FIRST_YEAR <= round(year, 2) <= LAST_YEAR else 2
         raise GeomagneticError(
-            f"year {year:.2f}: WMM2025 is valid from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}, and the magnetic "
-            "field is known only in these years"
+            f"year {year:.{digits}f}: WMM2025 is valid from {FIRST_YEAR:.0f} to "
+            f"{LAST_YEAR:.0f}, and the magnetic field is known only in these years"
         )
 
 

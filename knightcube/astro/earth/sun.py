@@ -45,6 +45,25 @@ def julian_date(utc: datetime) -> float:
     return J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
 
 
+FIRST_YEAR, LAST_YEAR = 1900, 2100
+"""Years between which the positions of Earth and Sun are known."""
+
+
+def ephemeris_date(name: str, utc: datetime) -> float:
+    """Return the Julian date UTC, days, of the argument `name`, at which the Sun's position is known.
+
+    Raises ArgumentError for another type than `datetime`, and for a time before 1900 or after 2099.
+    """
+    date = julian_date(utc)
+    if not FIRST_YEAR <= utc.year < LAST_YEAR:
+        raise ArgumentError(
+            name,
+            f"{utc.isoformat()}: give a time from {FIRST_YEAR} to {LAST_YEAR - 1}, in which the positions of "
+            "Earth and Sun are known",
+        )
+    return date
+
+
 def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
     """Return the Earth's heliocentric position (3,), m, and barycentric velocity (3,), m/s, in ICRS axes.
 
