@@ -77,8 +77,12 @@ class ScanResult:
         return damage + sum(self.missing.values()) == 0
 
 
-def scan(data: bytes) -> ScanResult:
-    """Return the packets in `data` and the account of all bytes."""
+def scan(data: bytes, whole: bool = False) -> ScanResult:
+    """Return the packets in `data` and the account of all bytes.
+
+    If `whole` is true, the data begin with the first packets of a flight, whose sequence counts are zero, so
+    packets before the first found packet are missing too.
+    """
     found: dict[str, list[bytes]] = {name: [] for name in LAYOUTS}
     claimed = other_versions = last = 0
     for layout, begin, end in walk(data):
@@ -95,16 +99,20 @@ def scan(data: bytes) -> ScanResult:
         total_bytes=len(data),
         skipped_bytes=len(data) - claimed - truncated,
         truncated_bytes=truncated,
-        missing={name: _missing(LAYOUTS[name], raw) for name, raw in joined.items()},
+        missing={name: _missing(LAYOUTS[name], raw, whole) for name, raw in joined.items()},
         other_versions=other_versions,
     )
 
 
-def _missing(layout: Layout, packets: bytes) -> int:
-    """Return the number of packets missing between the found packets, according to their sequence counts."""
-    if len(packets) <= layout.length:  # gaps need at least two packets
+def _missing(layout: Layout, packets: bytes, whole: bool) -> int:
+    """Return the number of packets missing between the found packets, according to their sequence counts.
+
+    If `whole` is true, the packets that are missing before the first found packet are counted too.
+    """
+    if not packets:
         return 0
-    steps = np.diff(layout.sequence_counts(packets))
+    counts = np.asarray(layout.sequence_counts(packets), dtype=np.int64)
+    steps = np.diff(counts, prepend=-1) if whole else np.diff(counts)
     return int(np.sum((steps - 1) % SEQUENCE_MODULUS))
 
 
@@ -161,6 +169,11 @@ def flight_segments(folder: Path) -> list[Path]:
     return segments
 
 
+def is_first(segment: Path) -> bool:
+    """Return whether a file is the first segment of a log, with the first packets of a flight."""
+    return int(segment.stem.rpartition("-")[2]) == 1
+
+
 def read_run(folder: Path) -> Run:
     """Read a run's folder. Raises UsageError if the folder has no flight log with a valid packet."""
     folder = Path(folder)
@@ -172,7 +185,10 @@ def read_run(folder: Path) -> Run:
     logs = []
     for stem in ("flight", "truth", "performance"):
         try:
-            logs.append(scan(b"".join(path.read_bytes() for path in find_segments(folder, stem))))
+            paths = find_segments(folder, stem)
+            # The first packets of a log whose oldest segments were deleted are not missing by damage.
+            whole = stem == "flight" and is_first(paths[0])
+            logs.append(scan(b"".join(path.read_bytes() for path in paths), whole))
         except OSError as error:
             raise UsageError(f"{folder}: the {stem} log cannot be read: {error.strerror or error}") from error
     flight, truth, performance = logs

@@ -33,7 +33,7 @@ from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
-from ground.telemetry import date_of, decode, flight_segments, scan
+from ground.telemetry import date_of, decode, flight_segments, is_first, scan
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -80,6 +80,7 @@ class LogTail:
         segments = flight_segments(folder)
         self._folder = folder
         self._path = segments[0]
+        self._begins = is_first(segments[0])
         self._offset = 0
         self._rest = b""
         self._bytes = self._outside = self._missing = self._others = self._packets = 0
@@ -102,7 +103,8 @@ class LogTail:
             data += self._read()
             self._path, self._offset = following, 0
             data += self._read()
-        found = scan(data)
+        found = scan(data, self._begins)
+        self._begins = self._begins and not found.counts
         self._rest = data[len(data) - found.truncated_bytes :] if found.truncated_bytes else b""
         self._bytes += found.total_bytes - found.truncated_bytes
         self._outside += found.skipped_bytes
@@ -369,7 +371,7 @@ def state_line(state: FlightState) -> str:
     if (slips := state.value("health", "slips")) is not None:
         parts.append(f"slips {int(slips)}")
         parts.append(f"alarms {', '.join(state.alarms) or 'none'}")
-    if state.faults or (slips is not None and (state.since or 0.0) > _FROM_START_S):
+    if state.faults or slips is not None:
         parts.append(state.counted_faults)
     return "  ".join(part for part in parts if part)
 

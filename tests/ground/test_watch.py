@@ -146,6 +146,29 @@ def test_a_damaged_log_is_reported(growing: Path, content: bytes | None, problem
     assert done.stderr.endswith(f"knightcube: {growing}: {problem}\n")
 
 
+def test_packets_missing_at_the_beginning_of_a_log_are_counted(growing: Path) -> None:
+    log = growing / "flight-0001.ccsds"
+    whole = read_run(growing).flight
+    log.write_bytes(log.read_bytes()[whole.total_bytes // 2 :])
+    cut = read_run(growing).flight
+    lost = sum(whole.counts.values()) - sum(cut.counts.values())
+    absent = sum(count for name, count in whole.counts.items() if name not in cut.counts)
+    assert sum(cut.missing.values()) == lost - absent > 0
+    assert f", {lost - absent} packets are missing" in command("watch", growing, "--once").stderr
+    log.rename(growing / "flight-0002.ccsds")  # older segments were deleted by the flight
+    assert sum(read_run(growing).flight.missing.values()) == 0
+
+
+def test_a_flight_without_faults_is_shown_with_their_number(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", Recipe(duration=2.0, rate_hz=10.0, hold=1.0))
+    packer = continued(run)
+    with (run / "flight-0001.ccsds").open("ab") as file:
+        file.write(pack(packer, HEALTH, 2.0, mode=3))
+    assert "  faults 0  no packet for " in command("watch", run, "--once").stdout.replace(
+        "\n", "  no packet for "
+    )
+
+
 def test_a_file_is_not_called_a_missing_folder(growing: Path) -> None:
     for name in ("watch", "console", "report", "export"):
         done = command(name, growing / "flight-0001.ccsds")
