@@ -386,10 +386,12 @@ class RunFiles:
     def listing(self) -> Object:
         """Return the files of the folder and its subfolders."""
         paths = [path for path in sorted(self._folder.rglob("*")) if path.is_file() and not path.is_symlink()]
-        files = [
-            {"name": path.relative_to(self._folder).as_posix(), "bytes": path.stat().st_size}
-            for path in paths[:_MOST_FILES]
-        ]
+        files = []
+        for path in paths[:_MOST_FILES]:
+            with contextlib.suppress(FileNotFoundError):  # a flight deletes its oldest segments
+                files.append(
+                    {"name": path.relative_to(self._folder).as_posix(), "bytes": path.stat().st_size}
+                )
         return {"files": files}
 
     def get(self, name: str) -> Path:

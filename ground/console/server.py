@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import hmac
 import json
+import logging
 import re
 import secrets
 import time
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from flight.link.commands import Point, words_of
 from flight.link.process.directives import KINDS
@@ -199,6 +201,7 @@ def application(console: Console, access: Access) -> web.Application:
         response.set_cookie(name, session, httponly=True, samesite="Strict")
         return response
 
+    logging.getLogger("aiohttp.server").addFilter(_is_not_a_malformed_request)
     app = web.Application(middlewares=[only_own_page, _errors_as_json], client_max_size=_MOST_UPLOAD)
     app.on_response_prepare.append(_add_headers)
     pages = _Pages(console)
@@ -223,6 +226,11 @@ def application(console: Console, access: Access) -> web.Application:
     app.cleanup_ctx.append(lambda _: _reading(console))
     app.on_shutdown.append(lambda _: _close_sockets(console))
     return app
+
+
+def _is_not_a_malformed_request(record: logging.LogRecord) -> bool:
+    """Return whether a record is not a traceback about bytes of another program that are not HTTP."""
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
 async def _reading(console: Console) -> AsyncIterator[None]:

@@ -5,12 +5,19 @@ const MOST_ROWS = 500;
 const MOST_ITEMS = 200; // events kept of one line
 const GAP_S = 60; // longest time between events of one line
 
-function row(cells, kind = "") {
+function row(cells, kind = "", packet = null) {
   const line = document.createElement("tr");
   line.className = kind;
   for (const cell of cells) line.append(Object.assign(document.createElement("td"), { textContent: cell }));
   line.firstChild.className = "t";
+  if (packet) line.firstChild.title = utc(packet);
   return line;
+}
+let zero = null; // UTC of mission time zero, ms since 1970, or null while it is unknown
+export function setZero(milliseconds) { zero = milliseconds; }
+function utc(packet) {
+  const date = new Date(zero === null ? NaN : zero + packet.time_ns / 1e6);
+  return Number.isFinite(date.getTime()) ? `${date.toISOString().slice(0, 19)}Z` : ""; // a damaged log may have any time
 }
 const seconds = (packet) => `${(packet.time_ns / 1e9).toFixed(1)}`;
 
@@ -87,7 +94,7 @@ export class Events extends Rows {
     const title = `${name}${count > 1 ? ` × ${count}` : ""}: ${ended && last.name !== name ? `${events[0].text}; ${last.name}: ${last.text}` : last.text}`;
     const cells = [seconds({ time_ns: begin }), open ? "open" : end > begin || ended ? seconds({ time_ns: end }) : "", label(severity, this.field), title];
     if (!episode.line) {
-      episode.line = row(cells, beyond(severity, this.field));
+      episode.line = row(cells, beyond(severity, this.field), { time_ns: begin });
       this.add(episode.line);
     }
     episode.line.className = open || !ended ? beyond(severity, this.field) : "";
@@ -141,7 +148,7 @@ export class Frames extends Rows {
   line(frame) {
     const known = this.lines.get(frame.sequence);
     if (known?.isConnected) return known;
-    const line = row([seconds(frame), "", "", "", "", "", ""]);
+    const line = row([seconds(frame), "", "", "", "", "", ""], "", frame);
     line.tabIndex = 0;
     line.dataset.sequence = frame.sequence;
     this.lines.set(frame.sequence, line);
@@ -156,11 +163,11 @@ export class History extends Rows {
   show(_, __, listed, again) {
     if (again) this.clear();
     for (const command of listed.command ?? []) {
-      this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "warn"));
+      this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "warn", command));
     }
     for (const step of listed.verification ?? []) {
       const name = label(step.stage, this.stage);
-      this.add(row([seconds(step), `link ${step.spi}:${step.counter}`, name, step.text], ["refused", "failed", "repeated"].includes(name) ? "warn" : ""));
+      this.add(row([seconds(step), `link ${step.spi}:${step.counter}`, name, step.text], ["refused", "failed", "repeated"].includes(name) ? "warn" : "", step));
     }
   }
 }

@@ -3,7 +3,7 @@ import { Attitude } from "/page/attitude.js";
 import { Commander, Parameters } from "/page/commands.js";
 import { KeptFrame } from "/page/frames.js";
 import { setUpKeys } from "/page/keys.js";
-import { Events, Frames, History } from "/page/lists.js";
+import { Events, Frames, History, setZero } from "/page/lists.js";
 import { GroundTrack } from "/page/map.js";
 import { Files, Passes } from "/page/panels.js";
 import { setUpTheme } from "/page/theme.js";
@@ -66,6 +66,7 @@ function take(said) {
   Object.assign(newest, said.newest);
   Object.assign(state, { time: said.time, span: said.span, live: said.live, speed: said.speed, silence: said.silence, flight_silence: said.flight_silence,
     surroundings: said.surroundings, utc_ns: said.utc_ns });
+  setZero(said.utc_ns === null ? null : said.utc_ns / 1e6 - said.time * 1e3);
   for (const view of views) view.show(newest, state, said.listed, said.again);
   if (said.body !== table.body) learn(said.body);
   byId("trouble").hidden = !said.trouble;

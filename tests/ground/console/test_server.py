@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import shutil
 from collections.abc import Awaitable, Callable
@@ -416,6 +417,21 @@ def test_doubts_about_a_flight_are_shown_on_the_page(folder: Path) -> None:
         console.doubts = tuple(partial(str, text) for text in doubts)
         console.read()
     assert console.trouble == doubts[1]
+
+
+@pytest.mark.parametrize("data", [b"FOO / HTTP/1.1\r\n\r\n", b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n\r\n"])
+def test_bytes_that_are_not_http_print_no_traceback(
+    folder: Path, data: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def ask(client: TestClient[Any, Any]) -> bytes:
+        reader, writer = await asyncio.open_connection("127.0.0.1", client.port)
+        writer.write(data)
+        answer = await reader.readline()
+        writer.close()
+        return answer
+
+    assert b" 400 " in asked(folder, ask)
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_wrong_days_of_a_prediction_are_named(folder: Path) -> None:
