@@ -333,6 +333,8 @@ def run_console(options: argparse.Namespace) -> int:
         raise KnightCubeError(f"the console needs {error.name}: {needed}") from error
     if (options.run is None) == (options.link is None):
         raise UsageError("give RUN, the folder of a run (with --fly: a new folder), or --link ADDRESS")
+    if options.link is None and options.config is not None:
+        raise UsageError(f"--config {options.config}: is for --link; a run has its own configuration")
     address = _listening(options.port)
     with address, ExitStack() as stack:
         shown = _shown(options, stack)

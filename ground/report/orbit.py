@@ -189,10 +189,10 @@ def camera_errors(run: Run) -> AttitudeErrors:
 def star_camera_knowledge(run: Run) -> Object | None:
     """Return rms error with stars and NEES (normalised squared error) of the star camera's attitude per axis.
 
-    Returns None without description packets of the estimate and of the truth.
+    Returns None without a star attitude, and without description packets of the estimate and of the truth.
     """
     found = camera_errors(run)
-    if not len(found.times):
+    if not len(found.times) or not len(run["stars"]):
         return None
     with_stars = stars_age(run, found.times) < WITH_STARS_S
     return {

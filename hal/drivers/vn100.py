@@ -99,7 +99,10 @@ def check(settings: Vn100Settings, baud_rate: int) -> None:
         )
     load = settings.rate_hz * length * 10 / baud_rate
     if load > _LINE_LOAD_LIMIT:
-        raise OutOfRange(DEVICE, f"line load at {baud_rate} baud", load, 0.0, _LINE_LOAD_LIMIT, "of the line")
+        most = int(_LINE_LOAD_LIMIT * baud_rate / (10 * length))
+        cure = f"raise `baud_rate`, or reduce `rate_hz` to at most {most}"
+        what, share = f"line load at {baud_rate} baud", round(load, 3)
+        raise OutOfRange(DEVICE, what, share, 0.0, _LINE_LOAD_LIMIT, "of the line", cure)
     if settings.unit_port not in {1, 2}:
         raise Refused(DEVICE, f"unit_port = {settings.unit_port}: the unit has serial ports 1 and 2")
 

@@ -54,8 +54,11 @@ class Refused(DeviceError):
 class OutOfRange(DeviceError):
     """Raised for a command or reading that exceeds the range of the device or is physically impossible."""
 
-    def __init__(self, device: str, quantity: str, value: float, low: float, high: float, unit: str) -> None:
-        super().__init__(device, f"{quantity} = {value!r} {unit} is outside {low!r} .. {high!r} {unit}")
+    def __init__(
+        self, device: str, quantity: str, value: float, low: float, high: float, unit: str, cure: str = ""
+    ) -> None:
+        problem = f"{quantity} = {value!r} {unit} is outside {low!r} .. {high!r} {unit}"
+        super().__init__(device, f"{problem}: {cure}" if cure else problem)
         self.quantity = quantity
         self.value = value
         self.low = low

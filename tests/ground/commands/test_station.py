@@ -140,6 +140,12 @@ def test_an_address_of_no_flight_is_refused(tmp_path: Path, to: str, complaint: 
         assert complaint in done.stderr
 
 
+def test_a_configuration_of_a_link_is_not_ignored_for_a_run(tmp_path: Path) -> None:
+    done = command("console", flight_log(tmp_path / "run"), "--config", "orbit")
+    assert done.returncode == 2
+    assert "orbit.yaml: is for --link; a run has its own configuration" in done.stderr
+
+
 def test_keys_are_made_for_both_ends(tmp_path: Path) -> None:
     done = command("keys", tmp_path / "keys")
     assert done.returncode == 0

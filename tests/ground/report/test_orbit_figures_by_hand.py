@@ -232,10 +232,10 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
     # The attitude error of the body includes the misalignment. The attitude error of the star camera is 1e-4
     # rad about x.
     body = from_rotation_vector(tilt + np.array([1e-4, 0.0, 0.0])).tolist()
-    run = packed_run(
+    packets: dict[str, Any] = {"stars": [(10.0, {"accepted": 1})]}
+    packets |= dict(
         navigation=[(0.0, {"knowledge": 2})],
         attitude=[(t, {"quaternion": body, "angle_sigma": [2e-3] * 3}) for t in (0.5, 10.5, 40.5)],
-        stars=[(10.0, {"accepted": 1})],
         truth=[(t, {"quaternion": UPRIGHT}) for t in (0.5, 10.5, 40.5)],
         description=[
             (t, {**matrices, **sigmas, "inertia": doubled, "inertia_ratio_sigma": [0.01] * 6,
@@ -244,6 +244,7 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
         ],
         true_description=[(0.0, {**matrices, "inertia": inertia, "camera": (-tilt).tolist()})],
     )  # fmt: skip
+    run = packed_run(**packets)
     found = orbit.knowledge(run)
     assert found is not None
     error = math.sqrt(2.1e-3**2 + 2e-3**2)
@@ -251,6 +252,9 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
     assert found["star_camera"]["with_stars_error_rms_rad"] == pytest.approx(error, rel=1e-3)
     rows = {row["name"]: row for row in found["description"]}
     assert rows["inertia"]["error"] == pytest.approx(0.0, abs=1e-12), "only the ratio to the trace counts"
+    without = orbit.knowledge(packed_run(**packets | {"stars": []}))
+    assert without is not None
+    assert without["star_camera"] is None, "a satellite without star camera"
     assert rows["inertia"]["sigma"] == pytest.approx(0.01, rel=1e-6)
     assert rows["camera"]["error"] == pytest.approx(np.sqrt(np.mean(tilt**2)), rel=1e-6)
 

@@ -394,6 +394,7 @@ def received(values: dict[int, float]) -> tuple[Sequence[ImuReading], ImuLink]:
         ({"rate_hz": 30}, Refused, "rate_hz = 30"),
         ({"rate_hz": 0}, Refused, "rate_hz = 0"),
         ({"rate_hz": 200}, OutOfRange, "line load at 115200 baud"),
+        ({"rate_hz": 200}, OutOfRange, "raise `baud_rate`, or reduce `rate_hz` to at most 1"),
         ({"rate_hz": 100, "output": "ascii"}, OutOfRange, "line load"),
         ({"rate_hz": 80, "output": "ascii"}, Refused, "rate_hz = 80"),
         ({"unit_port": 3}, Refused, "unit_port = 3"),
