@@ -188,8 +188,12 @@ class PageState:
         self._shown.clear()
 
     def at(self, time_ns: int, names: Mapping[str, Any]) -> Object:
-        """Return the new packets up to a time: the newest of each name, and lists of the `LISTED` types."""
+        """Return the new packets up to a time: the newest of each name, and lists of the `LISTED` types.
+
+        The value `omitted` is the number of older packets of a type that are not in its list.
+        """
         newest: Object = {}
+        omitted: dict[str, int] = {}
         again = not self._shown
         listed: dict[str, list[Object]] = {}
         for name in names:
@@ -202,8 +206,10 @@ class PageState:
             newest[name] = rows[-1] if rows else None
             if name in LISTED:
                 listed[name] = rows
+                if first > shown:
+                    omitted[name] = first - shown
             self._shown[name] = stop
-        return {"newest": newest, "listed": listed, "again": again}
+        return {"newest": newest, "listed": listed, "omitted": omitted, "again": again}
 
 
 def values(row: Any) -> Object:

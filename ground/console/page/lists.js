@@ -22,9 +22,14 @@ function utc(packet) {
 const seconds = (packet) => `${(packet.time_ns / 1e9).toFixed(1)}`;
 
 class Rows {
-  constructor(table) { this.body = table.tBodies[0]; this.kept = []; }
-  clear() { this.body.replaceChildren(); this.kept = []; }
-  add(line) { this.body.prepend(line); while (this.body.rows.length > MOST_ROWS) this.body.lastChild.remove(); }
+  constructor(table) { Object.assign(this, { table, body: table.tBodies[0], kept: [], older: 0 }); }
+  clear() { this.body.replaceChildren(); this.table.deleteCaption(); this.kept = []; this.older = 0; }
+  add(line) { this.body.prepend(line); while (this.body.rows.length > MOST_ROWS) { this.body.lastChild.remove(); this.omit(1); } }
+  // The page must not look as if the flight began with its oldest row.
+  omit(count = 0) {
+    this.older += count;
+    if (count) this.table.createCaption().textContent = `${this.older} older entries are not shown; knightcube export writes all`;
+  }
 }
 
 // Events of one cause as one line with begin and end. An event that ends a condition closes the line of its begin, and
@@ -36,8 +41,9 @@ export class Events extends Rows {
     severity.onchange = filter.oninput = () => { for (const episode of this.kept) this.hide(episode); };
   }
 
-  show(newest, _, listed, again) {
+  show(newest, { omitted }, listed, again) {
     if (again) { this.clear(); this.open.clear(); }
+    this.omit(omitted.event);
     const touched = new Set((listed.event ?? []).map((event) => this.take(event)));
     if (newest.health) for (const episode of this.endedBy(newest.health)) touched.add(episode);
     for (const episode of touched) this.draw(episode);
@@ -128,8 +134,9 @@ export class Events extends Rows {
 const subject = (event) => event.text.split(/[ :]/)[0];
 
 export class Frames extends Rows {
-  show(_, __, listed, again) {
+  show(_, { omitted }, listed, again) {
     if (again) { this.clear(); this.lines = new Map(); }
+    this.omit(omitted.streak ?? omitted.stars);
     for (const frame of listed.streak ?? []) {
       const rate = frame.rate.every((part) => part !== null) ? `${(180 / Math.PI * Math.hypot(...frame.rate)).toFixed(3)} deg/s` : frame.status;
       const line = this.line(frame);
@@ -160,8 +167,9 @@ export class Frames extends Rows {
 // Commands that reached the flight, and by a link each stage of a command with its counter.
 export class History extends Rows {
   constructor(table, stage) { super(table); this.stage = stage; }
-  show(_, __, listed, again) {
+  show(_, { omitted }, listed, again) {
     if (again) this.clear();
+    this.omit((omitted.command ?? 0) + (omitted.verification ?? 0));
     for (const command of listed.command ?? []) {
       this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "warn", command));
     }

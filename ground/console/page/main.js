@@ -65,7 +65,7 @@ function take(said) {
   if (said.again) for (const name of Object.keys(newest)) delete newest[name];
   Object.assign(newest, said.newest);
   Object.assign(state, { time: said.time, span: said.span, live: said.live, speed: said.speed, silence: said.silence, flight_silence: said.flight_silence,
-    surroundings: said.surroundings, utc_ns: said.utc_ns });
+    surroundings: said.surroundings, utc_ns: said.utc_ns, omitted: said.omitted });
   setZero(said.utc_ns === null ? null : said.utc_ns / 1e6 - said.time * 1e3);
   for (const view of views) view.show(newest, state, said.listed, said.again);
   if (said.body !== table.body) learn(said.body);

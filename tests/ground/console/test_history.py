@@ -74,6 +74,18 @@ def test_an_instant_shows_what_had_come_and_each_event_once(history: History, ru
     assert instant.at(LATER, LAYOUTS)["newest"]["control"] == values(run["control"][-1])
 
 
+def test_packets_that_are_too_old_for_a_list_are_counted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ground.console.history._MAX_LISTED", 2)
+    rows = np.repeat(run["event"][:1], 7)
+    with History() as history:
+        history.append({"event": rows})
+        page = PageState(history)
+        state = page.at(LATER, LAYOUTS)
+        assert (len(state["listed"]["event"]), state["omitted"]) == (2, {"event": 5})
+        history.append({"event": rows[:1]})
+        assert page.at(LATER, LAYOUTS)["omitted"] == {}
+
+
 def test_a_replay_shows_at_each_time_what_was_live_then(history: History, run: Run) -> None:
     """The live state at a time equals the state that a replay shows for this time."""
     for until in (1_000_000_000, 3_300_000_000):
