@@ -74,6 +74,12 @@ def _real(value: npt.ArrayLike) -> float:
     )
 
 
+def check_type(name: str, value: object, kind: type[object]) -> None:
+    """Raise ArgumentError unless the argument `name` of a public function is an object of a class."""
+    if not isinstance(value, kind):
+        raise ArgumentError(name, f"{value!r}: give an object of the class {kind.__name__}")
+
+
 _UNIT = 1e-12
 """Largest deviation of the length of a vector from one at which the vector is not normalised again."""
 

@@ -26,7 +26,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError
 from knightcube.vision.camera.lens import SHAPE_TERMS, CameraModel, Lens, LensError
 from knightcube.vision.frame import grey_image
 from knightcube.vision.frame_job import solve_frame
@@ -512,9 +512,7 @@ def calibrate_lens(
         InputError: if the field of view is not between 1 and 120 deg.
         CalibrationError: if the solved images do not determine a lens.
     """
-    images = [grey_image(image) for image in images]
-    if len({image.shape for image in images}) != 1:
-        raise UsageError("a calibration needs images of one camera with the same shape")
+    images = _grey_images(images)
     sky = default_index()
     model: CameraModel
     model, scale = camera_of_field(fov_deg, None, images[0].shape)
@@ -549,6 +547,22 @@ def calibrate_lens(
             outcomes[solved[number]] = replace(outcomes[solved[number]], excluded=reason)
         model, scale = lens.calibration.lens, (0.999, 1.001)
     return LensCalibration(lens, tuple(outcomes))
+
+
+def _grey_images(images: Sequence[Image]) -> list[Image]:
+    """Return grey images of one shape. Raises UsageError, which states the number of the image, from 1."""
+    found: list[Image] = []
+    for number, image in enumerate(images, start=1):
+        try:
+            found.append(grey_image(image))
+        except ArgumentError as error:
+            raise ArgumentError(f"images, number {number}", error.problem) from None
+        if found[-1].shape != found[0].shape:
+            shapes = f"an array of shape {found[-1].shape}, but the first image has {found[0].shape}"
+            raise ArgumentError(f"images, number {number}", f"{shapes}: give images of one camera")
+    if not found:
+        raise ArgumentError("images", "no image: give images of the night sky")
+    return found
 
 
 def _repeated(images: Sequence[Image]) -> dict[int, str]:

@@ -19,6 +19,7 @@ from knightcube.astro.arrays import (
     FloatArray,
     Image,
     IntArray,
+    check_type,
     checked_deviation,
     checked_number,
     finite_array,
@@ -208,13 +209,14 @@ class StarTracker:
     ) -> None:
         if fov_deg is not None and camera is not None:
             raise ArgumentError("fov_deg", "give a field of view or a camera, not both")
-        if fov_error_deg is not None and fov_deg is None and camera is None:
-            raise ArgumentError("fov_error_deg", f"{fov_error_deg:g}: give `fov_deg` or `camera` too")
         if camera is not None:
             check_camera(camera)
         _check_field_of_view(fov_deg, fov_error_deg)
+        if fov_error_deg is not None and fov_deg is None and camera is None:
+            raise ArgumentError("fov_error_deg", f"{fov_error_deg:g}: give `fov_deg` or `camera` too")
         self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
         self._settings = SolveSettings() if settings is None else settings
+        check_type("settings", self._settings, SolveSettings)
         if not isinstance(self._settings.lens, CameraKnowledge | None):
             raise ArgumentError(
                 "settings.lens",
@@ -325,7 +327,8 @@ class StarTracker:
         if shape != (camera.rows, camera.columns):
             raise ArgumentError(
                 "image",
-                f"{shape[1]} x {shape[0]} pixels, but the camera has {camera.columns} x {camera.rows}",
+                f"{shape[1]} x {shape[0]} pixels, but the camera has {camera.columns} x {camera.rows}: give "
+                "images of this camera, or the camera of these images",
             )
         if not self._fov_error_deg:
             return camera, (1.0, 1.0)

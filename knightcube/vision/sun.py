@@ -24,7 +24,7 @@ from enum import Enum
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, image_of_camera
@@ -205,6 +205,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
             numbers.
     """
     settings = LINEAR if settings is None else settings
+    check_type("settings", settings, SunSettings)
     image = image_of_camera(image, camera)
     # Off the axis, a pinhole camera stretches a disc by at most the squared secant of the field angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2

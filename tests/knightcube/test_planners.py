@@ -231,6 +231,19 @@ def test_a_slew_at_a_time_without_known_field_or_orbit_is_refused(
         plan_slew(**SLEW | wrong)
 
 
+def test_a_free_roll_does_not_move_a_goal_out_of_its_cone() -> None:
+    """The camera on the pointing axis sees the Sun at every roll; 60 deg beside it, a cone of 50 deg is free.
+
+    The remedy is another goal, not a longer time.
+    """
+    reason = "all of these, .* end in the exclusion cone of the Sun: choose another goal or time"
+    with pytest.raises(PlanningError, match=reason):
+        plan_slew(**SLEW, cones={"sun": 0.5})
+    beside = np.array([np.sin(np.radians(60.0)), 0.0, np.cos(np.radians(60.0))])
+    found = plan_slew(**SLEW, camera_axis=beside, cones={"sun": np.radians(50.0)})
+    assert found.plan.clearance[0] >= 0.0
+
+
 def test_a_slew_depends_on_the_directions_of_the_axes_and_not_on_their_lengths() -> None:
     """Axes of any length, and principal moments instead of a tensor, give the same plan."""
     axes: dict[str, Any] = {"pointing_axis": [0.0, 0.6, 0.8], "across_axis": [1.0, 0.0, 0.0]}

@@ -10,13 +10,25 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import knightcube
-from knightcube import LensCalibration, SingleAxisPlant, StarTracker, plan_step
+from knightcube import (
+    ArgumentError,
+    Goal,
+    LensCalibration,
+    Pinhole,
+    PointingTarget,
+    SingleAxisPlant,
+    StarTracker,
+    find_nadir,
+    plan_step,
+)
 from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement
 from knightcube.vision.objects.detect import DetectedObjects, SpaceObject
 from knightcube.vision.startracker.index.build import default_index
@@ -141,3 +153,80 @@ def test_importing_the_library_imports_none_of_its_modules() -> None:
     script = "import sys, knightcube; print([m for m in sys.modules if m.startswith('knightcube.')])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# Without types, so that arguments of other types can be tested.
+LIB: Any = knightcube
+IMAGE: Any = np.random.default_rng(1).poisson(100.0, (64, 64))
+CAMERA = Pinhole(64, 64, 100.0)
+SLEW: dict[str, Any] = {
+    "inertia": [1e-3] * 3,
+    "dipole_limit": [0.1] * 3,
+    "heat": [50.0] * 3,
+    "elements": ("", ""),
+    "time": datetime(2026, 3, 20),
+    "start": PointingTarget(Goal.NADIR),
+    "goal": PointingTarget(Goal.SUN),
+    "duration": 600.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: LIB.StarTracker(settings=5), "settings: 5: give an object of the class SolveSettings"),
+        (
+            lambda: LIB.StarTracker(camera=CAMERA).solve(IMAGE[1:]),
+            "64 x 63 pixels, .*: give images of this",
+        ),
+        (lambda: LIB.estimate_rate(IMAGE, CAMERA, 1.0, settings=0), "settings: 0: .* LikelihoodSettings"),
+        (
+            lambda: LIB.detect_objects(IMAGE, CAMERA, [0, 0, 1], 1.0, {}),
+            "settings: {}: .* ObjectSettings",
+        ),
+        (lambda: LIB.find_sun(IMAGE, CAMERA, "x"), "settings: 'x': .* SunSettings"),
+        (
+            lambda: LIB.find_nadir(IMAGE, CAMERA, {"altitude": 5e5}),
+            "knowledge: {'altitude'.*: give",
+        ),
+        (lambda: LIB.find_nadir(IMAGE, CAMERA, None, 5), "settings: 5: .* HorizonSettings"),
+        (
+            lambda: LIB.find_nadir(IMAGE, CAMERA, hidden=IMAGE[1:] > 0),
+            r"hidden: an array of shape \(63",
+        ),
+        (
+            lambda: LIB.find_nadir(IMAGE, CAMERA, hidden=0.5 * IMAGE),
+            "hidden: pixels of float64: give",
+        ),
+        (lambda: LIB.HorizonKnowledge(sun=[0, 0, 0]), "sun: .* whose length is not zero"),
+        (lambda: LIB.HorizonKnowledge(pole=[0, 0, 0]), "pole: .* whose length is not zero"),
+        (lambda: LIB.HorizonKnowledge(attitude=[0, 0, 0, 1]), "attitude: .* RoughAttitude"),
+        (lambda: LIB.HorizonKnowledge(sensed=([0, 0, 1],)), "sensed: .* SensedDirection"),
+        (
+            lambda: LIB.plan_step(None, start_angle=0, end_angle=1, horizon=9),
+            "plant: None: .*AxisPlant",
+        ),
+        (lambda: LIB.plan_slew(**SLEW, cones=["sun"]), r"cones: \['sun'\]: .* Mapping"),
+        (lambda: LIB.calibrate_lens([]), "images: no image"),
+        (
+            lambda: LIB.calibrate_lens([IMAGE, "b.png"]),
+            "images, number 2: b.png: give an array of pixels",
+        ),
+        (
+            lambda: LIB.calibrate_lens([IMAGE, IMAGE[1:]]),
+            r"images, number 2: an array of shape \(63, 64\), but the first image has \(64, 64\)",
+        ),
+    ],
+)
+def test_an_argument_of_another_type_is_named(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.int64])
+def test_a_mask_of_integers_hides_the_pixels_that_are_not_zero(kind: type[np.generic]) -> None:
+    """A mask without hidden pixels changes nothing, and a mask of hidden pixels removes all edges."""
+    image = np.where(np.arange(64)[:, None] + np.arange(64) > 60, 200.0, 5.0)
+    edges = len(find_nadir(image, CAMERA).points)
+    assert len(find_nadir(image, CAMERA, hidden=np.zeros((64, 64), kind)).points) == edges > 20
+    assert len(find_nadir(image, CAMERA, hidden=np.full((64, 64), 2, kind)).points) == 0

@@ -610,12 +610,18 @@ def check(task: SlewTask) -> None:
         raise PlanningError(f"nodes is {task.nodes}: must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")
     if task.time_cost is not None and not task.time_cost > 0.0:
         raise PlanningError(f"the cost of time is {task.time_cost} W: it must be positive")
+    _check_cones(task)
+
+
+def _check_cones(task: SlewTask) -> None:
+    """Raise PlanningError for a start, or an end at rest, inside an exclusion cone."""
     end = task.end(task.horizon)
     for cone in task.cones:
         inside = -math.degrees(float(cone.clearance(task.quaternion[None], np.zeros(1))[0]))
         if inside > 0.0:
             raise PlanningError(
-                f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
+                f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}: choose "
+                "another start or time, or a smaller cone"
             )
         # The cones move by only a few degrees during a slew.
         # An end attitude deep inside a cone is therefore inside for any duration of the slew.
@@ -623,16 +629,27 @@ def check(task: SlewTask) -> None:
             clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
             if float(clearance[0]) >= -_DEEP:
                 continue
-            raise PlanningError(f"the end lies inside the exclusion cone of the {cone.name}")
+            raise PlanningError(
+                f"the end lies inside the exclusion cone of the {cone.name}: choose another goal or a "
+                "smaller cone"
+            )
 
 
 def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
     """Return an exclusion cone that contains the end attitude of a slew of `horizon` s, or None.
 
-    The result is also None if only the direction of a boresight is given at the end.
+    If only the direction of a boresight is given at the end, a cone is returned that contains the end
+    attitude at every roll.
     """
-    end = task.end(horizon)
-    if not isinstance(end, AttitudeEnd):
-        return None
-    shown, time = end.quaternion[None], np.array([horizon])
-    return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
+    end, time = task.end(horizon), np.array([horizon])
+    if isinstance(end, AttitudeEnd):
+        shown = end.quaternion[None]
+        return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
+    for cone in task.cones:
+        # The largest angle between two directions that are rotated about each other is the sum of their
+        # angles from the axis of the rotation.
+        pairs = ((end.axis, cone.axis), (end.direction, cone.direction(time)[0]))
+        apart = sum(math.acos(min(max(float(one @ other), -1.0), 1.0)) for one, other in pairs)
+        if min(apart, 2.0 * math.pi - apart) < cone.angle:
+            return cone
+    return None

@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray, finite_array, unit_vector
+from knightcube.astro.arrays import FloatArray, check_type, finite_array, unit_vector
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.geomagnetism import check_year
 from knightcube.astro.earth.orbit_knowledge import elements_of
@@ -269,6 +269,8 @@ def refusal(task: SlewTask, tried: int) -> str:
         first, cone = found[0]
         share = "one" if len(found) == 1 else "all" if len(found) == _ENDS else "many"
         text += f"; {share} of these, from {first:.0f} s on, end in the exclusion cone of the {cone.name}"
+        if share == "all":
+            return f"{text}: choose another goal or time, or a smaller cone"
     return f"{text}: allow a longer time or another start"
 
 
@@ -510,6 +512,13 @@ def _axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
     return axes
 
 
+def _cone_angles(cones: Mapping[Literal["sun", "earth", "moon"], float] | None) -> dict[str, float]:
+    """Return the angles (rad) of the exclusion cones by name. Raises ArgumentError for another type."""
+    given = {} if cones is None else cones
+    check_type("cones", given, Mapping)
+    return {str(name): angle for name, angle in given.items()}
+
+
 def _check_order(order: SlewOrder) -> None:
     """Raise UsageError or PlanningError, with the name of the argument of `plan_slew`, for invalid values."""
     for name, target in (("start", order.start), ("goal", order.goal)):
@@ -628,7 +637,7 @@ def plan_slew(
         STRETCH * duration if longest is None else longest,
         window,
         time_cost,
-        {str(name): angle for name, angle in (cones or {}).items()},
+        _cone_angles(cones),
         nodes,
     )
     _check_order(order)

@@ -25,7 +25,7 @@ from typing import Literal
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, check_type
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.plant import (
     FARTHEST,
@@ -346,7 +346,7 @@ def plan(
     Raises PlanningError if an argument is outside its limits, or if no permitted duration is feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
-    _check(states, horizon, nodes, reference, q2_limit, max_stretch)
+    _check(plant, states, horizon, nodes, reference, q2_limit, max_stretch)
     if time_cost is not None and not (math.isfinite(time_cost) and time_cost > 0.0):
         raise PlanningError(f"time_cost is {time_cost} W: it must be finite and positive")
     boundary = BoundaryStates(
@@ -478,6 +478,7 @@ def _assemble(
 
 
 def _check(
+    plant: SingleAxisPlant,
     states: dict[str, float],
     horizon: float,
     nodes: int,
@@ -485,7 +486,8 @@ def _check(
     q2_limit: float,
     max_stretch: float,
 ) -> None:
-    """Raise PlanningError for arguments outside their ranges."""
+    """Raise PlanningError for arguments outside their ranges, and ArgumentError for another plant."""
+    check_type("plant", plant, SingleAxisPlant)
     for name, value in states.items():
         if not math.isfinite(value):
             raise PlanningError(f"{name} is {value}: a path needs finite states")
@@ -602,11 +604,9 @@ def plan_step(
 
     Args:
         plant: model with inertia, torque constant, coil and thread.
-        start_angle: angle at the start, -1.4955 to 1.4955 rad; at zero, the torque is largest.
-        end_angle: angle at the end, -1.4955 to 1.4955 rad.
+        start_angle, end_angle: angles, -1.4955 to 1.4955 rad; at zero, the torque is largest.
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
-        start_rate: body rate at the start, rad/s.
-        end_rate: body rate at the end, rad/s.
+        start_rate, end_rate: body rates at the start and at the end, rad/s.
         time_cost: cost of the duration, W, which is added to the energy; None for a fixed duration.
         minimise: "heat" for the integral of R I^2, or "supply" for the supply energy, the integral of V |I|.
         nodes: number of nodes of the path, 8 to 40.

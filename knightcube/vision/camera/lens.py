@@ -713,13 +713,13 @@ def image_of_camera(image: Image, camera: CameraModel) -> Image:
     return image
 
 
-def check_shape(image: Image, camera: CameraModel) -> None:
-    """Raise ArgumentError unless an array has the shape (rows, columns) of a camera."""
+def check_shape(image: Image, camera: CameraModel, name: str = "image") -> None:
+    """Raise ArgumentError unless the array `name` has the shape (rows, columns) of a camera."""
     if image.shape != (camera.rows, camera.columns):
         raise ArgumentError(
-            "image",
+            name,
             f"an array of shape {image.shape}, but the camera has {camera.columns} x {camera.rows} pixels: "
-            f"give ({camera.rows}, {camera.columns}) grey values",
+            f"give ({camera.rows}, {camera.columns}) {'grey values' if name == 'image' else 'values'}",
         )
 
 

@@ -25,10 +25,12 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type, tangent_basis
 from knightcube.astro.quaternion import multiply
+from knightcube.errors import ArgumentError
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_shape, image_of_camera
 from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, ScanLines, find_edges, observe
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine, near_limb
@@ -202,12 +204,33 @@ def find_nadir(
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
 
     Raises:
-        ArgumentError: if the size of image or mask differs from the camera's, or if pixels are not finite.
+        ArgumentError: if the size of image or mask differs from the camera's, if pixels are not finite, or if
+            the mask contains other values than Booleans or integers, of which all but 0 are true.
 
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
-    knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
+    knowledge, settings = _given(knowledge, settings)
     return _find(_ScannedImage(image, camera, hidden), knowledge, settings)
+
+
+def _given(
+    knowledge: HorizonKnowledge | None, settings: HorizonSettings | None
+) -> tuple[HorizonKnowledge, HorizonSettings]:
+    """Return the arguments of a search or their defaults. Raises ArgumentError for other types."""
+    knowledge = HorizonKnowledge() if knowledge is None else knowledge
+    settings = HorizonSettings() if settings is None else settings
+    check_type("knowledge", knowledge, HorizonKnowledge)
+    check_type("settings", settings, HorizonSettings)
+    return knowledge, settings
+
+
+def _mask(hidden: ArrayLike, camera: CameraModel) -> BoolArray:
+    """Return the argument `hidden` of `find_nadir` as a mask (rows, columns). Raises ArgumentError."""
+    mask = np.asarray(hidden)
+    if mask.dtype.kind not in "biu":
+        raise ArgumentError("hidden", f"pixels of {mask.dtype}: give Booleans, such as hidden > 0")
+    check_shape(mask, camera, "hidden")
+    return np.asarray(mask != 0)
 
 
 def _find(
@@ -241,10 +264,8 @@ class _ScannedImage:
 
     def __init__(self, image: Image, camera: CameraModel, hidden: BoolArray | None) -> None:
         """Keep an image and its mask. Raises ArgumentError as `find_nadir`."""
-        if hidden is not None:
-            check_shape(hidden, camera)
         self.image = image_of_camera(image, camera)
-        self.camera, self.hidden = camera, hidden
+        self.camera, self.hidden = camera, None if hidden is None else _mask(hidden, camera)
         self._observed: dict[int, tuple[Observation, ScanLines, list[_FreeCone]]] = {}
 
     def observed(self, settings: EdgeSettings) -> tuple[Observation, ScanLines, list[_FreeCone]]:
@@ -287,7 +308,7 @@ def nadir_of_uncertain_field(
     the scatter of the individual horizons. Refused horizons also contribute to the means, but the image is
     refused if refused horizons have half of the total weight or more. See `find_nadir`.
     """
-    knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
+    knowledge, settings = _given(knowledge, settings)
     first = find_nadir(image, camera, knowledge, settings, hidden)
     if len(first.points) < settings.some_edges:
         return first

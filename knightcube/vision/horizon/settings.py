@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.arrays import FloatArray, Image, check_type, unit_vector
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.errors import ArgumentError, UsageError
 
@@ -55,7 +55,8 @@ class HorizonKnowledge:
         sensed: directions measured by coarse sensors.
 
     Raises:
-        ValueError: if a value is not finite or has a wrong shape, or if the position is inside the Earth.
+        ArgumentError: if a value is not finite or has a wrong shape or type, if a direction is zero, or if
+            the position is inside the Earth.
     """
 
     position: FloatArray | None = None
@@ -70,6 +71,14 @@ class HorizonKnowledge:
             value = getattr(self, name)
             if value is not None and (np.shape(value) != (3,) or not np.all(np.isfinite(value))):
                 raise ArgumentError(name, f"{value}: give (3,) finite numbers")
+        for name in ("sun", "pole"):
+            if (value := getattr(self, name)) is not None:
+                unit_vector(name, value)
+        if self.attitude is not None:
+            check_type("attitude", self.attitude, RoughAttitude)
+        check_type("sensed", self.sensed, tuple)
+        for each in self.sensed:
+            check_type("sensed", each, SensedDirection)
         if self.position is not None and np.linalg.norm(self.position) < SEMI_MAJOR_AXIS + LEAST_ALTITUDE:
             raise ArgumentError("position", f"{self.position}: inside the Earth, give metres from its centre")
         if self.altitude is not None and not LEAST_ALTITUDE <= self.altitude < np.inf:

@@ -39,6 +39,7 @@ from knightcube.astro.arrays import (
     FloatArray,
     Image,
     IntArray,
+    check_type,
     checked_number,
     finite_array,
 )
@@ -830,6 +831,7 @@ def detect_objects(
     is not part of Sease's method.
     """
     settings = ObjectSettings() if settings is None else settings
+    check_type("settings", settings, ObjectSettings)
     exposure = checked_number("exposure", exposure, "seconds")
     rotation = finite_array("rate", rate, (3,)) * exposure
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))

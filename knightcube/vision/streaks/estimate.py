@@ -24,7 +24,7 @@ from itertools import chain, islice
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
 from knightcube.vision.frame import raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
@@ -672,7 +672,8 @@ def estimate_rate(
         ArgumentError: if the image is not an array of finite numbers of the size of the camera, if exposure
             or prior deviation is not a positive number, or if the prior rate is not three finite numbers.
     """
-    settings = settings or LikelihoodSettings()
+    settings = LikelihoodSettings() if settings is None else settings
+    check_type("settings", settings, LikelihoodSettings)
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     settings = settings.in_units_of(unit, zero)
     found = estimate_motion(pixels, streak_camera(camera), exposure, settings, prior_rate, prior_sigma)

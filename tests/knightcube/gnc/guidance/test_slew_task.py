@@ -218,7 +218,12 @@ def test_an_end_at_rest_deep_inside_a_cone_is_refused(deep: float, refused: bool
     found = blocking_cone(task, 240.0)
     assert found is not None
     assert found.name == "Moon"
-    assert blocking_cone(free, 240.0) is None
+    # The roll does not move the axis of the camera if it is the axis that points to the target.
+    assert blocking_cone(free, 240.0) is found
+    (cone,) = free.cones
+    for axis, blocked in ((np.array([0.0, 1.0, 0.0]), False), (np.array([1.0, 0.01, 0.0]), True)):
+        beside = replace(free, cones=(replace(cone, axis=axis / np.linalg.norm(axis)),))
+        assert (blocking_cone(beside, 240.0) is not None) is blocked
     assert blocking_cone(small_slew(cones=(cone_about(START, 0.1),)), 240.0) is None
 
 
