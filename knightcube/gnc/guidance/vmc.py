@@ -604,9 +604,11 @@ def plan_step(
 
     Args:
         plant: model with inertia, torque constant, coil and thread.
-        start_angle, end_angle: angles, -1.4955 to 1.4955 rad; at zero, the torque is largest.
+        start_angle: angle at the start, -1.4955 to 1.4955 rad; at zero, the torque is largest.
+        end_angle: angle at the end, -1.4955 to 1.4955 rad.
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
-        start_rate, end_rate: body rates at the start and at the end, rad/s.
+        start_rate: body rate at the start, rad/s.
+        end_rate: body rate at the end, rad/s.
         time_cost: cost of the duration, W, which is added to the energy; None for a fixed duration.
         minimise: "heat" for the integral of R I^2, or "supply" for the supply energy, the integral of V |I|.
         nodes: number of nodes of the path, 8 to 40.
