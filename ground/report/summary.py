@@ -111,7 +111,13 @@ def _identity(run: Run, attitude: signals.ThreadMotion, notes: list[str]) -> Obj
         notes.append("no truth log: judged on the estimate")
     behind = float(signals.seconds(run["truth"])[-1]) - identity["duration_s"] if len(run["truth"]) else 0.0
     if behind > _LOST_S:
-        notes.append(f"the flight log ends {behind:.1f} s before the truth log: its last packets are lost")
+        # In real time, the emulated devices run some seconds longer than a flight process that was killed.
+        stopped = events.STOPPED.code in run["event"]["code"]
+        killed = not stopped and bool(np.any(run["run"]["realtime"]))
+        cause = "the flight process died, or its" if killed else "its"
+        notes.append(
+            f"the flight log ends {behind:.1f} s before the truth log: {cause} last packets are lost"
+        )
     if not len(run["run"]):
         notes.append("no run packet: the configuration of this run is not known")
         return {**identity, "duration_planned_s": math.nan}

@@ -127,6 +127,15 @@ def test_the_flight_log_decides_how_long_a_run_lasted(tmp_path: Path) -> None:
     assert summary["run"]["cut_short"]
     (note,) = [note for note in summary["notes"] if note.startswith("the flight log ends ")]
     assert float(note.split()[4]) == pytest.approx(250.0 - lasted, abs=0.2)
+    assert note.endswith("the truth log: its last packets are lost")
+    run = read_run(tmp_path / "run")
+    rows = run.flight.packets["run"].copy()
+    rows["realtime"] = 1
+    run.flight.packets["run"] = rows
+    assert any(
+        note.endswith("the flight process died, or its last packets are lost")
+        for note in summarise(run)["notes"]
+    )
 
 
 def test_a_satellite_stopped_before_its_first_cycle_is_not_judged_as_a_testbed(tmp_path: Path) -> None:
