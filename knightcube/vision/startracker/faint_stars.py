@@ -35,6 +35,9 @@ from knightcube.vision.startracker.verification import expected_stars, log10_cho
 
 # Pairs are formed only from the brightest guide stars, on average this many in a field of view.
 _PER_FIELD = 20.0
+# Largest expected number of pairs of guide stars. A field of 4 x 3 deg has as many pairs; a narrow strip of
+# the sky would have several times as many, whose search took a minute.
+_MOST_PAIRS = 4e6
 # Number of the brightest points of which pairs are formed, and the minimum distance of the points of a pair
 # as a fraction of the frame's diagonal.
 _BRIGHTEST, _LEAST_APART = 5, 0.1
@@ -233,8 +236,11 @@ class _Search:
         self.points = light.camera.project(field.direction)
         across, down = (width * field.scale[1] for width in field.half_width)
         area = 4.0 * math.atan(across) * math.atan(down)
-        count = min(int(_PER_FIELD * 4.0 * math.pi / area), len(sky.stars))
-        self.guide = _guide_pairs(sky, count, 2.0 * math.atan(math.hypot(across, down)))
+        longest = 2.0 * math.atan(math.hypot(across, down))
+        # The share of all pairs of directions that are at most `longest` apart is (1 - cos) / 2.
+        most = 2.0 * math.sqrt(_MOST_PAIRS / (1.0 - math.cos(longest)))
+        count = min(int(_PER_FIELD * 4.0 * math.pi / area), int(most), len(sky.stars))
+        self.guide = _guide_pairs(sky, count, longest)
 
     def pairs(self) -> Iterator[tuple[IntArray, IntArray]]:
         """Yield pairs of points (2,), the brightest first, and the similar pairs of guide stars (c, 2)."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
-from knightcube.vision.camera.lens import CameraModel, Lens
+from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.attitude_fit import StarField
 from knightcube.vision.startracker.detect import Detections, detect
@@ -135,6 +135,22 @@ def test_the_light_of_a_distorting_lens_is_at_the_positions_of_an_ideal_camera()
     assert np.all(np.abs(lens.project(direction) - [[80.0, 60.0], [900.0, 700.0]]).max(axis=1) > 3.0)
     for column, row in np.rint(ideal.project(direction)).astype(int):
         assert light.level[row, column] == _LEVELS - 1
+
+
+def test_a_narrow_strip_has_no_more_pairs_of_guide_stars_than_a_field(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Stars in a strip are as far apart as in a field, but the pairs of more stars are as many."""
+    monkeypatch.setattr("knightcube.vision.startracker.faint_stars._MOST_PAIRS", 1e5)
+    strip = Pinhole(NARROW.pinhole.columns, 24, NARROW.pinhole.focal_length)
+    pixels = np.random.default_rng(2).poisson(100.0, (24, strip.columns)).astype(np.uint16)
+    points = np.array([[100.0, 12.0], [900.0, 12.0]])
+    seen = FrameSolution(
+        SolveStatus.NO_STARS, "", FrameKind.POINTS, strip, points, np.tile(np.eye(2), (2, 1, 1))
+    )
+    field = star_field(seen, np.array([1e4, 5e3]), _FIXED)
+    search = _Search(field, sky(), FrameLight.of(pixels, strip))
+    assert 0.5e5 < len(search.guide.stars) < 1.2e5
 
 
 @pytest.mark.parametrize("scale", [_FIXED, (0.99, 1.01)])
