@@ -29,6 +29,7 @@ from knightcube import (
     find_nadir,
     plan_step,
 )
+from knightcube.vision.horizon import settings
 from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement
 from knightcube.vision.objects.detect import DetectedObjects, SpaceObject
 from knightcube.vision.startracker.index.build import default_index
@@ -157,6 +158,9 @@ def test_importing_the_library_imports_none_of_its_modules() -> None:
 
 # Without types, so that arguments of other types can be tested.
 LIB: Any = knightcube
+RoughAttitude: Any = settings.RoughAttitude
+SensedDirection: Any = settings.SensedDirection
+NAN = float("nan")
 IMAGE: Any = np.random.default_rng(1).poisson(100.0, (64, 64))
 CAMERA = Pinhole(64, 64, 100.0)
 SLEW: dict[str, Any] = {
@@ -202,6 +206,11 @@ SLEW: dict[str, Any] = {
         (lambda: LIB.HorizonKnowledge(pole=[0, 0, 0]), "pole: .* whose length is not zero"),
         (lambda: LIB.HorizonKnowledge(attitude=[0, 0, 0, 1]), "attitude: .* RoughAttitude"),
         (lambda: LIB.HorizonKnowledge(sensed=([0, 0, 1],)), "sensed: .* SensedDirection"),
+        (lambda: RoughAttitude([0, 0, 0, 2], 0.1), "quaternion: .* give unit length, scalar part last"),
+        (lambda: RoughAttitude([0, 0, 0, 1], 0.0), "sigma: 0.0: give a standard deviation above 0 rad"),
+        (lambda: SensedDirection(np.zeros(3), [1, 0, 0], 0.1), "camera: .* whose length is not zero"),
+        (lambda: SensedDirection([1, 0, 0], [1, 0, NAN], 0.1), "inertial: .*nan.*: give finite numbers"),
+        (lambda: SensedDirection([1, 0, 0], [1, 0, 0], -0.1), "sigma: -0.1: give a standard deviation of 0"),
         (
             lambda: LIB.plan_step(None, start_angle=0, end_angle=1, horizon=9),
             "plant: None: .*AxisPlant",
@@ -221,6 +230,12 @@ SLEW: dict[str, Any] = {
 def test_an_argument_of_another_type_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
         call()
+
+
+def test_prior_directions_can_be_lists() -> None:
+    sensed = SensedDirection([1, 0, 0], (0, 1, 0), 0.1)
+    known = LIB.HorizonKnowledge(altitude=5e5, attitude=RoughAttitude([0, 0, 0, 1], 0.1), sensed=(sensed,))
+    assert not find_nadir(IMAGE, CAMERA, known)
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.int64])

@@ -11,12 +11,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, Image, check_type, unit_vector
+from knightcube.astro.arrays import (
+    FloatArray,
+    Image,
+    check_type,
+    checked_deviation,
+    finite_array,
+    unit_vector,
+)
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.errors import ArgumentError, UsageError
 
 LEAST_ALTITUDE = 50e3
 """Lowest altitude (m) from which the limb is visible; a lower camera is inside the atmosphere."""
+
+_UNIT_TOLERANCE = 1e-3
+"""Largest deviation of the length of an approximate quaternion from 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,19 +37,45 @@ class SensedDirection:
         camera: measured direction (3,) in camera axes, of any length.
         inertial: direction (3,) from an ephemeris or field model in inertial axes, of any length.
         sigma: standard deviation of the measured direction per axis, rad.
+
+    Raises:
+        ArgumentError: if a direction is not three finite numbers or is zero, or if `sigma` is not positive.
     """
 
     camera: FloatArray
     inertial: FloatArray
     sigma: float
 
+    def __post_init__(self) -> None:
+        for name in ("camera", "inertial"):
+            unit_vector(name, getattr(self, name))
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        _check_sigma(self.sigma)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoughAttitude:
-    """An approximate attitude (4,) of a camera, inertial to camera axes, with `sigma` per axis, rad."""
+    """An approximate attitude (4,) of a camera, inertial to camera axes, with `sigma` per axis, rad.
+
+    The quaternion has the scalar part last. Raises ArgumentError if the quaternion is not of unit length, or
+    if `sigma` is not positive.
+    """
 
     quaternion: FloatArray
     sigma: float
+
+    def __post_init__(self) -> None:
+        quaternion = finite_array("quaternion", self.quaternion, (4,))
+        if abs(math.hypot(*quaternion.tolist()) - 1.0) > _UNIT_TOLERANCE:
+            raise ArgumentError("quaternion", f"{quaternion.tolist()}: give unit length, scalar part last")
+        object.__setattr__(self, "quaternion", quaternion)
+        _check_sigma(self.sigma)
+
+
+def _check_sigma(sigma: float) -> None:
+    """Raise ArgumentError unless the standard deviation of prior knowledge is positive or infinite."""
+    if checked_deviation("sigma", sigma, "rad") == 0.0:
+        raise ArgumentError("sigma", f"{sigma}: give a standard deviation above 0 rad")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
