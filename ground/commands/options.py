@@ -73,9 +73,9 @@ def read_picture(options: argparse.Namespace) -> Image:
     Raises UsageError if the picture cannot be read, or if the overlay would replace a picture that is read.
     """
     second, mask = getattr(options, "second", None), getattr(options, "mask", None)
+    check_picture("--overlay", options.overlay, options.image, second, mask, options.camera)
     if options.overlay is not None and options.overlay.suffix.lower() not in {"", ".png"}:
         raise UsageError(f"--overlay {options.overlay}: a PNG file is written: give a name that ends in .png")
-    check_picture("--overlay", options.overlay, options.image, second, mask, options.camera)
     if options.raw:
         pixels = read_raw(options.image, *options.raw)
     else:  # the lens of a calibrated camera belongs to the rows and columns of its detector
