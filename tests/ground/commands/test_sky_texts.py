@@ -245,7 +245,7 @@ def test_pictures_that_are_not_solved_are_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(calibrate, "calibrate_lens", lambda *_, **__: found)
     monkeypatch.setattr(calibrate, "_read", lambda paths: [(path, np.zeros((4, 4))) for path in paths])
     done = command("calibrate", "a", "b", "c")
-    assert (done.returncode, done.stderr) == (1, "a: \nb: odd\nc: dark\n")
+    assert (done.returncode, done.stderr) == (1, "knightcube: a: \nb: odd\nc: dark\n")
 
 
 def test_pictures_of_two_sizes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
