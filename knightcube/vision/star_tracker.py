@@ -25,6 +25,7 @@ from knightcube.astro.arrays import (
     finite_array,
 )
 from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import ArgumentError, InputError
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole, check_camera
 from knightcube.vision.frame import grey_image
@@ -97,7 +98,8 @@ class StarSolution:
         declination: declination of the boresight, ICRS, rad.
         roll: position angle of the image's upward direction (-y), north through east, 0 to 2 pi, rad.
         quaternion: attitude (4,) at mid-exposure, scalar last. The quaternion rotates ICRS into camera axes:
-            z along the boresight, x to the right along the pixel rows, y down.
+            z along the boresight, x to the right along the pixel rows, y down. With `learn`, the boresight is
+            the pixel of the optical axis of the given camera, so that all images have the same axes.
         covariance: covariance (3, 3) of the attitude error as a small rotation in camera axes, rad^2.
         stars: identified catalogue stars.
         field_of_view: angle between the outer edges of the first and last column, without distortion, rad.
@@ -111,7 +113,8 @@ class StarSolution:
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
         rate_sign_known: whether the sign of `rate` is known, which requires a predicted rate.
         sky_map: conversion between pixels of the image and ICRS directions; None unless solved.
-        frame: all results of the star tracker, including the points that are not catalogue stars.
+        frame: all results of the star tracker, including the points that are not catalogue stars. Attitude
+            and rate of `frame` are in the axes of `frame.camera`, which is the estimated lens with `learn`.
         index: sky index (catalogue of guide stars) at the epoch of the image. The star indices in
             `frame.star` refer to `index`.
     """
@@ -290,7 +293,8 @@ class StarTracker:
             low, high = (math.degrees(field_of_view(camera.rescaled(1.0 / limit))) for limit in scale)
             searched = f"fields of view of {low:.3g} to {high:.3g} deg were searched"
             frame = replace(frame, reason=f"{frame.reason}; {searched}")
-        return _solution(frame, sky, settings.velocity, exposure is not None)
+        solution = _solution(frame, sky, settings.velocity, exposure is not None)
+        return solution if found.turn is None or not solution else _turned(solution, conjugate(found.turn))
 
     def _solved_coarser(self, image: Image, sky: SkyIndex, settings: SolveSettings) -> FrameSolution | None:
         """Return the solution of a large image after binning, or None if no binned image is solved.
@@ -425,6 +429,25 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
         raise InputError("field of view", f"{fov_deg:g}: give 1 to 120 degrees across the columns")
     if error_deg is not None and not 0.0 <= error_deg < 120.0:
         raise InputError("error of the field of view", f"{error_deg:g}: give 0 or more degrees")
+
+
+def _turned(solution: StarSolution, back: FloatArray) -> StarSolution:
+    """Return a solution in the axes of the given camera, which `back` (4,) turns from those of the used lens.
+
+    The axes of an estimated lens change from image to image, and the axes of the given camera do not.
+    """
+    matrix, quaternion = attitude_matrix(back), multiply(back, solution.quaternion)
+    pointing, rates = Pointing.of(quaternion), solution.rate_covariance
+    return replace(
+        solution,
+        right_ascension=pointing.right_ascension,
+        declination=pointing.declination,
+        roll=pointing.roll,
+        quaternion=quaternion if quaternion[3] >= 0.0 else -quaternion,
+        covariance=matrix @ solution.covariance @ matrix.T,
+        rate=None if solution.rate is None else matrix @ solution.rate,
+        rate_covariance=None if rates is None else matrix @ rates @ matrix.T,
+    )
 
 
 def _solution(

@@ -17,14 +17,21 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from knightcube.astro.arrays import Image
-from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
+from knightcube.astro.quaternion import (
+    angle_between,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
 from knightcube.errors import ArgumentError, InputError
 from knightcube.vision import star_tracker
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
+from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, SolveStatus
 from knightcube.vision.startracker.survey import FrameKind
-from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
+from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 ARCSECOND = math.radians(1.0 / 3600.0)
 
@@ -49,6 +56,28 @@ def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) ->
     assert solution.field_of_view_deg == pytest.approx(12.0, abs=0.01)
     assert not solution.mirrored
     assert solution.rate is None
+
+
+def test_a_tracker_that_learns_its_lens_has_the_same_axes_in_all_images() -> None:
+    """The attitudes are in the axes of the given camera, and not in those of the estimated lens.
+
+    The axis of the estimated lens moves by up to 1 px (42 arcsec) between images. The optical axis of the
+    second camera is 2 px beside that of the given camera, which rotates all attitudes by the same angle.
+    """
+    columns, rows, f = NARROW.pinhole.columns, NARROW.pinhole.rows, NARROW.pinhole.focal_length
+    x, y = NARROW.pinhole.centre
+    for offset in (0.0, 2.0):
+        tracker = StarTracker(camera=Lens(columns, rows, f, (x + offset, y)), learn=True)
+        for seed in (31, 33, 34):
+            frame = sky_frame(np.random.default_rng(seed), 0.0, 0.2)
+            solution = tracker.solve(frame.pixels)
+            constant = from_rotation_vector(np.array([0.0, math.atan(offset / f), 0.0]))
+            expected = multiply(constant, frame.attitude)
+            error = to_rotation_vector(multiply(solution.quaternion, conjugate(expected)))
+            assert np.linalg.norm(error[:2]) < 3.0 * ARCSECOND
+            assert error @ np.linalg.solve(solution.covariance, error) < 16.3
+            pointing = Pointing.of(solution.quaternion)
+            assert solution.right_ascension == pytest.approx(pointing.right_ascension, abs=1e-12)
 
 
 _COMPILED = """
