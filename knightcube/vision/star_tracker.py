@@ -14,6 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from knightcube.astro.arrays import (
     FloatArray,
@@ -146,10 +147,11 @@ class StarSolution:
         """Return one line of text: status, pointing, uncertainty and number of stars, or the reason."""
         if not self:
             return f"<StarSolution {self.status}: {self.reason}>"
+        roll = round(self.roll_deg, 3) % 360.0
         across = 3_600.0 * math.degrees(math.sqrt(max(self.covariance[0, 0], self.covariance[1, 1])))
         return (
             f"<StarSolution {self.status}: right ascension {self.right_ascension_deg:.4f}, declination "
-            f"{self.declination_deg:.4f}, roll {self.roll_deg:.3f} deg, 1 sigma {across:.2g} arcsec, "
+            f"{self.declination_deg:.4f}, roll {roll:.3f} deg, 1 sigma {across:.2g} arcsec, "
             f"{len(self.stars)} stars{', mirrored' if self.mirrored else ''}>"
         )
 
@@ -240,9 +242,9 @@ class StarTracker:
         *,
         exposure: float | None = None,
         utc: datetime | None = None,
-        attitude: FloatArray | None = None,
+        attitude: ArrayLike | None = None,
         attitude_sigma: float = 1e-3,
-        rate: FloatArray | None = None,
+        rate: ArrayLike | None = None,
         rate_sigma: float = 0.0,
     ) -> StarSolution:
         """Return the attitude at mid-exposure of an image, or the reason why it was not solved.
@@ -406,7 +408,7 @@ def camera_of_field(
 
 
 def _priors(
-    attitude: FloatArray | None, attitude_sigma: float, rate: FloatArray | None, rate_sigma: float
+    attitude: ArrayLike | None, attitude_sigma: float, rate: ArrayLike | None, rate_sigma: float
 ) -> tuple[AttitudePrior | None, RatePrior | None]:
     """Return the predicted attitude and rate. Raises ArgumentError for a value that is not possible."""
     attitudes = rates = None

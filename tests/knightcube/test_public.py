@@ -10,9 +10,11 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,6 +28,8 @@ from knightcube import (
     PointingTarget,
     SingleAxisPlant,
     StarTracker,
+    detect_objects,
+    estimate_rate,
     find_nadir,
     plan_step,
 )
@@ -230,6 +234,21 @@ SLEW: dict[str, Any] = {
 def test_an_argument_of_another_type_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
         call()
+
+
+def test_a_roll_that_is_rounded_to_a_revolution_is_shown_as_zero() -> None:
+    solved = StarTracker(camera=CAMERA).solve(IMAGE)
+    fix = SimpleNamespace(fix=solved)
+    shown = repr(replace(solved, frame=cast(Any, fix), roll=-1e-9 % (2.0 * np.pi), covariance=np.eye(3)))
+    assert " roll 0.000 deg, " in shown
+
+
+def test_vectors_can_be_lists_for_type_checkers_too() -> None:
+    """Mypy, which checks this file, accepts lists and tuples, and so does the interpreter."""
+    solution = StarTracker(camera=CAMERA).solve(IMAGE, attitude=(0, 0, 0, 1), rate=[0, 0, 1], exposure=1.0)
+    assert not solution
+    assert estimate_rate(IMAGE, CAMERA, 1.0, prior_rate=(0, 0, 1)).rate is None
+    assert not detect_objects(IMAGE, CAMERA, [0, 0, 0.1], 1.0)
 
 
 def test_prior_directions_can_be_lists() -> None:

@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from knightcube.astro.arrays import (
     BoolArray,
@@ -805,7 +806,7 @@ def _problem_of_rate(report: ObjectReport) -> str:
 def detect_objects(
     image: Image,
     camera: CameraModel,
-    rate: FloatArray,
+    rate: ArrayLike,
     exposure: float,
     settings: ObjectSettings | None = None,
 ) -> DetectedObjects:

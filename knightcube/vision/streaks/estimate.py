@@ -23,8 +23,9 @@ from enum import Enum
 from itertools import chain, islice
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type, finite_array
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
 from knightcube.vision.frame import raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
@@ -646,7 +647,7 @@ def estimate_rate(
     camera: CameraModel,
     exposure: float,
     *,
-    prior_rate: FloatArray | None = None,
+    prior_rate: ArrayLike | None = None,
     prior_sigma: float = 0.0,
     settings: LikelihoodSettings | None = None,
 ) -> MotionResult:
@@ -676,7 +677,8 @@ def estimate_rate(
     check_type("settings", settings, LikelihoodSettings)
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     settings = settings.in_units_of(unit, zero)
-    found = estimate_motion(pixels, streak_camera(camera), exposure, settings, prior_rate, prior_sigma)
+    prior = None if prior_rate is None else finite_array("prior_rate", prior_rate, (3,))
+    found = estimate_motion(pixels, streak_camera(camera), exposure, settings, prior, prior_sigma)
     found = replace(found, flux=unit * found.flux, faint_flux=unit * found.faint_flux)
     if found.rate is not None or found.reason:
         return found
