@@ -391,7 +391,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, trails)
         if near is not None:
-            return FrameFound(motion or _no_motion(job), near)
+            return FrameFound(_no_motion(job) if motion is None else motion, near)
     if motion is None:
         return _of_picture(job, tracker, sky)
     if rests:
@@ -457,7 +457,7 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
 
     assert isinstance(job.estimator, LikelihoodSettings)  # it made a MotionResult
     better = refit_with_catalogue(job.pixels, solution, sky, settings, job.estimator)
-    return FrameFound(better.motion or motion, better)
+    return FrameFound(motion if better.motion is None else better.motion, better)
 
 
 def _motion(job: FrameJob) -> FrameMotion:

@@ -243,11 +243,17 @@ def test_a_roll_that_is_rounded_to_a_revolution_is_shown_as_zero() -> None:
     assert " roll 0.000 deg, " in shown
 
 
+def test_a_rate_is_true_if_it_was_found() -> None:
+    found = MotionResult(StreakStatus.RATE, 0, 1.0, rate=np.zeros(3), covariance=np.eye(3))
+    assert found
+    assert not replace(found, rate=None)
+
+
 def test_vectors_can_be_lists_for_type_checkers_too() -> None:
     """Mypy, which checks this file, accepts lists and tuples, and so does the interpreter."""
     solution = StarTracker(camera=CAMERA).solve(IMAGE, attitude=(0, 0, 0, 1), rate=[0, 0, 1], exposure=1.0)
     assert not solution
-    assert estimate_rate(IMAGE, CAMERA, 1.0, prior_rate=(0, 0, 1)).rate is None
+    assert not estimate_rate(IMAGE, CAMERA, 1.0, prior_rate=(0, 0, 1))
     assert not detect_objects(IMAGE, CAMERA, [0, 0, 0.1], 1.0)
 
 

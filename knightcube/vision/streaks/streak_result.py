@@ -252,6 +252,10 @@ class MotionResult(FrameMotion):
     course: Course | None = None
     line_time_sigma: float = 0.0
 
+    def __bool__(self) -> bool:
+        """Return whether a rate was found."""
+        return self.rate is not None
+
     def __repr__(self) -> str:
         """Return one line of text: status, rate, uncertainty and number of stars, or the reason."""
         if self.rate is None or self.covariance is None:
