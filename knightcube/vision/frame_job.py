@@ -12,6 +12,9 @@
 Afterwards, the streaks are fitted again, with a corrected focal length or the directions of the identified
 stars.
 
+4. If point stars are not identified, or lie far from their predicted positions, they may be defocused: a star
+is a ring or a disc, whose parts are detected as points. After binning, each star is a single spot.
+
 The control process creates the job and receives the result. The streak estimators and scipy are imported at
 their first use, because they occupy tens of MB and the control process does not need them.
 """
@@ -26,10 +29,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
+from knightcube.astro.attitude.wahba import AttitudeFix
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
-from knightcube.vision.camera.lens import CameraModel, Pinhole, streak_camera
+from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole, streak_camera
 from knightcube.vision.frame import FrameState, frame_state, raw_counts, saturation_count
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import FieldPoints, MeasuredObjects, ObjectMeasurementSettings
@@ -39,6 +43,7 @@ from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.sky_map import ShortTrails
 from knightcube.vision.startracker.solve import (
     MOVED,
+    SHAPE_DOUBT,
     AttitudePrior,
     FrameSolution,
     RatePrior,
@@ -69,6 +74,17 @@ _POINT_PX = 1.0
 _SHORT_PX = 4.0
 # Largest uncertainty (px) of the predicted motion of a star that is included in the model of its image.
 _KNOWN_PX = 0.3
+# Scatter (px, per axis) of identified points about their predicted positions above which the stars may be
+# defocused. Without defocus, the scatter is below 0.2 px (campaign `resting`).
+_SCATTERED_PX = 0.25
+# Standard deviation (px) of the direction above which stars may be images of several points each.
+_UNCERTAIN_PX = 0.5
+# Chi-square (3 degrees of freedom) of a difference above which two attitudes contradict each other (0.001 %).
+_CONTRADICTORY = 25.9
+# Minimum side length (px) of a frame after binning by the largest size.
+_LEAST_BINNED_PX = 64
+BIN_SIZES = 3, 5
+"""Bin sizes (px) with which an unsolved image, or an image of defocused stars, is binned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,8 +398,143 @@ def found_in_image(
     return replace(found, solution=replace(found.solution, reason=REASONS[StreakStatus(state.value)]))
 
 
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """Bins of `size` x `size` px in an image of `rows` x `columns` pixels.
+
+    The bins are centred in the image. `size` is odd, so that the margins can be equal on both sides.
+    """
+
+    rows: int
+    columns: int
+    size: int
+
+    def _counts(self) -> list[int]:
+        """Return the largest numbers of bins along rows and columns with equal margins at both ends."""
+        return [
+            length // self.size - (length - self.size * (length // self.size)) % 2
+            for length in (self.rows, self.columns)
+        ]
+
+    def _offset(self) -> FloatArray:
+        """Return the position (x, y) of the centre of the first bin, px."""
+        down, across = self._counts()
+        margin = [0.5 * (self.columns - self.size * across), 0.5 * (self.rows - self.size * down)]
+        return np.array(margin) + 0.5 * (self.size - 1)
+
+    def sums(self, image: Image) -> Image:
+        """Return the image with a pixel for each bin, the sum of the pixels in the bin."""
+        (down, across), size = self._counts(), self.size
+        top, left = (self.rows - size * down) // 2, (self.columns - size * across) // 2
+        inner = image[top : top + size * down, left : left + size * across]
+        total = np.float32 if image.dtype.kind == "f" else np.int64 if image.dtype.kind == "i" else np.uint32
+        return np.asarray(inner.reshape(down, size, across, size).sum(axis=(1, 3), dtype=total))
+
+    def camera(self, camera: CameraModel) -> CameraModel:
+        """Return the camera of the binned image."""
+        (rows, columns), focal_length = self._counts(), camera.focal_length / self.size
+        if not isinstance(camera, Lens):
+            return Pinhole(columns, rows, focal_length)
+        x, y = ((np.array(camera.centre) - self._offset()) / self.size).tolist()
+        return replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
+
+    def in_whole_image(self, found: FrameSolution) -> FrameSolution:
+        """Return a solution of the binned image, converted to the pixels of the image."""
+        size, offset = self.size, self._offset()
+        camera, focal_length = found.camera, size * found.camera.focal_length
+        whole: CameraModel = Pinhole(self.columns, self.rows, focal_length)
+        if isinstance(camera, Lens):
+            x, y = (offset + size * np.array(camera.centre)).tolist()
+            rows, columns = self.rows, self.columns
+            whole = replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
+        return replace(
+            found,
+            camera=whole,
+            points=offset + size * found.points,
+            expected=offset + size * found.expected,
+            covariance=size**2 * found.covariance,
+            late=size * found.late,
+            psf_sigma=size * found.psf_sigma,
+        )
+
+
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
     """Return attitude and rate from a frame by the decision tree in the module docstring."""
+    found = _of_sharp_stars(job, tracker, sky)
+    best = found.solution
+    for size in BIN_SIZES if min(job.pixels.shape) >= _LEAST_BINNED_PX * BIN_SIZES[-1] else ():
+        if best is None or not _may_be_defocused(best, found.motion, tracker):
+            break
+        again = _of_defocused_stars(job, tracker, sky, size)
+        if again.fix is not None and (best.fix is None or _is_better(again, best)):
+            best = again
+    return found if best is found.solution else replace(found, solution=best)
+
+
+def _is_better(one: FrameSolution, other: FrameSolution) -> bool:
+    """Return whether the attitude of `one`, after binning, is more credible than that of `other`.
+
+    The points of `one` scatter half as much, its attitude is more certain, or the two attitudes contradict
+    each other: parts of stars, but not whole stars, may all be displaced in the same direction.
+    """
+    assert one.fix is not None
+    assert other.fix is not None
+    if _direction_sigma(one.fix) < _direction_sigma(other.fix) or _scatter(one) < 0.5 * _scatter(other):
+        return True
+    off = to_rotation_vector(multiply(one.fix.quaternion, conjugate(other.fix.quaternion)))
+    return bool(off @ np.linalg.solve(one.fix.covariance + other.fix.covariance, off) > _CONTRADICTORY)
+
+
+def _direction_sigma(fix: AttitudeFix) -> float:
+    """Return the standard deviation, rad, of the direction of the boresight along one axis."""
+    return math.sqrt(0.5 * float(np.trace(fix.covariance[:2, :2])))
+
+
+def _scatter(solution: FrameSolution) -> float:
+    """Return the scatter, px, of the identified points of a solution about their predicted positions."""
+    off = solution.points[solution.matched] - solution.expected[solution.matched]
+    # Of normally distributed displacements along x and y, half are within 1.18 standard deviations.
+    return float(np.median(np.hypot(off[:, 0], off[:, 1]))) / 1.18
+
+
+def _may_be_defocused(solution: FrameSolution, motion: FrameMotion, tracker: TrackerSettings) -> bool:
+    """Return whether the points of a frame of a calibrated camera may be parts of defocused stars."""
+    lowest, highest = tracker.scale
+    if solution.kind is not FrameKind.POINTS or lowest != highest or tracker.solve.method is not None:
+        return False
+    if solution.fix is None or motion.status is StreakStatus.FAILED or _scatter(solution) > _SCATTERED_PX:
+        return True
+    return _direction_sigma(solution.fix) * solution.camera.focal_length > _UNCERTAIN_PX
+
+
+def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, size: int) -> FrameSolution:
+    """Return the attitude from a frame that is binned by `size` px.
+
+    Because the shape of a defocused star is unknown, all stars may have a common error, which is a fraction
+    of the bin size.
+    """
+    bins = Bins(job.pixels.shape[0], job.pixels.shape[1], size)
+    solve, estimator, doubt = tracker.solve, job.estimator, SHAPE_DOUBT / (job.camera.focal_length / size)
+    detection = replace(solve.detection, psf_sigma=None, gain=None, saturation=None)
+    lens = None if solve.lens is None else replace(solve.lens, centre=solve.lens.centre / size)
+    solve = replace(solve, detection=detection, lens=lens)
+    if isinstance(estimator, LikelihoodSettings):
+        knowledge = replace(estimator.knowledge, line_time=size * estimator.line_time_sigma)
+        line_time = None if estimator.line_time is None else size * estimator.line_time
+        estimator = replace(estimator, line_time=line_time, knowledge=knowledge)
+    camera = bins.camera(job.camera)
+    binned = replace(job, pixels=bins.sums(job.pixels), camera=camera, estimator=estimator)
+    tracker, solution, prior = replace(tracker, solve=solve), None, job.attitude_prior
+    if prior is not None:
+        trails = _short_trails(binned)
+        solution = solve_near(binned.pixels, binned.camera, tracker.scale, sky, solve, prior, trails)
+    if solution is None:
+        solution = _from_points(binned, tracker, sky, survey(binned.pixels, detection))
+    return bins.in_whole_image(solution.wider(np.diag([doubt**2, doubt**2, 0.0])))
+
+
+def _of_sharp_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
+    """Return attitude and rate from a frame by the first three steps in the module docstring."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
     # A fit to a few short streaks is uncertain, so stars are searched near their predicted positions.

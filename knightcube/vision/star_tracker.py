@@ -28,9 +28,9 @@ from knightcube.astro.arrays import (
 from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import ArgumentError, InputError
-from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole, check_camera
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole, check_camera
 from knightcube.vision.frame import grey_image
-from knightcube.vision.frame_job import found_in_image
+from knightcube.vision.frame_job import BIN_SIZES, Bins, found_in_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index import SkyIndex, load_once
 from knightcube.vision.startracker.index.build import default_index
@@ -47,8 +47,8 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0
 """Range of the field of view (deg) that is searched if the field of view is unknown."""
-_SQUARES, _LEAST_COARSE_PX = (3, 5), 330
-"""Bin sizes (px) with which an unsolved image is binned, and minimum side length (px) of the binned image."""
+_LEAST_COARSE_PX = 330
+"""Minimum side length (px) of a binned image of an uncalibrated camera."""
 FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, as a fraction of the field of view."""
 _LEAST_FOV_ERROR = 0.001
@@ -304,14 +304,15 @@ class StarTracker:
         The stars of large photographs are often several pixels wide. Compression or interpolation correlates
         the noise of neighbouring pixels, so that the computed uncertainties are too small.
         """
-        for size in _SQUARES:
+        for size in BIN_SIZES:
             if min(image.shape) < _LEAST_COARSE_PX * size:
                 return None
-            coarse = _summed(image, size)
+            bins = Bins(image.shape[0], image.shape[1], size)
+            coarse = bins.sums(image)
             camera, scale = camera_of_field(self._fov_deg, self._fov_error_deg, coarse.shape)
             found = found_in_image(coarse, camera, scale, 1.0, sky, settings).solution
             if found is not None and found.fix is not None and found.kind is FrameKind.POINTS:
-                return _in_whole_image(found, size, image.shape)
+                return bins.in_whole_image(found)
         return None
 
     def _described(self, camera: CameraModel, scale: tuple[float, float]) -> LensKnowledge:
@@ -339,46 +340,6 @@ class StarTracker:
         if not self._fov_error_deg:
             return camera, (1.0, 1.0)
         return camera, camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)[1]
-
-
-def _summed(image: Image, size: int) -> Image:
-    """Return a binned image (rows, columns), whose pixels are sums over bins of `size` x `size` px.
-
-    The bins are centred in the image. `size` is odd, so that the margins can be equal on both sides.
-    """
-    rows, columns = (_squares(length, size) for length in image.shape)
-    top, left = (
-        (length - size * count) // 2 for length, count in zip(image.shape, (rows, columns), strict=True)
-    )
-    inner = image[top : top + size * rows, left : left + size * columns]
-    total = np.float32 if image.dtype.kind == "f" else np.int64 if image.dtype.kind == "i" else np.uint32
-    return np.asarray(inner.reshape(rows, size, columns, size).sum(axis=(1, 3), dtype=total))
-
-
-def _squares(length: int, size: int) -> int:
-    """Return the largest number of bins of odd `size` along `length` px with equal margins at both ends."""
-    count = length // size
-    return count - (length - size * count) % 2
-
-
-def _in_whole_image(found: FrameSolution, size: int, shape: tuple[int, ...]) -> FrameSolution:
-    """Return the solution of an image binned by `size` px, converted to pixels of the original `shape`."""
-    rows, columns = shape
-    margin = [0.5 * (length - size * _squares(length, size)) for length in (columns, rows)]
-    offset = np.array(margin) + 0.5 * (size - 1)
-    camera, focal_length = found.camera, size * found.camera.focal_length
-    whole: CameraModel = Pinhole(columns, rows, focal_length)
-    if isinstance(camera, Lens):
-        x, y = (offset + size * np.array(camera.centre)).tolist()
-        whole = replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
-    return replace(
-        found,
-        camera=whole,
-        points=offset + size * found.points,
-        expected=offset + size * found.expected,
-        covariance=size**2 * found.covariance,
-        psf_sigma=size * found.psf_sigma,
-    )
 
 
 def field_of_view(camera: CameraModel) -> float:

@@ -192,12 +192,13 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
     return np.outer(motion.rate, motion.rate) * float(np.min(along / speed[moving] ** 4))
 
 
+SHAPE_DOUBT = 0.05
+"""Common centroid error of all stars, relative to the excess width of the PSF, from the campaign `resting`.
+"""
 # Minimum position error (px) of a star, due to residual lens distortion and to the colour of the star.
 _LEAST_SIGMA_PX = 0.005
 # Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
 _COLOUR_PX = 0.002
-# Common centroid error of all stars, relative to the excess width of the PSF (from the campaign `resting`).
-_SHAPE_DOUBT = 0.05
 # Significant chi-square per degree of freedom above which the positions contradict their uncertainties.
 _CONTRADICTED = 1.5
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
@@ -462,7 +463,7 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
     if solution.fix is None or given is None or not len(width):
         return solution
     measured = float(np.median(width))
-    doubt = _SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
+    doubt = SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
     # The measured width includes the averaging over a pixel, whose variance is subtracted.
     psf_sigma = math.sqrt(max(measured**2 - PIXEL_VARIANCE, 0.0))
     return replace(solution, psf_sigma=psf_sigma).wider(np.diag([doubt**2, doubt**2, 0.0]))

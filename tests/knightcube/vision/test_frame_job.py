@@ -12,12 +12,21 @@ import numpy as np
 import pytest
 
 from flight.bodies.streak_methods import CornerEstimator
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
+from knightcube.astro import catalogue
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import (
+    angle_between,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
 from knightcube.reference.corner_streaks import StreakResult, StreakSettings
 from knightcube.vision import frame_job
-from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
+from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
+from knightcube.vision.frame_job import Bins, FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -27,11 +36,11 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
-from knightcube.vision.startracker.survey import FrameKind
+from knightcube.vision.startracker.survey import DetectionSettings, FrameKind
 from knightcube.vision.startracker.tracking import PRIOR_SIGMAS
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.flight.loop.passing import passed
-from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.knightcube.vision.startracker.frames import EPOCH, NARROW, SkyFrame, sky, sky_frame
 
 _TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))
 _ESTIMATORS: list[LikelihoodSettings | StreakEstimator] = [
@@ -312,3 +321,128 @@ def test_the_facts_of_a_frame_are_plain_values() -> None:
         0,
         [],
     )
+
+
+@pytest.mark.parametrize(
+    ("length", "size", "bins"),
+    [(9, 3, 3), (10, 3, 2), (11, 3, 3), (12, 3, 4), (25, 5, 5), (26, 5, 4), (27, 5, 5)],
+)
+def test_bins_leave_equal_margins(length: int, size: int, bins: int) -> None:
+    assert Bins(length, 100, size).sums(np.zeros((length, 100), np.uint8)).shape[0] == bins
+    assert Bins(100, length, size).sums(np.zeros((100, length), np.uint8)).shape[1] == bins
+    assert (length - size * bins) % 2 == 0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32])
+def test_pixels_of_a_bin_are_summed_without_overflow(dtype: type[np.generic]) -> None:
+    image = np.random.default_rng(1).integers(0, 120, (11, 15)).astype(dtype)
+    image[1:4] = 120
+    found = Bins(11, 15, 3).sums(image)
+    # The margin of one row is equal at both ends: rows 1 to 9 and all columns are summed.
+    expected = [
+        [
+            image[1 + 3 * row : 4 + 3 * row, 3 * column : 3 * column + 3].astype(float).sum()
+            for column in range(5)
+        ]
+        for row in range(3)
+    ]
+    assert found.tolist() == expected
+    assert found[0, 0] == 9 * 120
+
+
+@pytest.mark.parametrize(
+    "coarse", [Pinhole(50, 33, 70.0), Lens(50, 33, 70.0, (25.5, 15.0), k1=0.02, p1=0.001, aspect=0.01)]
+)
+def test_the_solution_of_a_binned_image_holds_for_the_whole_image(coarse: CameraModel) -> None:
+    """A direction has, in the whole image, the middle of the bin that contains it in the binned image."""
+    points = np.array([[3.0, 4.0], [40.25, 20.5]])
+    found = FrameSolution(
+        SolveStatus.SOLVED,
+        "",
+        FrameKind.POINTS,
+        coarse,
+        points=points,
+        expected=points + 0.1,
+        covariance=np.tile(np.diag([0.01, 0.04]), (2, 1, 1)),
+        late=points - 3.0,
+        psf_sigma=1.5,
+    )
+    bins = Bins(101, 152, 3)
+    whole = bins.in_whole_image(found)
+    # The margins are one column and one row at each end.
+    assert whole.points == pytest.approx(1.0 + 1.0 + 3.0 * points)
+    assert whole.expected == pytest.approx(whole.points + 0.3)
+    assert whole.covariance == pytest.approx(9.0 * found.covariance)
+    assert whole.late == pytest.approx(3.0 * found.late)
+    assert whole.psf_sigma == pytest.approx(4.5)
+    assert (whole.camera.columns, whole.camera.rows, whole.camera.focal_length) == (152, 101, 210.0)
+    assert whole.camera.project(coarse.unit_vectors(points)) == pytest.approx(whole.points)
+    assert bins.camera(whole.camera) == coarse
+
+
+_DEFOCUSED = Lens(512, 512, 1450.0, (255.5, 255.5), k1=-0.1)
+
+
+def _defocused_frame(camera: CameraModel, turn: FloatArray, delay: float) -> tuple[Image, FloatArray]:
+    """Return a frame whose stars are rings of 5 to 9 px, and its attitude (4,) at mid-exposure.
+
+    The camera rotates by `turn` (3,), rad, during the exposure, and each row is exposed later than the row
+    above it by the fraction `delay` of the exposure. Each pixel is the mean of 4 x 4 points.
+    """
+    rng = np.random.default_rng(3)
+    attitude, stars = normalise(rng.normal(size=4)), catalogue.load()
+    bright = stars.magnitude < 7.0
+    directions, light = stars.directions_at(EPOCH)[bright], 4e5 * 10.0 ** (-0.4 * stars.magnitude[bright])
+    middle = camera.project(directions @ attitude_matrix(attitude).T)
+    near = camera.contains(middle, 20.0)
+    directions, light, middle = directions[near], light[near], middle[near]
+    fine = (np.arange(4 * 512) - 1.5) / 4.0
+    image = np.zeros((4 * 512, 4 * 512))
+    for fraction in np.linspace(-0.5, 0.5, 7):
+        late = fraction + delay * (middle[:, 1] - 255.5)
+        rotated = multiply(from_rotation_vector(late[:, None] * turn), attitude)
+        points = [
+            camera.project(direction @ attitude_matrix(at).T)
+            for direction, at in zip(directions, rotated, strict=True)
+        ]
+        for (x, y), counts in zip(points, light, strict=True):
+            columns, rows = np.abs(fine - x) < 10.0, np.abs(fine - y) < 10.0
+            apart = np.hypot(fine[columns] - x, fine[rows][:, None] - y)
+            ring = np.exp(-0.5 * ((apart - 3.5) / 0.6) ** 2)
+            image[np.ix_(rows, columns)] += ring * counts / (7.0 * ring.sum())
+    light = image.reshape(512, 4, 512, 4).sum(axis=(1, 3))
+    return rng.poisson(light + 100.0).astype(np.uint16), attitude
+
+
+@pytest.mark.parametrize(
+    ("camera", "length", "delay"),
+    [(_DEFOCUSED.ideal, 0.0, 0.0), (_DEFOCUSED, 0.0, 0.0), (_DEFOCUSED.ideal, 3.0, 8e-4)],
+    ids=["pinhole", "lens", "rolling shutter"],
+)
+def test_an_attitude_follows_from_the_rings_of_defocused_stars(
+    camera: CameraModel, length: float, delay: float
+) -> None:
+    turn = np.array([0.6, 0.8, 0.0]) * length / camera.focal_length
+    pixels, attitude = _defocused_frame(camera, turn, delay)
+    settings = SolveSettings(detection=DetectionSettings(psf_sigma=1.0, gain=1.0))
+    estimator = LikelihoodSettings(saturation=65_535, line_time=delay)
+    job = FrameJob(
+        pixels,
+        camera,
+        1.0,
+        estimator,
+        TrackerSettings(settings, (1.0, 1.0)),
+        RatePrior(turn, 1e-5),
+        AttitudePrior(multiply(from_rotation_vector(np.array([2e-4, -1e-4, 1e-4])), attitude), 3e-4),
+    )
+    solution = run(job).solution
+    assert solution is not None
+    assert solution.fix is not None
+    error = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(attitude)))
+    assert error @ np.linalg.solve(solution.fix.covariance, error) < 16.3  # 99.9 %, 3 degrees of freedom
+    matched = solution.matched
+    assert len(matched) >= 10
+    off = solution.points[matched] - solution.expected[matched]
+    assert np.median(np.hypot(*off.T)) < 0.3
+    assert np.sqrt(np.diag(solution.fix.covariance))[:2].max() * camera.focal_length < 0.3
+    assert np.hypot(*error[:2]) * camera.focal_length < 0.3

@@ -25,12 +25,10 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import ArgumentError, InputError
-from knightcube.vision import star_tracker
-from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
+from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
 from knightcube.vision.startracker.sky_map import Pointing
-from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, SolveStatus
-from knightcube.vision.startracker.survey import FrameKind
+from knightcube.vision.startracker.solve import SolveSettings
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 ARCSECOND = math.radians(1.0 / 3600.0)
@@ -318,7 +316,7 @@ def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(monkeypatch: p
         np.argsort(np.linalg.norm(3.0 * resting.stars - solution.stars.points[0], axis=1))[0]
     ]
     np.testing.assert_allclose(solution.stars.points[0], 3.0 * brightest, atol=1.5)
-    monkeypatch.setattr("knightcube.vision.star_tracker._SQUARES", ())
+    monkeypatch.setattr("knightcube.vision.star_tracker.BIN_SIZES", ())
     assert not tracker.solve(image)
 
 
@@ -383,55 +381,3 @@ def test_a_field_of_view_gives_a_camera_and_the_range_of_its_scale() -> None:
         certain, (lowest, highest) = camera_of_field(10.0, error, (300, 400))
         assert math.degrees(field_of_view(certain)) == pytest.approx(10.0)
         assert (lowest, highest) == pytest.approx((0.999, 1.001), abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("length", "size", "bins"),
-    [(9, 3, 3), (10, 3, 2), (11, 3, 3), (12, 3, 4), (25, 5, 5), (26, 5, 4), (27, 5, 5)],
-)
-def test_bins_leave_equal_margins(length: int, size: int, bins: int) -> None:
-    assert star_tracker._squares(length, size) == bins
-    assert (length - size * bins) % 2 == 0
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32])
-def test_pixels_of_a_bin_are_summed_without_overflow(dtype: type[np.generic]) -> None:
-    image = np.random.default_rng(1).integers(0, 120, (11, 15)).astype(dtype)
-    image[1:4] = 120
-    found = star_tracker._summed(image, 3)
-    # The margin of one row is equal at both ends: rows 1 to 9 and all columns are summed.
-    expected = [
-        [
-            image[1 + 3 * row : 4 + 3 * row, 3 * column : 3 * column + 3].astype(float).sum()
-            for column in range(5)
-        ]
-        for row in range(3)
-    ]
-    assert found.tolist() == expected
-    assert found[0, 0] == 9 * 120
-
-
-@pytest.mark.parametrize(
-    "coarse", [Pinhole(50, 33, 70.0), Lens(50, 33, 70.0, (25.5, 15.0), k1=0.02, p1=0.001, aspect=0.01)]
-)
-def test_the_solution_of_a_binned_image_holds_for_the_whole_image(coarse: CameraModel) -> None:
-    """A direction has, in the whole image, the middle of the bin that contains it in the binned image."""
-    points = np.array([[3.0, 4.0], [40.25, 20.5]])
-    found = FrameSolution(
-        SolveStatus.SOLVED,
-        "",
-        FrameKind.POINTS,
-        coarse,
-        points=points,
-        expected=points + 0.1,
-        covariance=np.tile(np.diag([0.01, 0.04]), (2, 1, 1)),
-        psf_sigma=1.5,
-    )
-    whole = star_tracker._in_whole_image(found, 3, (101, 152))
-    # The margins are one column and one row at each end.
-    assert whole.points == pytest.approx(1.0 + 1.0 + 3.0 * points)
-    assert whole.expected == pytest.approx(whole.points + 0.3)
-    assert whole.covariance == pytest.approx(9.0 * found.covariance)
-    assert whole.psf_sigma == pytest.approx(4.5)
-    assert (whole.camera.columns, whole.camera.rows, whole.camera.focal_length) == (152, 101, 210.0)
-    assert whole.camera.project(coarse.unit_vectors(points)) == pytest.approx(whole.points)
