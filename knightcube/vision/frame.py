@@ -10,6 +10,8 @@ star is excluded by mistake.
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
 8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits. Colour
 images are converted to grey values, and images of any numeric type to counts.
+
+Bins of pixels (`Bins`) show a wide or defocused star as a single spot.
 """
 
 from __future__ import annotations
@@ -624,3 +626,51 @@ def in_steps(pixels: Image) -> tuple[Image, int, int]:
         return pixels, 1, 0
     steps = (pixels.astype(np.int64) - offset + step // 2) // step
     return np.maximum(steps, 0).astype(pixels.dtype), step, offset
+
+
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """Bins of `size` x `size` px in an image, in `rows` rows and `columns` columns.
+
+    The first bin begins at the pixel `first` (x, y).
+    """
+
+    size: int
+    columns: int
+    rows: int
+    first: tuple[int, int]
+
+    @classmethod
+    def centred(cls, shape: tuple[int, ...], size: int) -> Bins | None:
+        """Return the bins of an image (rows, columns), with equal margins at opposite sides of the image.
+
+        The optical axis stays in the image centre. Bins of odd `size` are always possible; None is returned
+        if bins of even `size` would have different margins.
+        """
+        rows, columns = (_centred_count(length, size) for length in shape)
+        down, across = shape[0] - size * rows, shape[1] - size * columns
+        if min(rows, columns) < 1 or down % 2 or across % 2:
+            return None
+        return cls(size, columns, rows, (across // 2, down // 2))
+
+    @property
+    def offset(self) -> FloatArray:
+        """The position (x, y) of the centre of the first bin, px."""
+        return np.array(self.first) + 0.5 * (self.size - 1)
+
+    def blocks(self, image: Image) -> Image:
+        """Return the pixels in the bins (rows, size, columns, size)."""
+        (x, y), size = self.first, self.size
+        inner = image[y : y + self.rows * size, x : x + self.columns * size]
+        return inner.reshape(self.rows, size, self.columns, size)
+
+    def sums(self, image: Image) -> Image:
+        """Return the binned image (rows, columns), the sums of the pixels in the bins."""
+        total = np.float32 if image.dtype.kind == "f" else np.int64 if image.dtype.kind == "i" else np.uint32
+        return np.asarray(self.blocks(image).sum(axis=(1, 3), dtype=total))
+
+
+def _centred_count(length: int, size: int) -> int:
+    """Return the number of bins of `size` px in `length` px; both margins are equal if possible."""
+    count = length // size
+    return count - 1 if (length - size * count) % 2 and size % 2 else count

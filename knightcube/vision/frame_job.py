@@ -34,7 +34,7 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to
 from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole, streak_camera
-from knightcube.vision.frame import FrameState, frame_state, raw_counts, saturation_count
+from knightcube.vision.frame import Bins, FrameState, frame_state, raw_counts, saturation_count
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import FieldPoints, MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detect import measure_areas
@@ -81,8 +81,8 @@ _SCATTERED_PX = 0.25
 _UNCERTAIN_PX = 0.5
 # Chi-square (3 degrees of freedom) of a difference above which two attitudes contradict each other (0.001 %).
 _CONTRADICTORY = 25.9
-# Minimum side length (px) of a frame after binning by the largest size.
-_LEAST_BINNED_PX = 64
+# Minimum number of bins in a row and in a column.
+_LEAST_BINNED = 64
 BIN_SIZES = 3, 5
 """Bin sizes (px) with which an unsolved image, or an image of defocused stars, is binned."""
 
@@ -398,74 +398,35 @@ def found_in_image(
     return replace(found, solution=replace(found.solution, reason=REASONS[StreakStatus(state.value)]))
 
 
-@dataclass(frozen=True, slots=True)
-class Bins:
-    """Bins of `size` x `size` px in an image of `rows` x `columns` pixels.
-
-    The bins are centred in the image. `size` is odd, so that the margins can be equal on both sides.
-    """
-
-    rows: int
-    columns: int
-    size: int
-
-    def _counts(self) -> list[int]:
-        """Return the largest numbers of bins along rows and columns with equal margins at both ends."""
-        return [
-            length // self.size - (length - self.size * (length // self.size)) % 2
-            for length in (self.rows, self.columns)
-        ]
-
-    def _offset(self) -> FloatArray:
-        """Return the position (x, y) of the centre of the first bin, px."""
-        down, across = self._counts()
-        margin = [0.5 * (self.columns - self.size * across), 0.5 * (self.rows - self.size * down)]
-        return np.array(margin) + 0.5 * (self.size - 1)
-
-    def sums(self, image: Image) -> Image:
-        """Return the image with a pixel for each bin, the sum of the pixels in the bin."""
-        (down, across), size = self._counts(), self.size
-        top, left = (self.rows - size * down) // 2, (self.columns - size * across) // 2
-        inner = image[top : top + size * down, left : left + size * across]
-        total = np.float32 if image.dtype.kind == "f" else np.int64 if image.dtype.kind == "i" else np.uint32
-        return np.asarray(inner.reshape(down, size, across, size).sum(axis=(1, 3), dtype=total))
-
-    def camera(self, camera: CameraModel) -> CameraModel:
-        """Return the camera of the binned image."""
-        (rows, columns), focal_length = self._counts(), camera.focal_length / self.size
-        if not isinstance(camera, Lens):
-            return Pinhole(columns, rows, focal_length)
-        x, y = ((np.array(camera.centre) - self._offset()) / self.size).tolist()
-        return replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
-
-    def in_whole_image(self, found: FrameSolution) -> FrameSolution:
-        """Return a solution of the binned image, converted to the pixels of the image."""
-        size, offset = self.size, self._offset()
-        camera, focal_length = found.camera, size * found.camera.focal_length
-        whole: CameraModel = Pinhole(self.columns, self.rows, focal_length)
-        if isinstance(camera, Lens):
-            x, y = (offset + size * np.array(camera.centre)).tolist()
-            rows, columns = self.rows, self.columns
-            whole = replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
-        return replace(
-            found,
-            camera=whole,
-            points=offset + size * found.points,
-            expected=offset + size * found.expected,
-            covariance=size**2 * found.covariance,
-            late=size * found.late,
-            psf_sigma=size * found.psf_sigma,
-        )
+def in_whole_image(found: FrameSolution, bins: Bins, shape: tuple[int, ...]) -> FrameSolution:
+    """Return a solution of a binned image, converted to the pixels of the image (rows, columns)."""
+    (rows, columns), size, offset = shape, bins.size, bins.offset
+    camera, focal_length = found.camera, size * found.camera.focal_length
+    whole: CameraModel = Pinhole(columns, rows, focal_length)
+    if isinstance(camera, Lens):
+        x, y = (offset + size * np.array(camera.centre)).tolist()
+        whole = replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
+    return replace(
+        found,
+        camera=whole,
+        points=offset + size * found.points,
+        expected=offset + size * found.expected,
+        covariance=size**2 * found.covariance,
+        late=size * found.late,
+        psf_sigma=size * found.psf_sigma,
+    )
 
 
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
     """Return attitude and rate from a frame by the decision tree in the module docstring."""
     found = _of_sharp_stars(job, tracker, sky)
     best = found.solution
-    for size in BIN_SIZES if min(job.pixels.shape) >= _LEAST_BINNED_PX * BIN_SIZES[-1] else ():
-        if best is None or not _may_be_defocused(best, found.motion, tracker):
+    for size in BIN_SIZES:
+        bins = Bins.centred(job.pixels.shape, size)
+        small = bins is None or min(bins.rows, bins.columns) < _LEAST_BINNED
+        if best is None or bins is None or small or not _may_be_defocused(best, found.motion, tracker):
             break
-        again = _of_defocused_stars(job, tracker, sky, size)
+        again = _of_defocused_stars(job, tracker, sky, bins)
         if again.fix is not None and (best.fix is None or _is_better(again, best)):
             best = again
     return found if best is found.solution else replace(found, solution=best)
@@ -507,22 +468,19 @@ def _may_be_defocused(solution: FrameSolution, motion: FrameMotion, tracker: Tra
     return _direction_sigma(solution.fix) * solution.camera.focal_length > _UNCERTAIN_PX
 
 
-def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, size: int) -> FrameSolution:
-    """Return the attitude from a frame that is binned by `size` px.
+def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, bins: Bins) -> FrameSolution:
+    """Return the attitude from a frame after binning.
 
     Because the shape of a defocused star is unknown, all stars may have a common error, which is a fraction
     of the bin size.
     """
-    bins = Bins(job.pixels.shape[0], job.pixels.shape[1], size)
-    solve, estimator, doubt = tracker.solve, job.estimator, SHAPE_DOUBT / (job.camera.focal_length / size)
+    solve, estimator, size = tracker.solve, job.estimator, bins.size
     detection = replace(solve.detection, psf_sigma=None, gain=None, saturation=None)
-    lens = None if solve.lens is None else replace(solve.lens, centre=solve.lens.centre / size)
+    lens = None if solve.lens is None else solve.lens.binned(size)
     solve = replace(solve, detection=detection, lens=lens)
     if isinstance(estimator, LikelihoodSettings):
-        knowledge = replace(estimator.knowledge, line_time=size * estimator.line_time_sigma)
-        line_time = None if estimator.line_time is None else size * estimator.line_time
-        estimator = replace(estimator, line_time=line_time, knowledge=knowledge)
-    camera = bins.camera(job.camera)
+        estimator = estimator.binned(size)
+    camera = job.camera.binned(bins.columns, bins.rows, size)
     binned = replace(job, pixels=bins.sums(job.pixels), camera=camera, estimator=estimator)
     tracker, solution, prior = replace(tracker, solve=solve), None, job.attitude_prior
     if prior is not None:
@@ -530,7 +488,8 @@ def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, 
         solution = solve_near(binned.pixels, binned.camera, tracker.scale, sky, solve, prior, trails)
     if solution is None:
         solution = _from_points(binned, tracker, sky, survey(binned.pixels, detection))
-    return bins.in_whole_image(solution.wider(np.diag([doubt**2, doubt**2, 0.0])))
+    doubt = SHAPE_DOUBT / camera.focal_length
+    return in_whole_image(solution.wider(np.diag([doubt**2, doubt**2, 0.0])), bins, job.pixels.shape)
 
 
 def _of_sharp_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:

@@ -29,8 +29,8 @@ from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import ArgumentError, InputError
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole, check_camera
-from knightcube.vision.frame import grey_image
-from knightcube.vision.frame_job import BIN_SIZES, Bins, found_in_image
+from knightcube.vision.frame import Bins, grey_image
+from knightcube.vision.frame_job import BIN_SIZES, found_in_image, in_whole_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index import SkyIndex, load_once
 from knightcube.vision.startracker.index.build import default_index
@@ -305,14 +305,14 @@ class StarTracker:
         the noise of neighbouring pixels, so that the computed uncertainties are too small.
         """
         for size in BIN_SIZES:
-            if min(image.shape) < _LEAST_COARSE_PX * size:
+            bins = Bins.centred(image.shape, size)
+            if bins is None or min(image.shape) < _LEAST_COARSE_PX * size:
                 return None
-            bins = Bins(image.shape[0], image.shape[1], size)
             coarse = bins.sums(image)
             camera, scale = camera_of_field(self._fov_deg, self._fov_error_deg, coarse.shape)
             found = found_in_image(coarse, camera, scale, 1.0, sky, settings).solution
             if found is not None and found.fix is not None and found.kind is FrameKind.POINTS:
-                return bins.in_whole_image(found)
+                return in_whole_image(found, bins, image.shape)
         return None
 
     def _described(self, camera: CameraModel, scale: tuple[float, float]) -> LensKnowledge:

@@ -87,7 +87,7 @@ class Pinhole:
         return replace(self, focal_length=self.focal_length * factor)
 
     def binned(self, columns: int, rows: int, size: int) -> Pinhole:
-        """Return the camera of `columns` x `rows` bins of `size` x `size` px with the same centre."""
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px, centred in the image."""
         return Pinhole(columns, rows, self.focal_length / size)
 
     @property
@@ -168,6 +168,9 @@ class CameraModel(Protocol):
 
     def rescaled(self, factor: float) -> Self:
         """Return the camera with its focal length multiplied by `factor`."""
+
+    def binned(self, columns: int, rows: int, size: int) -> Self:
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px, centred in the image."""
 
     def project(self, vectors: FloatArray) -> FloatArray:
         """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions not imaged give NaN."""
@@ -255,6 +258,13 @@ class Lens:
     def rescaled(self, factor: float) -> Lens:
         """Return the camera with its focal length multiplied by `factor`."""
         return replace(self, focal_length=self.focal_length * factor)
+
+    def binned(self, columns: int, rows: int, size: int) -> Lens:
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px, centred in the image."""
+        (x, y), focal_length = self.ideal.centre, self.focal_length / size
+        x, y = (self.centre[0] - x) / size, (self.centre[1] - y) / size
+        centre = x + 0.5 * (columns - 1), y + 0.5 * (rows - 1)
+        return replace(self, columns=columns, rows=rows, focal_length=focal_length, centre=centre)
 
     def project(self, vectors: FloatArray) -> FloatArray:
         """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions not imaged give NaN."""
@@ -471,7 +481,7 @@ class DistortedPinhole(Pinhole):
         )
 
     def binned(self, columns: int, rows: int, size: int) -> DistortedPinhole:
-        """Return the camera of `columns` x `rows` bins of `size` x `size` px."""
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px, centred in the image."""
         shift = self.shift[0] / size, self.shift[1] / size
         focal_length = self.focal_length / size
         return replace(self, columns=columns, rows=rows, focal_length=focal_length, shift=shift)
@@ -779,6 +789,16 @@ class CameraKnowledge:
     line_time: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
     psf_sigma: float = 0.0
+
+    def binned(self, size: int) -> CameraKnowledge:
+        """Return the standard deviations for images that are binned by `size` px."""
+        covariance = self.covariance
+        if covariance is not None:
+            unit = np.array([1.0, 1.0 / size, 1.0 / size, 1.0, size])
+            covariance = tuple(map(tuple, (np.array(covariance) * np.outer(unit, unit)).tolist()))
+        line_time = None if self.line_time is None else self.line_time * size
+        centre, psf_sigma = self.centre / size, self.psf_sigma / size
+        return replace(self, centre=centre, line_time=line_time, covariance=covariance, psf_sigma=psf_sigma)
 
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)

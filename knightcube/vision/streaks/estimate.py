@@ -732,7 +732,7 @@ def _attempt(
 ) -> MotionResult:
     """Return the result of `estimate_motion` for a prepared frame; `seen` is a result without stars."""
     binning, frame, regions, sigma = prepared
-    settings, pinhole = binning.settings(settings), binning.pinhole
+    settings, pinhole = settings.binned(binning.size), binning.pinhole
     shutter = Shutter(settings.delay_per_row / seen.exposure, pinhole.centre[1])
     camera = FitProblem(frame, pinhole, shutter, settings, sigma, settings.rate_model == "accelerating")
     if prior_course is not None and settings.rate_model != "constant":

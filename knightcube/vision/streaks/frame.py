@@ -19,6 +19,7 @@ from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.background import estimate_background
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import (
+    Bins,
     at_least,
     box_sum,
     find_hot_pixels,
@@ -416,64 +417,44 @@ _NARROWEST = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Binning:
-    """Binning of `size` x `size` pixels from pixel `first` (x, y), with `pinhole` for the binned image."""
+    """Bins of a frame, or None without binning, and the camera `pinhole` of the binned frame."""
 
-    size: int
-    first: tuple[int, int]
+    bins: Bins | None
     pinhole: Pinhole
 
     @classmethod
     def suited(cls, pinhole: Pinhole, psf_sigma: float) -> Binning:
-        """Return the binning for the point-spread width `psf_sigma`, px; a small width needs no binning.
-
-        The same number of pixels is omitted at opposite sides of the frame, so that the optical axis stays in
-        the centre.
-        """
+        """Return the binning for the point-spread width `psf_sigma`, px; a small width needs no binning."""
         for size in range(int(psf_sigma / _NARROWEST), 1, -1):
-            columns, rows = (_centred_count(length, size) for length in (pinhole.columns, pinhole.rows))
-            left = pinhole.columns - size * columns, pinhole.rows - size * rows
-            if min(columns, rows) > 0 and not left[0] % 2 and not left[1] % 2:
-                small = pinhole.binned(columns, rows, size)
-                return cls(size, (left[0] // 2, left[1] // 2), small)
-        return cls(1, (0, 0), pinhole)
+            bins = Bins.centred((pinhole.rows, pinhole.columns), size)
+            if bins is not None:
+                return cls(bins, pinhole.binned(bins.columns, bins.rows, size))
+        return cls(None, pinhole)
+
+    @property
+    def size(self) -> int:
+        """The side length of a bin, px; 1 without binning."""
+        return 1 if self.bins is None else self.bins.size
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
         """Return the binned image of `pixels`, and the counts assigned to a saturated bin.
 
         A bin is saturated if one of its pixels has at least `top` counts.
         """
-        if self.size == 1:
+        if self.bins is None:
             return pixels, top
-        x, y = self.first
-        shape = self.pinhole.rows, self.size, self.pinhole.columns, self.size
-        cut = pixels[y : y + shape[0] * self.size, x : x + shape[2] * self.size].reshape(shape)
+        cut = self.bins.blocks(pixels)
         # The value of saturated bins is an integer, so that all bins are multiples of one count.
         full = max(int(cut.max()), int(np.ceil(top))) * self.size**2
         sums = cut.sum(axis=(1, 3), dtype=np.uint64)
         sums[at_least(cut, top).any(axis=(1, 3))] = full
         return sums, float(full)
 
-    def settings(self, settings: LikelihoodSettings) -> LikelihoodSettings:
-        """Return the `settings` for the full frame converted to binned pixels."""
-        if self.size == 1:
-            return settings
-        unit = np.array([1.0, 1.0 / self.size, 1.0 / self.size, 1.0, self.size])
-        covariance = settings.knowledge.covariance
-        if covariance is not None:
-            covariance = tuple(map(tuple, (np.array(covariance) * np.outer(unit, unit)).tolist()))
-        line_time = None if settings.line_time is None else settings.line_time * self.size
-        centre, delay = settings.knowledge.centre / self.size, settings.line_time_sigma * self.size
-        knowledge = replace(settings.knowledge, centre=centre, line_time=delay, covariance=covariance)
-        knowledge = replace(knowledge, psf_sigma=settings.knowledge.psf_sigma / self.size)
-        psf_sigma = settings.psf_sigma / self.size
-        return replace(settings, psf_sigma=psf_sigma, line_time=line_time, knowledge=knowledge)
-
     def in_pixels(self, result: MotionResult) -> MotionResult:
         """Return the `result` of a binned frame with its pixel coordinates converted to the full frame."""
-        size = self.size
-        if size == 1:
+        if self.bins is None:
             return result
-        square, first = float(size**2), np.array(self.first) + 0.5 * (size - 1)
+        size, square, first = self.size, float(self.size**2), self.bins.offset
         return replace(
             result,
             length=size * result.length,
@@ -485,12 +466,6 @@ class Binning:
             psf_sigma=size * result.psf_sigma,
             reason=f"{result.reason}, after {size} x {size} binning" if result.reason else "",
         )
-
-
-def _centred_count(length: int, size: int) -> int:
-    """Return the number of bins of `size` px in `length` px; both margins are equal if possible."""
-    count = length // size
-    return count - 1 if (length - size * count) % 2 and size % 2 else count
 
 
 # Maximum number of bright regions in a frame.
@@ -540,7 +515,7 @@ def _prepared(
 ) -> PreparedFrame:
     """Return the frame, binned for a PSF with the standard deviation `sigma`, px."""
     binning = Binning.suited(pinhole, sigma)
-    frame = reduce_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
+    frame = reduce_frame(*binning.frame(pixels, saturation), settings.gain)
     regions = find_bright_regions(frame, settings.threshold_sigmas, _MOST_REGIONS)
     for without in (without_mosaic, without_glare):
         clear = without(frame, regions)

@@ -116,6 +116,14 @@ class LikelihoodSettings:
         """Whether the shutter may be a rolling shutter because its type is unknown."""
         return self.line_time is None and self.line_time_sigma > 0.0
 
+    def binned(self, size: int) -> LikelihoodSettings:
+        """Return the settings for frames that are binned by `size` px, with the line time of binned rows."""
+        if size == 1:
+            return self
+        line_time = None if self.line_time is None else self.line_time * size
+        knowledge = replace(self.knowledge.binned(size), line_time=self.line_time_sigma * size)
+        return replace(self, psf_sigma=self.psf_sigma / size, line_time=line_time, knowledge=knowledge)
+
     def in_units_of(self, unit: float, zero: float) -> LikelihoodSettings:
         """Return the settings for a frame from which `zero` was subtracted and that was divided by `unit`."""
         if unit == 1.0 and zero == 0.0:

@@ -14,6 +14,7 @@ from knightcube.errors import ArgumentError
 from knightcube.vision import frame
 from knightcube.vision.background import Background, estimate_background
 from knightcube.vision.frame import (
+    Bins,
     FrameState,
     are_hot,
     at_least,
@@ -353,3 +354,39 @@ def test_the_compiled_hot_pixels_are_those_of_numpy_among_pairs_and_squares() ->
     for pixels in (signal, np.clip(signal + 20.0, 0.0, 255.0).astype(np.uint8)):
         assert_forms_agree(frame.hot_among, pixels, row, column, noise, level)
     assert len(frame.hot_among.numpy_form(signal, row, column, noise, level)[0]) > 20
+
+
+@pytest.mark.parametrize(
+    ("length", "size", "bins"),
+    [(9, 3, 3), (10, 3, 2), (11, 3, 3), (12, 3, 4), (25, 5, 5), (26, 5, 4), (27, 5, 5)],
+)
+def test_bins_leave_equal_margins(length: int, size: int, bins: int) -> None:
+    for shape in ((length, 27), (27, length)):
+        found = Bins.centred(shape, size)
+        assert found is not None
+        assert found.sums(np.zeros(shape, np.uint8)).shape[shape.index(length)] == bins
+    assert (length - size * bins) % 2 == 0
+
+
+def test_bins_of_even_size_need_an_even_margin() -> None:
+    assert Bins.centred((12, 13), 2) is None
+    assert Bins.centred((12, 14), 4) == Bins(4, 3, 3, (1, 0))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32])
+def test_pixels_of_a_bin_are_summed_without_overflow(dtype: type[np.generic]) -> None:
+    image = np.random.default_rng(1).integers(0, 120, (11, 15)).astype(dtype)
+    image[1:4] = 120
+    bins = Bins.centred(image.shape, 3)
+    assert bins is not None
+    found = bins.sums(image)
+    # The margin of one row is equal at both ends: rows 1 to 9 and all columns are summed.
+    expected = [
+        [
+            image[1 + 3 * row : 4 + 3 * row, 3 * column : 3 * column + 3].astype(float).sum()
+            for column in range(5)
+        ]
+        for row in range(3)
+    ]
+    assert found.tolist() == expected
+    assert found[0, 0] == 9 * 120

@@ -26,7 +26,15 @@ from knightcube.astro.quaternion import (
 from knightcube.reference.corner_streaks import StreakResult, StreakSettings
 from knightcube.vision import frame_job
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
-from knightcube.vision.frame_job import Bins, FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
+from knightcube.vision.frame import Bins
+from knightcube.vision.frame_job import (
+    FrameFound,
+    FrameJob,
+    StreakEstimator,
+    TrackerSettings,
+    in_whole_image,
+    run,
+)
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -324,33 +332,6 @@ def test_the_facts_of_a_frame_are_plain_values() -> None:
 
 
 @pytest.mark.parametrize(
-    ("length", "size", "bins"),
-    [(9, 3, 3), (10, 3, 2), (11, 3, 3), (12, 3, 4), (25, 5, 5), (26, 5, 4), (27, 5, 5)],
-)
-def test_bins_leave_equal_margins(length: int, size: int, bins: int) -> None:
-    assert Bins(length, 100, size).sums(np.zeros((length, 100), np.uint8)).shape[0] == bins
-    assert Bins(100, length, size).sums(np.zeros((100, length), np.uint8)).shape[1] == bins
-    assert (length - size * bins) % 2 == 0
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32])
-def test_pixels_of_a_bin_are_summed_without_overflow(dtype: type[np.generic]) -> None:
-    image = np.random.default_rng(1).integers(0, 120, (11, 15)).astype(dtype)
-    image[1:4] = 120
-    found = Bins(11, 15, 3).sums(image)
-    # The margin of one row is equal at both ends: rows 1 to 9 and all columns are summed.
-    expected = [
-        [
-            image[1 + 3 * row : 4 + 3 * row, 3 * column : 3 * column + 3].astype(float).sum()
-            for column in range(5)
-        ]
-        for row in range(3)
-    ]
-    assert found.tolist() == expected
-    assert found[0, 0] == 9 * 120
-
-
-@pytest.mark.parametrize(
     "coarse", [Pinhole(50, 33, 70.0), Lens(50, 33, 70.0, (25.5, 15.0), k1=0.02, p1=0.001, aspect=0.01)]
 )
 def test_the_solution_of_a_binned_image_holds_for_the_whole_image(coarse: CameraModel) -> None:
@@ -367,8 +348,9 @@ def test_the_solution_of_a_binned_image_holds_for_the_whole_image(coarse: Camera
         late=points - 3.0,
         psf_sigma=1.5,
     )
-    bins = Bins(101, 152, 3)
-    whole = bins.in_whole_image(found)
+    bins = Bins.centred((101, 152), 3)
+    assert bins is not None
+    whole = in_whole_image(found, bins, (101, 152))
     # The margins are one column and one row at each end.
     assert whole.points == pytest.approx(1.0 + 1.0 + 3.0 * points)
     assert whole.expected == pytest.approx(whole.points + 0.3)
@@ -377,7 +359,8 @@ def test_the_solution_of_a_binned_image_holds_for_the_whole_image(coarse: Camera
     assert whole.psf_sigma == pytest.approx(4.5)
     assert (whole.camera.columns, whole.camera.rows, whole.camera.focal_length) == (152, 101, 210.0)
     assert whole.camera.project(coarse.unit_vectors(points)) == pytest.approx(whole.points)
-    assert bins.camera(whole.camera) == coarse
+    again = whole.camera.binned(bins.columns, bins.rows, 3)
+    assert again.project(coarse.unit_vectors(points)) == pytest.approx(points)
 
 
 _DEFOCUSED = Lens(512, 512, 1450.0, (255.5, 255.5), k1=-0.1)

@@ -116,17 +116,16 @@ def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> 
 
 
 def test_the_line_time_of_binned_rows_is_a_multiple_whether_stated_or_not() -> None:
-    binning = Binning.suited(Pinhole(1024, 768, 3000.0), 3.0)
     nobody, stated = LikelihoodSettings(), LikelihoodSettings(line_time=1e-5)
-    assert binning.settings(nobody).line_time_sigma == pytest.approx(3.0 * nobody.line_time_sigma)
-    assert binning.settings(nobody).shutter_unstated
-    assert binning.settings(stated).line_time == pytest.approx(3e-5)
-    assert binning.settings(stated).line_time_sigma == 0.0
+    assert nobody.binned(3).line_time_sigma == pytest.approx(3.0 * nobody.line_time_sigma)
+    assert nobody.binned(3).shutter_unstated
+    assert stated.binned(3).line_time == pytest.approx(3e-5)
+    assert stated.binned(3).line_time_sigma == 0.0
 
 
 def test_the_uncertainty_of_the_point_spread_is_given_in_binned_pixels() -> None:
     settings = LikelihoodSettings(psf_sigma=3.0, knowledge=replace(EXACT, psf_sigma=0.06))
-    binned = Binning.suited(Pinhole(1024, 768, 3000.0), 3.0).settings(settings)
+    binned = settings.binned(3)
     assert binned.psf_sigma == pytest.approx(1.0)
     assert binned.knowledge.psf_sigma == pytest.approx(0.02)
 
