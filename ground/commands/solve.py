@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
     """Solve the picture, and print and draw the solution. The exit status is 1 without a solution."""
     check_new(options.wcs)
     if options.date is not None and not FIRST_YEAR <= options.date.year < LAST_YEAR:
-        years = f"{FIRST_YEAR} to {LAST_YEAR}"
+        years = f"{FIRST_YEAR} to {LAST_YEAR - 1}"
         raise UsageError(f"--date {options.date:%Y-%m-%d}: give the time of the picture, from {years}")
     pixels = read_picture(options)
     tracker, exposure, axis_sigma = _tracker(options, pixels)

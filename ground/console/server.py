@@ -82,7 +82,7 @@ class Console:
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: camera frames that the flight has kept.
         trouble: reason why the last read failed, or the `doubts` on the flight, or an empty text.
-        doubts: functions that return what is wrong with the log or the flight process, or an empty text.
+        doubts: functions that describe damage of the log or the end of the flight process, or return "".
         files: files of the satellite, or None if the files are not accessible.
         stations: ground stations in the panel of passes until the operator enters other stations.
         settled_ns: newest time (ns) up to which all packets have been received, which the live page shows.

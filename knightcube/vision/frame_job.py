@@ -30,7 +30,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.attitude.wahba import AttitudeFix
-from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import KnightCubeError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole, streak_camera
@@ -49,6 +49,7 @@ from knightcube.vision.startracker.solve import (
     RatePrior,
     SolveSettings,
     SolveStatus,
+    attitudes_agree,
     solve_faint,
     solve_motion,
     solve_near,
@@ -79,8 +80,6 @@ _KNOWN_PX = 0.3
 _SCATTERED_PX = 0.25
 # Standard deviation (px) of the direction above which stars may be images of several points each.
 _UNCERTAIN_PX = 0.5
-# Chi-square (3 degrees of freedom) of a difference above which two attitudes contradict each other (0.001 %).
-_CONTRADICTORY = 25.9
 # Minimum number of bins in a row and in a column.
 _LEAST_BINNED = 64
 BIN_SIZES = 3, 5
@@ -442,8 +441,8 @@ def _is_better(one: FrameSolution, other: FrameSolution) -> bool:
     assert other.fix is not None
     if _direction_sigma(one.fix) < _direction_sigma(other.fix) or _scatter(one) < 0.5 * _scatter(other):
         return True
-    off = to_rotation_vector(multiply(one.fix.quaternion, conjugate(other.fix.quaternion)))
-    return bool(off @ np.linalg.solve(one.fix.covariance + other.fix.covariance, off) > _CONTRADICTORY)
+    covariance = one.fix.covariance + other.fix.covariance
+    return not attitudes_agree(one.fix.quaternion, other.fix.quaternion, covariance)
 
 
 def _direction_sigma(fix: AttitudeFix) -> float:
@@ -454,7 +453,7 @@ def _direction_sigma(fix: AttitudeFix) -> float:
 def _scatter(solution: FrameSolution) -> float:
     """Return the scatter, px, of the identified points of a solution about their predicted positions."""
     off = solution.points[solution.matched] - solution.expected[solution.matched]
-    # Of normally distributed displacements along x and y, half are within 1.18 standard deviations.
+    # Half of the normally distributed displacements in a plane are within 1.18 standard deviations.
     return float(np.median(np.hypot(off[:, 0], off[:, 1]))) / 1.18
 
 

@@ -219,7 +219,7 @@ _SPLIT_PX = 10.0
 # The first term is `_SPLIT_SIGMAS` standard deviations of the number of nearby points.
 # The second term is the fraction `_SPLIT_SHARE` of the matched points.
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
-# Largest chi-square of the difference from the prior attitude (1 false rejection in 100,000 frames).
+# Largest chi-square of the difference of two attitudes that agree (1 false rejection in 100,000 frames).
 _NEAR = 25.9
 # In a frame in which few stars are detected without a prediction: minimum height of a star near its predicted
 # position, in standard deviations, and minimum number of such stars.
@@ -448,9 +448,14 @@ def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
     """Return whether an attitude agrees with the prior attitude."""
     if solution.fix is None:
         return True
-    off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))
     known = solution.fix.covariance + prior.sigma**2 * np.eye(3)
-    return bool(off @ np.linalg.solve(known, off) < _NEAR)
+    return attitudes_agree(solution.fix.quaternion, prior.quaternion, known)
+
+
+def attitudes_agree(one: FloatArray, other: FloatArray, covariance: FloatArray) -> bool:
+    """Return whether the difference of two attitudes (4,) agrees with its covariance (3, 3), rad^2."""
+    off = to_rotation_vector(multiply(one, conjugate(other)))
+    return bool(off @ np.linalg.solve(covariance, off) < _NEAR)
 
 
 def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:

@@ -193,7 +193,7 @@ def test_a_picture_without_stars_is_not_solved_and_says_why(tmp_path: Path) -> N
     [
         (["--fov", "200"], "1 to 120 degrees"),
         (["--date", "yesterday"], "such as 2026-03-01"),
-        (["--date", "1700-01-01"], "--date 1700-01-01: give the time of the picture, from 1900 to 2100"),
+        (["--date", "1700-01-01"], "--date 1700-01-01: give the time of the picture, from 1900 to 2099"),
         (["--fov", "wide"], "is not a number"),
         (["--raw", "1024x1024"], "such as 1280x960x16"),
         (["--raw", "9000x9000x16"], "pixels of 16 bits need 162000000"),
