@@ -24,17 +24,22 @@ import numpy as np
 from knightcube.compiled import in_use
 
 TOLERANCE = 1e-5
-"""Largest relative difference from the record, which rounding in another order may cause."""
-COMPILED_TOLERANCE = 1e-2
-"""Largest relative difference from the record if compiled functions are used.
+"""Largest relative difference of the `ANSWERS` from the record, which rounding in another order may cause."""
+OTHER_TOLERANCE = 2e-3
+"""Largest relative difference of other values from the record.
 
-The rounding of compiled functions differs, which may change the step at which an iteration stops.
+Another processor rounds sums differently, which may change the step at which an iteration stops.
+
+The largest difference found is 0.06 %, of a misfit (1 of 68 cases of `tests/knightcube/vision`, 2026-11-29).
+"""
+COMPILED_TOLERANCE = 1e-2
+"""Largest relative difference of other values from the record if compiled functions are used.
 
 The largest difference found, of a covariance or a faint star, is 0.7 % (5 of 68 cases of
 `tests/knightcube/vision`, 2026-11-27).
 """
 ANSWERS = ("rate", "quaternion")
-"""Names of the values for which `TOLERANCE` also applies if compiled functions are used."""
+"""Names of the values that agree within `TOLERANCE` on all processors, also if they are compiled."""
 COMPILED = in_use()
 ZERO = 1e-15
 CURE = "if the change is intended, set KNIGHTCUBE_RECORD=1 and run the test to write the record again"
@@ -123,8 +128,9 @@ def differences(record: Any, found: Any, tolerance: float, place: str = "", zero
 def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zero: float = ZERO) -> None:
     """Fail if a result differs from its record, a file in the folder of the test module.
 
-    Numbers agree if they differ by at most the fraction `tolerance`, or by `zero`. If compiled functions are
-    used, the fraction is `COMPILED_TOLERANCE` for all values except the `ANSWERS`.
+    The `ANSWERS` agree if they differ by at most the fraction `tolerance`, or by `zero`. The fraction of
+    other values is `OTHER_TOLERANCE`, or `COMPILED_TOLERANCE` if compiled functions are used, unless
+    `tolerance` is larger.
     """
     path = Path(module).with_name("recorded_results.json")
     records: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -140,10 +146,10 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
 def unlike(record: Any, found: Any, tolerance: float, zero: float, compiled: bool) -> list[str]:
     """Return the key paths at which results differ from their record.
 
-    If `compiled` is true, compiled functions were used, whose results have a larger tolerance.
+    If `compiled` is true, compiled functions were used, and values other than the `ANSWERS` have a larger
+    tolerance.
     """
     lines = differences(record, found, tolerance, zero=zero)
-    if not compiled:
-        return lines
     answers = [line for line in lines if set(line.partition(":")[0].split(".")) & set(ANSWERS)]
-    return answers + differences(record, found, max(tolerance, COMPILED_TOLERANCE), zero=zero)
+    others = COMPILED_TOLERANCE if compiled else OTHER_TOLERANCE
+    return answers + differences(record, found, max(tolerance, others), zero=zero)
