@@ -27,7 +27,8 @@ $(TOOLS): $(READY) requirements-test.lock
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report
 	@rm -rf runs/demo
-	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
+	@# Without numba: to compile the functions for the first time takes longer than this flight.
+	KNIGHTCUBE_COMPILED=0 $(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
 
 cage: $(READY)  ## fly the testbed in a Helmholtz cage that plays an orbit's field, for a revolution; report and pictures
