@@ -21,7 +21,7 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from knightcube.gnc.first_orbit import (
     MINIMUM_SIGHTINGS,
     ArcError,
@@ -143,7 +143,7 @@ def _write(path: Path, lines: list[str], as_xml: bool) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n", encoding="ascii")
     except OSError as error:
-        raise UsageError(f"{path}: the message cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{path}: the message cannot be written: {reason_of(error)}") from error
 
 
 _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")

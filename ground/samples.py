@@ -20,7 +20,7 @@ from knightcube.astro.catalogue import load
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from knightcube.vision.camera.images import write_picture
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.sky_map import Pointing
@@ -157,4 +157,4 @@ def write_truth(path: Path, truth: dict[str, Any]) -> None:
     try:
         path.write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be written: {reason_of(error)}") from error

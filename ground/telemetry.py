@@ -35,7 +35,7 @@ from flight.link.telemetry.packets import (
     truncated_bytes,
     walk,
 )
-from knightcube.errors import UsageError, shown
+from knightcube.errors import UsageError, reason_of, shown
 
 
 def text_of(value: bytes) -> str:
@@ -190,7 +190,7 @@ def read_run(folder: Path) -> Run:
             whole = stem == "flight" and is_first(paths[0])
             logs.append(scan(b"".join(path.read_bytes() for path in paths), whole))
         except OSError as error:
-            raise UsageError(f"{folder}: the {stem} log cannot be read: {error.strerror or error}") from error
+            raise UsageError(f"{folder}: the {stem} log cannot be read: {reason_of(error)}") from error
     flight, truth, performance = logs
     if not flight.counts:
         raise UsageError(f"{folder}: no valid packet in the {flight.total_bytes} bytes of the flight log")
@@ -356,4 +356,4 @@ def export(run: Run, place: Path, form: str = "csv") -> list[Path]:
         (place.parent if form == "sqlite" else place).mkdir(parents=True, exist_ok=True)
         return write(run, place)
     except OSError as error:
-        raise UsageError(f"{place}: {form} cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{place}: {form} cannot be written: {reason_of(error)}") from error

@@ -35,7 +35,7 @@ from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
 from ground.telemetry import date_of, decode, flight_segments, is_first, scan
 from knightcube.astro.quaternion import angle_between
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -135,7 +135,7 @@ class LogTail:
         except FileNotFoundError:  # the segment was deleted because the log was too large
             data = b""
         except OSError as error:
-            raise UsageError(f"{self._path}: cannot be read: {error.strerror or error}") from error
+            raise UsageError(f"{self._path}: cannot be read: {reason_of(error)}") from error
         if data and self._offset:
             self._grew = time.monotonic()
         self._offset += len(data)

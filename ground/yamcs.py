@@ -40,7 +40,7 @@ from ground.documentation import foreign_modes, layouts_for
 from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, TELECOMMANDS, UNUSED, document, epoch_of, spread
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 from knightcube.gnc.guidance.pointing_target import PointingTarget
 
 if TYPE_CHECKING:
@@ -295,7 +295,7 @@ def write(
         for name in ("data", RECORDED, *_BUCKETS):
             (folder / name).mkdir(exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{folder}: cannot be written: {reason_of(error)}") from error
 
 
 def password_in(folder: Path) -> str:
@@ -336,7 +336,7 @@ def compile_link(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / LINK_SOURCE).write_text(_LINK, encoding="utf-8")
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{folder}: cannot be written: {reason_of(error)}") from error
     compiler = ["java", *_FRUGAL, "-cp", class_path()]
     compiler += ["-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
     command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]

@@ -2,6 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+
+_REMEDIES = {
+    errno.EACCES: "change the owner or the permissions, or give another path",
+    errno.EEXIST: "give another name",
+    errno.EISDIR: "give the name of a file",
+    errno.ENOENT: "check the path",
+    errno.ENOSPC: "delete files, or give a path on another disk",
+    errno.ENOTDIR: "a part of the path is a file; give another path",
+    errno.EROFS: "give a path on another disk",
+}
+"""Remedies for errors of the operating system, by error number."""
+
 
 class KnightCubeError(Exception):
     """Base class of all errors that the library and the flight application define.
@@ -45,6 +58,12 @@ class PlanningError(UsageError):
     The message states the reason and the remedy. If the arguments are valid and no path is found, a command
     ends with status 1.
     """
+
+
+def reason_of(error: OSError) -> str:
+    """Return the reason of a failed file operation and, for frequent reasons, its remedy."""
+    reason, remedy = str(error.strerror or error), _REMEDIES.get(error.errno or 0)
+    return f"{reason}; {remedy}" if remedy else reason
 
 
 def shown(text: str) -> str:

@@ -93,7 +93,7 @@ from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube import compiled
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
 from knightcube.vision.camera import images
@@ -687,7 +687,7 @@ def _begin_folder(
     except OSError as error:
         if request.archive is not None and error.errno in DISK_TROUBLE:
             return request, earlier
-        raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{out}: cannot be written: {reason_of(error)}") from error
     return request, earlier
 
 

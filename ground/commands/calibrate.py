@@ -16,7 +16,7 @@ from flight.schema import reader as configuration
 from flight.schema.devices import camera_model
 from ground.commands.options import add_field, check_new, check_size, positive, print_result, write_new
 from knightcube.astro.arrays import Image
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import SHAPE_TERMS
 from knightcube.vision.lens_calibration import (
@@ -228,7 +228,7 @@ def run_samples(options: argparse.Namespace) -> int:
         if any(out.iterdir()):
             raise UsageError(f"{out}: is not empty, and its files could be replaced: give another --out")
     except OSError as error:
-        raise UsageError(f"{out}: cannot be made: {error.strerror or error}") from error
+        raise UsageError(f"{out}: cannot be made: {reason_of(error)}") from error
 
     def progress(name: str) -> None:
         if sys.stderr.isatty():
@@ -285,7 +285,7 @@ def run_index(options: argparse.Namespace) -> int:
     try:
         save(sky, options.out)
     except OSError as error:
-        raise UsageError(f"--out {options.out}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"--out {options.out}: cannot be written: {reason_of(error)}") from error
     stars, triangles = len(sky.stars), len(sky.triangles)
     facts = {"index": str(options.out), "stars": stars, "triangles": triangles}
     print_result(options, facts, f"{options.out}: {stars} stars, {triangles} triangles\n")

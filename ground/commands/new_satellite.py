@@ -24,7 +24,7 @@ from ground.commands.elements import elements_of
 from ground.commands.options import interruptible, print_result, write_new
 from ground.satellite_description import Derived, Question, Satellite, Values
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from sim_hal.settings import OrbitSection
 from sim_hal.worlds.orbit import julian_date
 
@@ -268,7 +268,7 @@ def _replace(path: Path, text: str) -> None:
         os.replace(beside, path)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be written: {reason_of(error)}") from error
 
 
 def warnings_of(satellite: Satellite, values: Derived) -> list[str]:

@@ -18,7 +18,7 @@ import numpy as np
 from flight.app.cli import to_json
 from flight.schema.document import config_path
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from knightcube.vision.camera.images import read_image, read_raw, stated_exposure
 from knightcube.vision.frame import LEAST_SIDE
 
@@ -203,4 +203,4 @@ def write_new(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be written: {reason_of(error)}") from error

@@ -31,7 +31,7 @@ from flight.schema.reader import parse
 from ground.commands.options import positive
 from ground.link.commanding import add_link_options, command, explained, failed, sha256_of, terminal_of
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 from knightcube.vision.startracker import index
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
@@ -172,7 +172,7 @@ def _check_permanent(options: argparse.Namespace) -> None:
     try:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"--out {options.out}: cannot be made: {error.strerror or error}") from error
+        raise UsageError(f"--out {options.out}: cannot be made: {reason_of(error)}") from error
 
 
 def sign(options: argparse.Namespace, data: bytes) -> Path:

@@ -51,7 +51,7 @@ from ground.link.terminal import (
     report_of,
 )
 from ground.telemetry import text_of
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 Show = Callable[[Report], object]
 _BLOCK = 64  # number of frame counters reserved at once, because each reservation takes two disk writes
@@ -461,7 +461,7 @@ class FileSession:
                         with self._store.part(record).open("rb") as file:
                             write_whole(place, file.read(count))
                 except OSError as error:
-                    raise FileError(f"{place}: cannot be written: {error.strerror or error}") from error
+                    raise FileError(f"{place}: cannot be written: {reason_of(error)}") from error
 
 
 def sha256_of(path: Path) -> bytes:
@@ -470,4 +470,4 @@ def sha256_of(path: Path) -> bytes:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").digest()
     except OSError as error:
-        raise KnightCubeError(f"{path}: {error.strerror or error}") from error
+        raise KnightCubeError(f"{path}: {reason_of(error)}") from error

@@ -32,7 +32,7 @@ from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, SECONDARY_BYTES, crc16
 from ground.link.terminal import FRAME_OVERHEAD_BYTES, PORTS, Terminal, report_of
 from ground.xtce import TELECOMMANDS
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 ADDRESS = "127.0.0.1:5013"
 
@@ -172,7 +172,7 @@ def token_file(path: Path, token: str) -> Iterator[None]:
             out.write(f"{token}\n")
         new.replace(path)
     except OSError as error:
-        raise KnightCubeError(f"{path}: the token cannot be written: {error.strerror or error}") from error
+        raise KnightCubeError(f"{path}: the token cannot be written: {reason_of(error)}") from error
     try:
         yield
     finally:

@@ -26,7 +26,7 @@ from flight.link.telemetry.definitions import LINK, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS
 from flight.schema.sections import Link, LinkCoding
 from ground.telemetry import text_of
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 DEFAULTS = Link(keys="-")
 """Link settings that are used without a configuration."""
@@ -57,7 +57,7 @@ def make_keys(folder: Path) -> list[Path]:
     except FileExistsError as error:
         raise UsageError(f"{folder} exists: keys are never overwritten, give another folder") from error
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be made: {error.strerror or error}") from error
+        raise UsageError(f"{folder}: cannot be made: {reason_of(error)}") from error
     ends = [folder / end for end in ("satellite", "ground")]
     for end in ends:
         end.mkdir(mode=0o700)

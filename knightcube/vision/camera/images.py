@@ -37,7 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import Image
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, reason_of
 from knightcube.vision.frame import LUMINANCE, grey_of_planes
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def _fits_content(path: Path) -> bytes:
     except (EOFError, zlib.error) as error:
         raise UsageError(f"{path}: is damaged: {error}") from error
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be read: {reason_of(error)}") from error
     if not content.startswith(SIGNATURE):
         raise UsageError(f"{path}: compressed, but not a FITS image: decompress or convert it")
     if len(content) > _MOST_BYTES:
@@ -269,7 +269,7 @@ def read_raw(path: Path, columns: int, rows: int, bits: int, header: int | None 
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be read: {reason_of(error)}") from error
     wanted = columns * rows * kind.itemsize
     extra = len(content) - wanted
     if extra < 0 or header not in (None, extra):
@@ -346,7 +346,7 @@ def write_picture(
         # Noise cannot be compressed: a higher level takes five times as long, for files 3 % smaller.
         pillow.fromarray(picture).save(path, format="PNG", compress_level=1, exif=metadata)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be written: {reason_of(error)}") from error
 
 
 def _through_pillow(path: Path, upright: bool) -> Image:

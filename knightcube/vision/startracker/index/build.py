@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro import catalogue
-from knightcube.errors import ArgumentError, InputError, UsageError
+from knightcube.errors import ArgumentError, InputError, UsageError, reason_of
 from knightcube.vision.startracker.index import (
     PATH,
     GuideStars,
@@ -168,7 +168,7 @@ def default_index() -> SkyIndex:
         path.parent.mkdir(parents=True, exist_ok=True)
         save(sky, path)
     except OSError as error:
-        sys.stderr.write(f"{path}: the sky index cannot be stored: {error.strerror or error}\n")
+        sys.stderr.write(f"{path}: the sky index cannot be stored: {reason_of(error)}\n")
         return sky
     return load(path)
 
@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"{error}\n")
         return 2
     except OSError as error:
-        sys.stderr.write(f"{options.output}: cannot be written: {error.strerror or error}\n")
+        sys.stderr.write(f"{options.output}: cannot be written: {reason_of(error)}\n")
         return 2
     megabytes = options.output.stat().st_size / 1e6
     sys.stdout.write(

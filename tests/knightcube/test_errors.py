@@ -1,0 +1,27 @@
+"""Tests of the texts that describe errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from knightcube.errors import reason_of
+
+
+def test_the_reason_of_a_frequent_file_error_has_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError) as exists:
+        (tmp_path / "file").mkdir()
+    with pytest.raises(OSError) as below_a_file:
+        (tmp_path / "file" / "folder").mkdir()
+    with pytest.raises(OSError) as folder:
+        tmp_path.write_text("")
+    assert reason_of(exists.value) == "File exists; give another name"
+    assert reason_of(below_a_file.value) == "Not a directory; a part of the path is a file; give another path"
+    assert reason_of(folder.value) == "Is a directory; give the name of a file"
+
+
+@pytest.mark.parametrize("error", [OSError("truncated"), OSError(None, "truncated")])
+def test_an_error_without_a_number_is_its_own_reason(error: OSError) -> None:
+    assert reason_of(error).endswith("truncated")
