@@ -55,7 +55,13 @@ from knightcube.vision.startracker.solve import (
     solve_near,
     solve_points,
 )
-from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Survey, survey
+from knightcube.vision.startracker.survey import (
+    DetectionSettings,
+    FrameKind,
+    Survey,
+    accepted_psf,
+    survey,
+)
 from knightcube.vision.startracker.tracking import PRIOR_SIGMAS
 from knightcube.vision.streaks.streak_result import (
     REASONS,
@@ -178,7 +184,7 @@ class FrameJob:
         if isinstance(estimator, LikelihoodSettings):
             estimator = replace(estimator, line_time=line_time, psf_sigma=psf_sigma, knowledge=accuracy)
         if tracker is not None:
-            detection = replace(tracker.solve.detection, psf_sigma=psf_sigma)
+            detection = replace(tracker.solve.detection, psf_sigma=accepted_psf(psf_sigma))
             solve = replace(tracker.solve, detection=detection, lens=accuracy)
             tracker = replace(tracker, solve=solve, scale=(1.0, 1.0))
         attitude, rate, turn = self.attitude_prior, self.rate_prior, known.turn

@@ -32,7 +32,7 @@ from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, attitude
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
-from knightcube.vision.startracker.survey import DetectionSettings, FrameKind
+from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, accepted_psf
 from knightcube.vision.startracker.tracking import PRIOR_SIGMAS, track
 from knightcube.vision.startracker.verification import expected_stars
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
@@ -318,7 +318,7 @@ def solve_faint(
     width = found.psf_sigma if settings.detection.psf_sigma is None else settings.detection.psf_sigma
     detection = replace(
         settings.detection,
-        psf_sigma=width if math.isfinite(width) else None,
+        psf_sigma=accepted_psf(width) if math.isfinite(width) else None,
         threshold_sigmas=_FAINT_SIGMAS,
         search_radius=_LEAST_RADIUS_PX,
     )

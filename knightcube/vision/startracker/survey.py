@@ -395,6 +395,15 @@ Method = Literal["psf", "window", "weighted", "gaussian", "iterative"]
 CENTROIDS: tuple[Method, ...] = get_args(Method)
 
 
+PSF_SIGMAS = 0.3, 6.0
+"""Range of the standard deviation of the PSF, px, that star detection accepts."""
+
+
+def accepted_psf(psf_sigma: float) -> float:
+    """Return a measured standard deviation of the PSF, px, limited to the range `PSF_SIGMAS`."""
+    return min(max(psf_sigma, PSF_SIGMAS[0]), PSF_SIGMAS[1])
+
+
 @dataclass(frozen=True, slots=True)
 class DetectionSettings:
     """Settings of star detection; the defaults suit an unknown camera.
@@ -429,7 +438,7 @@ class DetectionSettings:
         for name, low, high in (
             ("threshold_sigmas", 1.0, 100.0),
             ("most_stars", 1, 10_000),
-            ("psf_sigma", 0.3, 6.0),
+            ("psf_sigma", *PSF_SIGMAS),
             ("gain", 1e-6, 1e6),
             ("saturation", 1e-6, 1e9),
             ("search_radius", 1.0, 50.0),

@@ -319,6 +319,22 @@ def test_the_priors_of_a_frame_are_in_the_axes_of_the_configured_lens() -> None:
     assert replace(job, lens=(LensKnowledge.of(DESCRIBED, KNOWN), 0.0)).with_lens().camera is DESCRIBED
 
 
+@pytest.mark.parametrize(("estimated", "used"), [(0.1, 0.3), (1.2, 1.2), (7.0, 6.0)])
+def test_an_extreme_estimated_width_of_the_stars_is_limited_for_the_detection(
+    estimated: float, used: float
+) -> None:
+    """Otherwise no frame of a very sharp camera would be processed any more."""
+    rng = np.random.default_rng(131)
+    known = learned(TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN), rng, 10)
+    known = replace(known, values=np.array([*known.values[:-1], estimated]))
+    assert known.psf_sigma == estimated
+    tracker = TrackerSettings(SolveSettings(), (0.9, 1.1))
+    job = FrameJob(np.zeros((480, 640)), DESCRIBED, 0.2, LikelihoodSettings(), tracker, None, None)
+    through = replace(job, lens=(known, 5.0)).with_lens()
+    assert through.tracker is not None
+    assert through.tracker.solve.detection.psf_sigma == used
+
+
 def _matched(lens: Lens, count: int, seed: int, late: bool) -> tuple[MatchedFrame, FloatArray]:
     """Return stars with correlated position errors, and the attitude of their frame."""
     rng = np.random.default_rng(seed)

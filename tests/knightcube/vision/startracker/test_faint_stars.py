@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -25,6 +26,7 @@ from knightcube.vision.startracker.solve import (
     FrameSolution,
     SolveSettings,
     SolveStatus,
+    solve_faint,
     solve_points,
     star_field,
 )
@@ -64,6 +66,18 @@ def test_frames_with_too_few_detected_stars_are_answered_and_the_answers_are_rig
         assert error @ np.linalg.solve(found.fix.covariance, error) < _CHI_SQUARE_3_DOF_1E_6
     assert alone <= 6
     assert answered >= alone + 5
+
+
+@pytest.mark.parametrize("width", [0.1, math.nan])
+def test_a_width_measured_in_few_stars_may_be_extreme(width: float) -> None:
+    """A width beyond the range of the detection settings raises no exception."""
+    frames = [_dim_frame(seed) for seed in range(16)]
+    found = [replace(detect(frame.pixels).stars(), psf_sigma=width) for frame in frames]
+    answers = [
+        solve_faint(frame.pixels, one, NARROW.pinhole, _FIXED, sky(), SolveSettings())
+        for frame, one in zip(frames, found, strict=True)
+    ]
+    assert any(answers)
 
 
 def test_a_camera_unlike_the_assumed_one_gives_no_wrong_attitude() -> None:
