@@ -154,10 +154,11 @@ class Navigation:
         self._coil_factors = estimation.coil_monitor.correction.factors
         self._available = estimation.coil_monitor.available
         self._has_rate = True
+        self._gyro_rate = np.zeros(3)
         self.speed = 0.0
-        """Body rate (rad/s) of the newest reading, including the gyro bias. Without a gyro, the value is the
-        rate of the estimate, or the largest likely rate from the magnetometer, or infinity while the rate is
-        unknown."""
+        """Body rate (rad/s) of the newest gyro reading, without the estimated gyro bias. Without a gyro, the
+        value is the rate of the estimate, or the largest likely rate from the magnetometer, or infinity while
+        the rate is unknown."""
 
     def begin(self, time_ns: int) -> None:
         """Ignore readings made before the release of the body at `time_ns`."""
@@ -214,7 +215,7 @@ class Navigation:
             self._received_ns = reading.time_ns
             self._has_rate = reading.has_rate
             if reading.has_rate:
-                self.speed = math.hypot(*reading.rate.tolist())
+                self._gyro_rate, self.speed = reading.rate, math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
         if doubted and not self._doubted:
@@ -278,8 +279,8 @@ class Navigation:
             self.speed = self.speed if self._has_rate else self._estimation.fastest_by_field()
             return None
         estimate = self._filter.at(now_ns)
-        if not self._has_rate:
-            self.speed = math.hypot(*estimate.rate.tolist())
+        rate = self._gyro_rate - estimate.bias if self._has_rate else estimate.rate
+        self.speed = math.hypot(*rate.tolist())
         return estimate
 
     def past(self, time_ns: int) -> Estimate | None:
