@@ -11,11 +11,11 @@ from knightcube.errors import reason_of
 
 def test_the_reason_of_a_frequent_file_error_has_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OSError) as exists:
+    with pytest.raises(FileExistsError) as exists:
         (tmp_path / "file").mkdir()
-    with pytest.raises(OSError) as below_a_file:
+    with pytest.raises(NotADirectoryError) as below_a_file:
         (tmp_path / "file" / "folder").mkdir()
-    with pytest.raises(OSError) as folder:
+    with pytest.raises(IsADirectoryError) as folder:
         tmp_path.write_text("")
     assert reason_of(exists.value) == "File exists; give another name"
     assert reason_of(below_a_file.value) == "Not a directory; a part of the path is a file; give another path"
