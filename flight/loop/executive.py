@@ -219,15 +219,13 @@ class RateGroup:
         self.slips += skipped
         return cycle, skipped
 
-    def account(self, execution_ns: int, completed: bool = True) -> bool:
-        """Record the execution time of a cycle and whether its task completed; return whether it overran."""
+    def account(self, execution_ns: int, completed: bool = True) -> None:
+        """Record the execution time of a cycle, and whether its task completed."""
         self.cycles += 1
         self.completed += completed
         self.total_execution_ns += execution_ns
         self.max_execution_ns = max(self.max_execution_ns, execution_ns)
-        overran = execution_ns > self.period_ns
-        self.overruns += overran
-        return overran
+        self.overruns += execution_ns > self.period_ns
 
 
 class Observer(Protocol):
@@ -298,13 +296,15 @@ BUDGET = 10
 """Number of consecutive unexpected exits of a worker after which restarts pause. The delays of the restarts
 before the pause add up to 127.5 s."""
 FIRST_NS = SECOND_NS // 2
+"""Delay (ns) of the second of several consecutive restarts; each later delay is twice as long."""
 STEADY_NS = 60 * SECOND_NS
 """Running time (ns) after which a worker's budget of restarts is reset."""
 REST_NS = 600 * SECOND_NS
+"""Pause (ns) after the budget of restarts is used up."""
 
 
 class Attempts:
-    """Counts the unexpected exits of a worker since it last ran for more than a minute."""
+    """Counts the unexpected exits of a worker since it last ran for `STEADY_NS`; 0 before the first exit."""
 
     def __init__(self) -> None:
         self.deaths = 0
@@ -331,6 +331,7 @@ MODULE = "flight.loop.worker"
 """Name of the module that a worker process runs."""
 
 _REAPED_WITHIN_S = 1.0
+"""Longest time (s) to wait for the end of a killed process."""
 
 
 class WorkerProcess:
@@ -391,7 +392,8 @@ class WorkerProcess:
     def send(self, argument: Any) -> None:
         """Submit a job.
 
-        Raises KnightCubeError if the job is too large, and EOFError if the process has ended.
+        Raises KnightCubeError if the job is too large, EOFError if the process has ended, and OSError if only
+        a part of the job was sent, so that the process cannot receive another job.
         """
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
@@ -401,7 +403,7 @@ class WorkerProcess:
         except ConnectionError as error:
             raise EOFError(self._name) from error
         if sent != len(message):
-            raise KnightCubeError(f"a job for {self._name} of {len(message)} bytes is too large")
+            raise OSError(f"the socket accepted {sent} of the job's {len(message)} bytes")
 
     def receive(self) -> JobAnswer | None:
         """Return an answer, or None if no answer has arrived.
@@ -447,7 +449,9 @@ class WorkerProcess:
 START_LIMIT_NS = 60 * SECOND_NS
 """Longest time (ns) in which a worker must import its function; otherwise it is restarted."""
 _IDLE_MS = 1000.0
+"""Longest time (ms) between two checks of the workers."""
 _CLOSE_S = 5.0
+"""Longest time (s) to wait for the end of the supervising thread."""
 
 
 class _Kept:
@@ -462,14 +466,13 @@ class _Kept:
         self._clock, self._cores = clock, cores
         self._attempts = Attempts()
         self._due_ns = self._begun_ns = clock.now_ns()
-        self._deaths = 0
 
-    def due_ns(self) -> int:
-        """Return the time (ns) of the worker's next timeout or restart, or -1 if none is pending."""
+    def dues_ns(self) -> list[int]:
+        """Return the times (ns) of the worker's pending timeouts, or of its restart."""
         if self.process is None:
-            return self._due_ns
+            return [self._due_ns]
         dues = [self.submitted_ns + self.worker.timeout_ns] if self.submitted_ns >= 0 else []
-        return min([*dues, *([] if self.process.ready else [self._begun_ns + START_LIMIT_NS])], default=-1)
+        return dues if self.process.ready else [*dues, self._begun_ns + START_LIMIT_NS]
 
     def serve(self) -> tuple[list[JobResult], list[WorkerNews]]:
         """Start, reap or communicate with the worker process, and return job results and state changes."""
@@ -495,7 +498,7 @@ class _Kept:
         answer = process.receive()
         if process.ready and not was_ready:
             self.accepts = True
-            if self._deaths:
+            if self._attempts.deaths:
                 news.append(WorkerNews(self.worker.name, WorkerChange.READY, "runs again"))
         if answer is not None and self.submitted_ns >= 0:
             results.append(JobResult(self.worker.name, *answer[:3], self.submitted_ns, now_ns, answer[3]))
@@ -529,7 +532,6 @@ class _Kept:
             ended = process.end()
             text = f"{text}, {ended}" if outcome == "died" else text
         results = self._lose(outcome, text, now_ns)
-        self._deaths += 1
         wait_ns = self._attempts.died(now_ns - self._begun_ns)
         self._due_ns = self._clock.now_ns() + wait_ns
         news = [WorkerNews(self.worker.name, WorkerChange.DIED, f"{text}; starts in {wait_ns * 1e-9:g} s")]
@@ -621,7 +623,7 @@ class ProcessRunner:
             if kept.process is not None:
                 poll.register(kept.process, select.POLLIN)
         now_ns = self._clock.now_ns()
-        dues = [due_ns for kept in self._kept.values() if (due_ns := kept.due_ns()) >= 0]
+        dues = [due_ns for kept in self._kept.values() for due_ns in kept.dues_ns()]
         wait_ms = min([_IDLE_MS, *(1e-6 * (due_ns - now_ns) + 1.0 for due_ns in dues)])
         poll.poll(max(wait_ms, 0.0))
         with suppress(BlockingIOError):

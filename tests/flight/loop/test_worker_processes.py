@@ -121,6 +121,17 @@ def test_a_result_that_cannot_be_sent_is_a_failure_and_not_a_death(processes: Pr
     assert "a worker cannot send this value of class" in result.error
 
 
+def test_a_job_sent_only_in_part_costs_the_process_and_not_the_next_job(processes: ProcessRunner) -> None:
+    processes.submit("double", bytes(8 << 20))
+    (result,) = wait(processes)
+    assert result.outcome == "died"
+    assert "of the job's 8388" in result.error
+    deadline = time.monotonic() + 20.0
+    while not processes.submit("double", 4) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert wait(processes)[0].value == 8
+
+
 def test_a_failure_in_a_process_names_its_reason(processes: ProcessRunner) -> None:
     processes.submit("fail", 7)
     (result,) = wait(processes)
