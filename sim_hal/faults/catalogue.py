@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial, reduce
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -282,16 +282,23 @@ def _nanoseconds(given: Parameters) -> int:
 
 
 def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
-    """Return a fault that sets an attribute of a device, or of the cameras selected by `camera`."""
+    """Return the `begin` of a fault that sets an attribute of a device to `value` until it is removed.
+
+    The parameter `camera` of a fault selects one of the horizon cameras.
+    """
 
     def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
-        hardware = bench.hardware
+        hardware, power = bench.hardware, bench.hardware.power
         parts: dict[str, Sequence[object]] = {
             "monitor": (hardware.monitor,),
             "camera": (hardware.camera,),
             "gps": (hardware.orbit.gps,),
             "strings": (hardware.orbit.cells,),
             "wide": hardware.orbit.wide,
+            "battery": (power,),
+            "panels": (power,),
+            "battery-monitor": (power and power.rails[0],),
+            "bus-monitor": (power and power.rails[1],),
         }
         number = round(given.get("camera", 0.0))
         chosen = [part for index, part in enumerate(parts[fault.device], start=1) if number in {0, index}]
@@ -537,12 +544,8 @@ def _lossy_bus(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     )
 
 
-def _on_bus(name: str, *arguments: None) -> Begin:
-    """Return a function that begins a fault by calling the method `name` of the emulated bus."""
-    return lambda bench, *_: cast("Removal", getattr(bench.hardware.bus, name)(*arguments))
-
-
-_hanging_bus = _on_bus("hang", None)
+def _hanging_bus(bench: Bench, *_: object) -> Removal:
+    return bench.hardware.bus.hang(None)
 
 
 # Upsets.
@@ -659,21 +662,6 @@ def _dead(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     return hold(cells, "dead", dead, np.zeros(len(dead), dtype=bool))
 
 
-def _power_part(attribute: str, value: Callable[[Parameters], object], sound: object) -> Begin:
-    """Return a fault that sets an attribute of the power system or of one of its two monitors."""
-
-    def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
-        power = bench.hardware.power
-        if power is None:
-            return no_removal
-        part: object = power
-        if fault.device in _RAILS:
-            part = power.rails[_RAILS.index(fault.device)]
-        return hold(part, attribute, value(given), sound)
-
-    return begin
-
-
 def _monitor_off(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
     power = bench.hardware.power
     rail = None if power is None else power.rails[_RAILS.index(fault.device)]
@@ -710,6 +698,7 @@ def _worker_faults(device: str) -> tuple[FaultKind, ...]:
 
 
 _RAILS = ("battery-monitor", "bus-monitor")
+"""Monitors of the power system, in the order of `EmulatedPower.rails`."""
 _EACH_BIT = "each bit flips with this probability"
 _EACH_FIELD = f", {FIELD_BITS} to each of its fields"
 _LOW_AT_TIMES = "the clock line is held low intermittently"
@@ -758,11 +747,18 @@ _ALL = (
     ),
     _fault("monitor: wrong", "measured values are multiplied by gain", _multiplied, {"gain": _gain(2.0)}),
     _upset("monitor: upset", _upset_monitor, _MONITOR, 16),
-    _fault("bus: off", "no part acknowledges", _on_bus("nack", None, None), adds=True),
+    _fault(
+        "bus: off", "no part acknowledges", lambda bench, *_: bench.hardware.bus.nack(None, None), adds=True
+    ),
     _fault(
         "bus: nack", "no acknowledge, with this probability", _lossy_bus, {"chance": _chance(0.5)}, adds=True
     ),
-    _fault("bus: arbitration", "another master always wins", _on_bus("lose_arbitration", None), adds=True),
+    _fault(
+        "bus: arbitration",
+        "another master always wins",
+        lambda bench, *_: bench.hardware.bus.lose_arbitration(None),
+        adds=True,
+    ),
     _fault("bus: hang", "the clock line is held low", _hanging_bus, adds=True),
     _fault("bus: intermittent", _LOW_AT_TIMES, intermittently(_hanging_bus), _turns(), adds=True),
     *(fault for axis in COIL_NAMES for fault in _coil_faults(axis)),
@@ -798,26 +794,26 @@ _ALL = (
         for device in _RAILS
         for fault in (
             _fault(f"{device}: off", "no power: the chip does not acknowledge", _monitor_off),
-            _fault(f"{device}: stuck", "always the same values", _power_part("stuck", lambda _: True, False)),
+            _fault(f"{device}: stuck", "always the same values", _held("stuck", lambda *_: True, False)),
             _fault(
                 f"{device}: wrong",
                 "measured values are multiplied by gain",
-                _power_part("gain", lambda given: given["gain"], 1.0),
+                _multiplied,
                 {"gain": _gain(0.5)},
             ),
         )
     ),
-    _fault("battery: cell-lost", "a cell gives no voltage", _power_part("cells_lost", lambda _: 1, 0)),
+    _fault("battery: cell-lost", "a cell gives no voltage", _held("cells_lost", lambda *_: 1, 0)),
     _fault(
         "battery: weak",
         "the capacity is divided by factor, the resistance is multiplied",
-        _power_part("weakness", lambda given: given["factor"], 1.0),
+        _held("weakness", lambda _, given: given["factor"], 1.0),
         {"factor": Parameter(4.0, 1.0, 100.0)},
     ),
     _fault(
         "panels: lost",
         "this panel gives no power; 0: all panels",
-        _power_part("lost_panel", lambda given: round(given["panel"]), None),
+        _held("lost_panel", lambda _, given: round(given["panel"]), None),
         {"panel": _count(1.0, 0.0, 32.0)},
     ),
     *_worker_faults("planner"),
