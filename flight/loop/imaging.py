@@ -73,6 +73,7 @@ _LEAST_PRIOR_SIGMA = 5e-4
 _COURSE_NODES = 17
 """Number of equally spaced times in an exposure at which the body rate is sampled."""
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
+"""Rate (3,) and covariance (3, 3) of a frame without a rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +253,6 @@ _NAMED_ELSEWHERE = {
     StreakStatus.FROZEN,
 }
 """Streak results that are not reported, because the body is at rest or another event is reported."""
-_NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
 class FrameReport:
@@ -296,8 +296,8 @@ class FrameReport:
         if accepted is False:
             text = f"frame {frame.sequence}: {len(solution.matched)} stars"
             self._events.report(events.STARS_REFUSED, now_ns, text)
-        quaternion = _NAN4 if attitude is None else attitude.quaternion
-        covariance = _NAN33 if attitude is None else attitude.covariance
+        quaternion = np.full(4, np.nan) if attitude is None else attitude.quaternion
+        covariance = _NAN[1] if attitude is None else attitude.covariance
         self._recorder.record(
             STARS,
             now_ns,
@@ -373,8 +373,9 @@ def _packed(c: FloatArray) -> list[float]:
 
 
 _ROWS = 32
+"""Number of image rows of which a checksum is stored."""
 _FRAMES = 4
-"""Number of frame buffers of a camera driver."""
+"""Number of frame buffers of a camera driver, any of which may contain old rows."""
 _LEAST_CHANGES = 0.125
 """Minimum fraction of pixels that differ from the next pixel, in an image row that contains noise."""
 
@@ -385,7 +386,7 @@ class RepeatedRows:
     def __init__(self) -> None:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
-    def look(self, pixels: Image) -> int:
+    def count(self, pixels: Image) -> int:
         """Return how many sampled rows are copies from earlier frames, or 0 if all of them are copies."""
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
         sampled = np.ascontiguousarray(pixels[rows])
@@ -397,6 +398,7 @@ class RepeatedRows:
 
 
 _UNKNOWN = [math.nan] * 3
+"""Recorded position (m) and velocity (m/s) of a body without an estimated orbit."""
 _STEP_PX = 2.0
 """Standard deviation (px) of the predicted rotation of the camera from one frame to the next."""
 
@@ -694,18 +696,17 @@ class Imaging:
             frame = self._camera.poll()
         except DeviceError as error:
             self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
-        age_ns = now_ns - self._last_frame_ns
+        if frame is not None and frame.sequence <= self._last_sequence:
+            text = f"frame {frame.sequence} was delivered again"
+            self._events.report(events.CAMERA_FROZEN, now_ns, text)
+            self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
+            frame = None  # a repeated frame does not count as a new frame
         if frame is None:
+            age_ns = now_ns - self._last_frame_ns
             if self._due_ns is not None and now_ns > self._due_ns:
                 self._facts.update(facts.CAMERA_LATE, True, now_ns, "no frame yet after its trigger")
             if age_ns > self._settings.max_age_ns:
                 self._facts.update(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
-            return
-        if frame.sequence <= self._last_sequence:
-            # A repeated frame does not count as a new frame.
-            text = f"frame {frame.sequence} was delivered again"
-            self._events.report(events.CAMERA_FROZEN, now_ns, text)
-            self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
         self._due_ns = None
         # The age of a frame is measured from the end of its exposure, not from its arrival.
@@ -717,13 +718,11 @@ class Imaging:
         self._facts.update(facts.CAMERA_LATE, age_ns > self._settings.late_ns, now_ns, text)
         if not late:
             self._streams.note("camera", now_ns)
-        old = self._rows.look(frame.pixels)
-        if old:
-            text = f"frame {frame.sequence}: {old} sampled rows are copies from an earlier frame"
-            self._events.report(events.CAMERA_TORN, now_ns, text)
         self._frames += 1
         self._last_sequence = frame.sequence
-        if old:
+        if old := self._rows.count(frame.pixels):
+            text = f"frame {frame.sequence}: {old} sampled rows are copies from an earlier frame"
+            self._events.report(events.CAMERA_TORN, now_ns, text)
             self._report.record(frame, StreakStatus.FAILED.value, None, now_ns, False)
         elif self._jobs.submit(WORKER, self._job(frame)):
             self._frame = frame

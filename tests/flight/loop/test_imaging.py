@@ -29,23 +29,25 @@ def exposed(noise: float = 10.0, dtype: str = "uint16") -> Image:
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_frames_of_a_living_camera_are_of_one_piece(dtype: str) -> None:
     rows = RepeatedRows()
-    assert [rows.look(exposed(dtype=dtype)) for _ in range(50)] == [0] * 50
+    assert [rows.count(exposed(dtype=dtype)) for _ in range(50)] == [0] * 50
 
 
 @pytest.mark.parametrize("at", [10, 120, 235])
 def test_a_frame_with_the_rows_of_an_earlier_one_is_torn(at: int) -> None:
     rows = RepeatedRows()
     before, between, now = exposed(), exposed(), exposed()
-    rows.look(before)
-    rows.look(between)
-    assert rows.look(np.concatenate([now[:at], before[at:]])) == pytest.approx(32 * (240 - at) / 240, abs=1.5)
-    assert rows.look(exposed()) == 0
+    rows.count(before)
+    rows.count(between)
+    assert rows.count(np.concatenate([now[:at], before[at:]])) == pytest.approx(
+        32 * (240 - at) / 240, abs=1.5
+    )
+    assert rows.count(exposed()) == 0
 
 
 def test_the_same_frame_again_is_not_torn_but_frozen() -> None:
     rows, frame = RepeatedRows(), exposed()
-    rows.look(frame)
-    assert rows.look(frame) == 0
+    rows.count(frame)
+    assert rows.count(frame) == 0
 
 
 def test_rows_without_noise_say_nothing() -> None:
@@ -58,7 +60,7 @@ def test_rows_without_noise_say_nothing() -> None:
         frame = np.zeros((240, 320), dtype=np.uint8)
         frame[:, 40] = 255
         frame[200, 100 + number] = 60
-        assert rows.look(frame) == 0
+        assert rows.count(frame) == 0
 
 
 @pytest.mark.parametrize(

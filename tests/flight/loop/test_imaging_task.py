@@ -351,6 +351,15 @@ def test_a_repeated_frame_is_frozen_and_does_not_count() -> None:
     assert np.isnan([values["length"], values["residual"], *values["rate"], *values["covariance"]]).all()
 
 
+def test_a_repeated_frame_does_not_hide_that_no_new_frame_arrives() -> None:
+    bench = Bench()
+    bench.take(5, 1 * S, 1300 * MS)
+    bench.take(5, 1 * S, 31_200 * MS)
+    assert bench.facts[facts.CAMERA_LOST] == [False]
+    bench.take(5, 1 * S, 31_200 * MS + 1)
+    assert bench.facts[facts.CAMERA_LOST] == [False, True]
+
+
 def test_a_torn_frame_is_counted_but_not_processed() -> None:
     bench = Bench()
     before, between, now = frame(1, 1 * S), frame(2, 2 * S), frame(3, 3 * S)
