@@ -9,9 +9,11 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from knightcube.vision.startracker.index import build
 from sim_hal.faults.host import corrupted
@@ -251,6 +253,15 @@ def test_a_lock_has_all_requirements_each_with_hashes(lock: Path) -> None:
     assert names <= _pins(lock).keys(), "run `make lock`"
     blocks = re.split(r"^(?=\S)", lock.read_text(encoding="utf-8"), flags=re.M)
     assert all("--hash=sha256:" in block for block in blocks if "==" in block)
+
+
+def test_the_locked_packages_can_be_installed_with_each_supported_python() -> None:
+    installed = {re.sub(r"[-_.]+", "-", d.name).lower(): d for d in metadata.distributions()}
+    for name, version in _pins(ROOT / "requirements-test.lock").items():
+        assert installed[name].version == version
+        supported = SpecifierSet(installed[name].metadata["Requires-Python"] or "")
+        for python in ("3.11.0", "3.11.2", "3.12.0", "3.13.0"):  # the second one is that of Debian 12
+            assert python in supported, f"{name} {version}"
 
 
 def test_board_and_demonstration_have_the_versions_that_the_tests_have() -> None:
