@@ -56,6 +56,7 @@ from knightcube.gnc.estimation.estimate import (
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 from knightcube.gnc.estimation.free_filter import (
     CAMERA,
+    COIL_ERROR,
     COILS,
     DIPOLE,
     FIELD_MATRIX,
@@ -416,7 +417,7 @@ class StepReplay:
             # A coil that is driven only during a part of the step does not change the rate uniformly.
             change = self._rate_change(step, since, step.impulse - free.impulse(since))
             noise = settings.gyro_noise**2 / step.samples
-            spread = settings.free.coil_error**2 * float(change @ change) + noise
+            spread = COIL_ERROR**2 * float(change @ change) + noise
             refused = not free.gyro(step.gyro, spread * _EYE, change, since)
             self._innovation = "coils and body" if step.dipole.any() else "body", free.newest_square
         self.refused_gyros = self.refused_gyros + 1 if refused else 0

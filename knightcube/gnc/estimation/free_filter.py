@@ -205,24 +205,13 @@ class FreeFilterSettings:
             (`dipole`), and of its increase in sunlight (`sunlit`), A m^2.
         magnet: initial standard deviation and random walk of the magnetometer bias, T.
         field: initial standard deviation of the field model's error, T per axis.
-        field_memory: correlation time of the field model's error, s.
         torque: expected magnitude and random walk of the aerodynamic torque, N m. The expected magnitudes of
             the solar radiation torque and of the constant torque are fixed fractions of `torque`.
-        torque_noise: density of the white noise of all other torques, N m sqrt(s).
-        coil_error: relative standard deviation of each coil's dipole, which varies over tens of seconds.
         coil_noise: density of the white noise of each coil's dipole while it is driven, A m^2 sqrt(s).
-        coil_walk: random walk per sqrt(s) of the elements of the coils' matrix, for example due to
-            temperature.
-        inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
-            rate in rad/s. The random walk represents flexible parts, which are loaded only while the body
-            rotates, and prevents the uncertainty of the inertia from becoming too small.
         errors: largest errors of the description of body and sensors.
         coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; for coils
             along the body axes None, because their covariance follows from `errors`.
         roles: roles of the blocks whose role differs from the default, by name of the block.
-        rate_start: initial standard deviation of the rate, rad/s.
-        fine, coarse: largest standard deviation, rad, of an attitude of the accuracy class FINE and COARSE,
-            about the least certain axis.
         gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
             probable than a one-dimensional deviation of this size.
     """
@@ -232,19 +221,11 @@ class FreeFilterSettings:
     sunlit: tuple[float, float] = (3e-4, 2e-7)
     magnet: tuple[float, float] = (3e-7, 3e-10)
     field: float = 5e-8
-    field_memory: float = 600.0
     torque: tuple[float, float] = (3e-9, 5e-12)
-    torque_noise: float = 1e-9
-    coil_error: float = 0.005
     coil_noise: float = 0.0
-    coil_walk: float = 1e-4
-    inertia_walk: float = 5e-5
     errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
     coils: FloatArray | None = None
     roles: Mapping[str, Role] = dataclasses.field(default_factory=dict)
-    rate_start: float = 1e-3
-    fine: float = math.radians(0.1)
-    coarse: float = math.radians(5.0)
     gate_sigma: float = 5.0
 
     def error_state(self, inertia: FloatArray) -> ErrorState:
@@ -264,13 +245,13 @@ class FreeFilterSettings:
             StateBlock("field_bias", self.magnet[0] * ones, self.magnet[1]),
             StateBlock("torques", torques, walk),
             StateBlock("inertia", inertia_covariance(inertia, errors)),
-            StateBlock("coils", coils, self.coil_walk),
+            StateBlock("coils", coils, COIL_WALK),
             StateBlock("gyro_matrix", _matrix_errors(errors.gyro_scale, errors.gyro_alignment)),
             StateBlock("field_matrix", _matrix_errors(errors.field_matrix, errors.field_matrix)),
             StateBlock("camera", _UNIFORM * errors.camera * ones),
             StateBlock("horizon", _UNIFORM * errors.horizon * ones),
             StateBlock("field_error", self.field * ones),
-            StateBlock("coil_variation", self.coil_error * ones),
+            StateBlock("coil_variation", COIL_ERROR * ones),
             StateBlock("sun_camera", _UNIFORM * errors.horizon * ones),
         ]
         return ErrorState(with_role(blocks, self.roles))
@@ -287,12 +268,26 @@ def _matrix_errors(scale: float, alignment: float) -> FloatArray:
 
 LARGEST_ROTATION = 0.1
 """Largest rotation (rad) of the body in one integration step."""
+FINE, COARSE = math.radians(0.1), math.radians(5.0)
+"""Largest standard deviations (rad), about the least certain axis, of an attitude of the two classes."""
+RATE_START = 1e-3
+"""Initial standard deviation (rad/s) of a rate that the gyro measured."""
+TORQUE_NOISE = 1e-9
+"""Density (N m sqrt(s)) of the white noise of all torques that are not estimated."""
+FIELD_MEMORY = 600.0
+"""Correlation time (s) of the field model's error."""
 FIELD_LEARNED = 2_000.0
 """Averaging time (s) of the estimated variance of the field model's error."""
 HORIZON_MEMORY = 3_000.0
 """Correlation time (s) of the misalignment of the horizon cameras."""
-COIL_MEMORY = 20.0
-"""Correlation time (s) of the variation of the coils' dipoles."""
+COIL_ERROR, COIL_MEMORY = 0.005, 20.0
+"""Relative standard deviation and correlation time (s) of the variation of the coils' dipoles."""
+COIL_WALK = 1e-4
+"""Random walk per sqrt(s) of the elements of the coils' matrix, for example due to temperature."""
+INERTIA_WALK = 5e-5
+"""Random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular rate in rad/s. The
+random walk represents flexible parts, which are loaded only while the body rotates, and prevents the
+uncertainty of the inertia from becoming too small."""
 MINIMUM_FIELD_ERROR = 1e-8
 """Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
 of the magnetometer's errors."""
@@ -343,8 +338,9 @@ class FreeFilter:
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
         sun_cameras: bit mask of the cameras that measured the Sun most recently; 0 before the first.
-        changes: number of changes of the estimate until now. refused: number of measurements that did not
-            pass the gate. newest_square: normalised square of the newest innovation.
+        changes: number of changes of the estimate until now.
+        refused: number of measurements that did not pass the gate.
+        newest_square: normalised square of the newest innovation.
     """
 
     def __init__(
@@ -409,7 +405,7 @@ class FreeFilter:
         first[ATTITUDE, misaligned] = -_EYE
         self.rate = gyro
         alone = np.zeros((6, 6))
-        alone[ATTITUDE, ATTITUDE], alone[RATE, RATE] = covariance, self._settings.rate_start**2 * _EYE
+        alone[ATTITUDE, ATTITUDE], alone[RATE, RATE] = covariance, RATE_START**2 * _EYE
         if spread is None:
             measured = gyro - self._constants[GYRO]
             self.rate = np.asarray(np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), measured), dtype=float)
@@ -423,9 +419,9 @@ class FreeFilter:
     @property
     def knowledge(self) -> Knowledge:
         """Accuracy class of the attitude."""
-        if not self.started or (sigma := self.worst_sigma) > self._settings.coarse:
+        if not self.started or (sigma := self.worst_sigma) > COARSE:
             return Knowledge.LOST
-        return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
+        return Knowledge.FINE if sigma <= FINE else Knowledge.COARSE
 
     @property
     def worst_sigma(self) -> float:
@@ -445,10 +441,16 @@ class FreeFilter:
 
     def memory(self) -> FreeMemory:
         """Return a copy of the estimate, for `recall`."""
-        constants, covariance = self._constants.copy(), self.covariance.copy()
-        rates = self.rate, self.acceleration
-        others = self.field_error, self.sun_cameras
-        return FreeMemory(self.quaternion, *rates, self.driven, constants, covariance, *others)
+        return FreeMemory(
+            self.quaternion,
+            self.rate,
+            self.acceleration,
+            self.driven,
+            self._constants.copy(),
+            self.covariance.copy(),
+            self.field_error,
+            self.sun_cameras,
+        )
 
     def recall(self, then: FreeMemory) -> None:
         """Restore an earlier estimate from its copy `then`."""
@@ -718,11 +720,11 @@ class FreeFilter:
         The estimated standard deviation is at least `least` (T per axis).
         """
         covariance, error = self.covariance, self._constants[FIELD]
-        if self.worst_sigma <= self._settings.fine:
+        if self.worst_sigma <= FINE:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
             variance = self.field_error**2 + dt / FIELD_LEARNED * (square - self.field_error**2)
             self.field_error = max(math.sqrt(variance), MINIMUM_FIELD_ERROR)
-        self._decay(FIELD, dt / self._settings.field_memory, max(self.field_error, least) ** 2 * _EYE)
+        self._decay(FIELD, dt / FIELD_MEMORY, max(self.field_error, least) ** 2 * _EYE)
 
     def _decay(self, at: slice, part: float, prior: FloatArray) -> None:
         """Propagate a Gauss-Markov process of covariance `prior` (3, 3) by `part` of its correlation time."""
@@ -765,7 +767,7 @@ class FreeFilter:
         self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
         self.covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
         if self.layout.prior[INERTIA, INERTIA].any():
-            flexed = self._settings.inertia_walk**2 * float(rate @ rate)
+            flexed = INERTIA_WALK**2 * float(rate @ rate)
             self.covariance.reshape(-1)[_INERTIA_DIAGONAL] += dt * flexed
         self._propagate_field_error(dt, around.field_sigma)
         self._decay(HORIZON, dt / HORIZON_MEMORY, self.layout.prior[HORIZON, HORIZON])
@@ -798,10 +800,10 @@ class FreeFilter:
         computed for the estimate `then` and the equation of motion `motion`, by default for the present
         estimate and equation.
         """
-        settings, motion, square = self._settings, motion or self.motion, float(dipole @ dipole)
+        motion, square = motion or self.motion, float(dipole @ dipole)
         at = then or self
-        coils = LASTING * doubt**2 + (settings.coil_noise**2 if square else 0.0)
-        density = settings.torque_noise**2 * motion.by_torque
+        coils = LASTING * doubt**2 + (self._settings.coil_noise**2 if square else 0.0)
+        density = TORQUE_NOISE**2 * motion.by_torque
         if coils:
             field = attitude_matrix(at.quaternion) @ around.field
             across = motion.inverse @ cross_matrix(field) @ self.coil_matrix

@@ -21,6 +21,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_filter import (
     ATTITUDE,
+    FIELD_MEMORY,
     MINIMUM_FIELD_ERROR,
     FilterEnvironment,
     FreeFilter,
@@ -44,7 +45,7 @@ class Sky:
         self.filter.start(IDENTITY, STAR**2 * np.eye(3), np.zeros(3))
 
     def fly(self, seconds: float, *, stars: bool) -> None:
-        kept = math.exp(-STEP / SETTINGS.field_memory)
+        kept = math.exp(-STEP / FIELD_MEMORY)
         for k in range(round(seconds / STEP)):
             self.time += STEP
             turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * self.time, 0.0])))
