@@ -57,7 +57,7 @@ from knightcube.gnc.estimation.mekf import (
     PropagationModel,
     Replay,
 )
-from knightcube.gnc.estimation.rigid_body import LONGEST_STEP, ProcessNoise, RigidBody
+from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody
 
 _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
 """Largest accepted mean innovation of the gyro, in standard deviations, by the number of averaged samples. A
@@ -239,7 +239,6 @@ class FilterSettings:
         gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
             probable than a one-dimensional deviation of this size.
         history_ns: largest delay of a measurement that is still used, ns.
-        longest_step: longest propagation step, s; longer steps are suitable for a slowly rotating body.
     """
 
     current_noise: float
@@ -259,7 +258,6 @@ class FilterSettings:
     unknown_current: float = 0.0
     gate_sigma: float
     history_ns: int
-    longest_step: float = LONGEST_STEP
 
 
 def free_axes(body: RigidBody) -> FloatArray:
@@ -379,7 +377,7 @@ class AttitudeFilter:
         self._commands = CommandHistory(body, settings.history_ns)
         self._layout = error_state(body, settings, self._prior)
         noise, gates = process_noise(body, settings, self._layout), gate_bounds(settings.gate_sigma)
-        self._model = PropagationModel(body, noise, self._commands, settings.longest_step, gates)
+        self._model = PropagationModel(body, noise, self._commands, gates)
         self._check = CommandCheck(self._model)
         self._history = CheckpointHistory(settings.history_ns)
         self._branch: _Branch | None = None

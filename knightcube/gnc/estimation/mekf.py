@@ -29,6 +29,7 @@ import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -348,17 +349,14 @@ def _corrected_about_thread_numpy(
 ) -> _Corrected:
     """Return the result of `_corrected` for an innovation about the thread.
 
-    The innovation `value` of an angle or a rate, which changes with `speed`, has the variance `variance`.
+    The innovation `value` of an angle or a rate, which changes with `speed`, has the variance `variance`. The
+    states 1, 4 and 7 are the angle, the rate and the gyro bias about the thread.
     """
     rows = np.zeros((1, len(covariance)))
-    rows[0, _RATE_AND_BIAS if is_rate else 1] = 1.0
+    rows[0, [4, 7] if is_rate else 1] = 1.0
     rows[0, LATENCY] = -speed
     values, noise = np.array((value,)), np.array(((variance,),))
     return _corrected_numpy(covariance, values, rows, noise, gate, rate_gate, considers_age)
-
-
-_RATE_AND_BIAS = [4, 7]
-"""Indices of the rate and of the gyro bias about the thread."""
 
 
 @compiled_form_of(_corrected_about_thread_numpy)
@@ -372,7 +370,7 @@ def _corrected_about_thread(
     rate_gate: float,
     considers_age: bool,
 ) -> _Corrected:
-    """See `_corrected_about_thread_numpy`. The states 1, 4 and 7 are the angle, the rate and the bias."""
+    """See `_corrected_about_thread_numpy`."""
     rows, values, noise = np.zeros((1, len(covariance))), np.empty(1), np.empty((1, 1))
     values[0], noise[0, 0] = value, variance
     if is_rate:
@@ -496,6 +494,10 @@ def release_attitude(
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
 
 
+_EVER_NS = -(1 << 63)
+"""Time (ns) before all measurements, from which the oldest stored command applies."""
+
+
 class CommandHistory:
     """The recent coil commands in order of time.
 
@@ -506,55 +508,45 @@ class CommandHistory:
         self._body = body
         self.idle = body.torquing(np.zeros(3))
         self._history_ns = history_ns
-        self._times: list[int] = []
-        self._torquings: list[Torquing] = []
-
-    def __len__(self) -> int:
-        return len(self._times)
+        self._times, self._torquings = [_EVER_NS], [self.idle]
 
     def record(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True
     ) -> None:
         """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes."""
         torquing = self._body.torquing(currents, field, known)
-        if self._torquings and self._torquings[-1] == torquing:
+        if self._torquings[-1] == torquing:
             return
         self._times.append(time_ns)
         self._torquings.append(torquing)
         oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
         if oldest > 64:  # commands are deleted in batches, not in each cycle
             del self._times[:oldest], self._torquings[:oldest]
+            self._times[0] = _EVER_NS
 
     def mark_unknown(self, since_ns: int) -> None:
         """Treat the coil currents since `since_ns` as unknown."""
         first = bisect.bisect_left(self._times, since_ns)
-        if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
+        if first == len(self._times) or self._times[first] > since_ns:
             self._torquings.insert(first, self.at(since_ns))
             self._times.insert(first, since_ns)
         self._torquings[first:] = [torquing._replace(known=False) for torquing in self._torquings[first:]]
 
     def at(self, time_ns: int) -> Torquing:
         """Return the coils' dipole and field at a time, as `Torquing`."""
-        index = max(bisect.bisect_right(self._times, time_ns) - 1, 0)
-        return self._torquings[index] if self._torquings else self.idle
+        return self._torquings[bisect.bisect_right(self._times, time_ns) - 1]
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
         """Yield each coil command between two times, and the command's duration (ns), in order of time."""
         if to_ns <= from_ns:
             return
-        if not self._times or self._times[-1] <= from_ns:  # no search is needed
-            yield self._torquings[-1] if self._torquings else self.idle, to_ns - from_ns
-            return
-        time_ns = from_ns
-        index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
-        while time_ns < to_ns:
-            torquing = self._torquings[index]
-            more = index + 1 < len(self._torquings)
-            until_ns = min(to_ns, self._times[index + 1]) if more else to_ns
-            if until_ns > time_ns:
-                yield torquing, until_ns - time_ns
-                time_ns = until_ns
-            index += more
+        first, last = bisect.bisect_right(self._times, from_ns), bisect.bisect_left(self._times, to_ns)
+        bounds = [from_ns, *self._times[first:last], to_ns]
+        for torquing, (begin_ns, end_ns) in zip(
+            self._torquings[first - 1 : last], pairwise(bounds), strict=True
+        ):
+            if begin_ns < end_ns:
+                yield torquing, end_ns - begin_ns
 
 
 _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
@@ -599,7 +591,7 @@ class _Step(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PropagationModel:
-    """The model that propagates a state: body, process noise, coil commands, longest step (s) and gate.
+    """The model that propagates a state: body, process noise, coil commands and gate.
 
     The mapping `gate` assigns the threshold of the normalised squared innovation to each number of measured
     components. The last steps are stored, because the propagation to the next measurement often repeats a
@@ -609,7 +601,6 @@ class PropagationModel:
     body: RigidBody
     noise: ProcessNoise
     commands: CommandHistory
-    longest_step: float
     gate: Mapping[int, float]
     _steps: deque[_Step] = field(default_factory=lambda: deque(maxlen=2), compare=False)
 
@@ -628,9 +619,7 @@ class PropagationModel:
                     state, covariance = step.result
                     break
             else:
-                result = propagate(
-                    self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
-                )
+                result = propagate(self.body, self.noise, state, covariance, torquing, span_ns * 1e-9)
                 self._steps.append(_Step(state, covariance, torquing, span_ns, result))
                 state, covariance = result
         return state, covariance
@@ -788,9 +777,9 @@ class CheckpointHistory:
         """
         first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
         last = bisect.bisect_left(self._checkpoints, end_ns, key=_TIME)
-        spanning = self._checkpoints[first - 1 : last + 1]
         if not first:
             return None
+        spanning = self._checkpoints[first - 1 : last + 1]
         return np.array([c.time_ns for c in spanning]), np.array([c.state.rate for c in spanning])
 
     def index_before(self, begin_ns: int) -> int:

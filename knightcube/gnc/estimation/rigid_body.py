@@ -118,7 +118,6 @@ class RigidBody:
     suspended: bool = False
     stiffness: float = 0.0
     damping: float = 0.0
-    response: FloatArray = dataclasses.field(init=False)
     constants: BodyConstants = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
@@ -139,7 +138,6 @@ class RigidBody:
         response = np.linalg.inv(inertia)
         if self.suspended:
             response = np.diag([0.0, 1.0 / inertia[1, 1], 0.0])
-        object.__setattr__(self, "response", response)
         constants = rows_of(inertia), rows_of(response), float(self.dipole_per_ampere), bool(self.suspended)
         object.__setattr__(self, "constants", constants)
 
@@ -259,7 +257,7 @@ def _linearised(
 
 
 LONGEST_STEP = 0.025
-"""Default of the longest propagation step (s), equal to the control period of the testbed."""
+"""Longest propagation step (s), equal to the control period of the testbed."""
 _UNKNOWN_FOR = 0.3
 """Correlation time (s) of an unknown coil current, which gives the spectral density of an equivalent white
 noise. The correlation time exceeds the delay after which the guardian switches off the coils of a hung
@@ -288,10 +286,9 @@ def propagate(
     covariance: FloatArray,
     torquing: Torquing,
     duration: float,
-    longest_step: float = LONGEST_STEP,
 ) -> tuple[FilterState, FloatArray]:
-    """Propagate over `duration` s under one coil command, in steps of at most `longest_step` s."""
-    steps = 1 if duration <= longest_step else math.ceil(duration / longest_step - 1e-9)
+    """Propagate over `duration` s under one coil command, in steps of at most `LONGEST_STEP` s."""
+    steps = 1 if duration <= LONGEST_STEP else math.ceil(duration / LONGEST_STEP - 1e-9)
     steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
     x, y, z = torquing.driven
     quaternion, rate, covariance = _propagated(
@@ -486,24 +483,15 @@ def _rate_change_numpy(
 ) -> tuple[Vector, FloatArray]:
     """Return the elements of `RateChange`. The arguments are those of `rate_change` as tuples."""
     before, by_before = _accelerated(body, quaternion, rate, parameters, dipole, field)
-    after, by_after = before, by_before
-    if (later_dipole, later_field) != (dipole, field):
-        after, by_after = _accelerated(body, quaternion, rate, parameters, later_dipole, later_field)
+    after, by_after = _accelerated(body, quaternion, rate, parameters, later_dipole, later_field)
     x, y, z = (0.5 * (a + b) + d for a, b, d in zip(before, after, disturbance, strict=True))
-    rows = _BY_ACCELERATIONS.copy()
-    rows[:, 3:] = by_before
-    if after is not before:
-        rows[:, 3:] = 0.5 * (rows[:, 3:] + by_after)
-    spread = rows.dot(covariance[_ACCELERATIONS, _ACCELERATIONS]).dot(rows.T)
-    if after is not before:
-        bend = 0.5 * (np.array(after) - before)
-        spread += bend[:, np.newaxis] * bend
-    spread *= covariance[LATENCY, LATENCY]
-    return (x, y, z), spread
+    rows = np.hstack([np.eye(3), 0.5 * (np.array(by_before) + by_after)])
+    bend = 0.5 * (np.array(after) - before)
+    spread = rows @ covariance[_ACCELERATIONS, _ACCELERATIONS] @ rows.T + np.outer(bend, bend)
+    return (x, y, z), covariance[LATENCY, LATENCY] * spread
 
 
 _ACCELERATIONS = slice(DISTURBANCE.start, PARAMETERS.stop)
-_BY_ACCELERATIONS: FloatArray = np.eye(3, 6)
 
 
 @compiled_form_of(_rate_change_numpy)

@@ -142,6 +142,14 @@ def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:
     assert not any(history.at(t).known for t in (2_500_000_000, 3_000_000_000, 9_000_000_000))
 
 
+def test_before_the_first_command_no_coil_is_driven() -> None:
+    second, history = 1_000_000_000, CommandHistory(SUSPENDED, 6_000_000_000)
+    history.record(second, np.array([0.01, 0.0, 0.0]), None)
+    driven = history.at(second)
+    assert history.at(0) == history.idle != driven
+    assert list(history.spans(0, 3 * second)) == [(history.idle, second), (driven, 2 * second)]
+
+
 def test_a_doubt_before_anything_was_noted_or_measured_does_nothing() -> None:
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
     filter_.mark_unknown(0)
