@@ -40,7 +40,13 @@ BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"
 faster."""
 GAPS = str.maketrans('#"_', "   ")
 
-TEXT_TOKENS = (tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING))
+PARTS = ("FSTRING_START", "FSTRING_MIDDLE", "FSTRING_END")
+"""Tokens of a formatted string, which is one token in Python 3.11."""
+TEXT_TOKENS = (
+    tokenize.STRING,
+    tokenize.COMMENT,
+    *(getattr(tokenize, name, tokenize.STRING) for name in PARTS),
+)
 
 
 def _masked(code: str) -> str:
