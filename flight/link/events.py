@@ -410,7 +410,7 @@ LEARNED_REFUSED = _warn(
     68,
     "learned-refused",
     "implausible or contradicted learned values were rejected",
-    "none: the configured values are used; the text names the value",
+    "none: the values are estimated again; if it repeats, look for a payload whose dipole changes",
 )
 UNCLEAN_SHUTDOWN = _warn(
     64,

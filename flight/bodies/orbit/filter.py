@@ -217,7 +217,7 @@ class StepReplay:
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
         # The states that the newest gyro innovation tests, and the normalised square of the innovation.
-        self._innovation = "body", 0.0
+        self._innovation = states.BODY_NAMES, 0.0
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
@@ -234,7 +234,7 @@ class StepReplay:
         """Estimate learned states again if the gyro samples up to `time` (s) consistently contradict them."""
         name, square = self._innovation
         if self._checks[name].add(time, square):
-            self.contradictions.append(f"the motion contradicts the learned {name}, which are learned again")
+            self.contradictions.append(f"the motion contradicts the estimated {name}: estimated again")
             self.free.widen(states.LEARNED[name], self._memories, drop=True)
             self.take_again(0)
 
@@ -419,7 +419,8 @@ class StepReplay:
             noise = settings.gyro_noise**2 / step.samples
             spread = COIL_ERROR**2 * float(change @ change) + noise
             refused = not free.gyro(step.gyro, spread * _EYE, change, since)
-            self._innovation = "coils and body" if step.dipole.any() else "body", free.newest_square
+            tested = states.ALL_NAMES if step.dipole.any() else states.BODY_NAMES
+            self._innovation = tested, free.newest_square
         self.refused_gyros = self.refused_gyros + 1 if refused else 0
         if step.field is not None:
             ago = (step.end_ns - step.field_ns) / SECOND_NS

@@ -839,12 +839,13 @@ class FreeFilter:
 
 
 BODY: IntArray = np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA]
-LEARNED = {"body": BODY, "coils and body": np.r_[BODY, COILS]}
-"""Indices of the estimated states that the motion can contradict: the entry `body` applies without coil
-currents, and the entry `coils and body` with coil currents."""
+BODY_NAMES, ALL_NAMES = "inertia, dipole and torques", "coils, inertia, dipole and torques"
+LEARNED = {BODY_NAMES: BODY, ALL_NAMES: np.r_[BODY, COILS]}
+"""Indices of the estimated states that the motion can contradict, by their names: without coil currents the
+states of the body (`BODY_NAMES`), and with coil currents also those of the coils (`ALL_NAMES`)."""
 # Inertia, dipoles and torques have a common scale: doubling all these states does not change the motion.
 _SCALED: FloatArray = np.zeros(STATES)
-_SCALED[LEARNED["coils and body"]] = 1.0
+_SCALED[LEARNED[ALL_NAMES]] = 1.0
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
 _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
 

@@ -326,6 +326,7 @@ def test_the_motion_replaces_wrong_learned_values_after_a_minute_and_healthy_one
         flown.fly(5.0)
         flown.see(52 * PERIOD_NS)
     assert len(flown.filter.contradictions) == wrong
+    assert all("inertia, dipole and torques" in text for text in flown.filter.contradictions)
     slow = flown.filter.slow
     for index, (_, sigma) in stored.items():
         at = index - SLOW.start

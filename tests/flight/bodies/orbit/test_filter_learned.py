@@ -160,5 +160,5 @@ def test_learned_values_that_the_motion_contradicts_are_reported_once() -> None:
     output = SimpleNamespace(cycle=SimpleNamespace(start_ns=5, slot=1), estimate=None, mode=Mode.POINT)
     for _ in range(3):
         view.record_cycle(cast(Any, output))
-        found.contradictions[:] = ["the motion contradicts the learned body"]
-    assert reported == [(events.LEARNED_REFUSED, "the motion contradicts the learned body")]
+        found.contradictions[:] = ["the motion contradicts the estimated inertia"]
+    assert reported == [(events.LEARNED_REFUSED, "the motion contradicts the estimated inertia")]
