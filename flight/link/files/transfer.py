@@ -54,6 +54,7 @@ MODULAR, CRC32C, CRC32, NO_CHECKSUM = 0, 2, 3, 15
 TYPES = (MODULAR, CRC32C, CRC32, NO_CHECKSUM)
 """Supported checksum types (SANA registry of CFDP checksum identifiers)."""
 _PORTION = 1 << 20
+"""Number of bytes of a file that one step of its checksum processes."""
 
 
 class FileSum:
@@ -155,7 +156,9 @@ class Ranges:
 
 
 _SOON = 4
+"""Number of retries from which the period of a timer doubles."""
 _LONGEST_NS = 60_000_000_000
+"""Longest period (ns) of a timer, unless its first period is longer."""
 
 
 class Timer:
@@ -175,18 +178,19 @@ class Timer:
         longer = self._period_ns << max(0, min(self.times - _SOON + 1, 16))
         return now_ns - self._since_ns >= min(max(self._period_ns, _LONGEST_NS), longer)
 
-    def asked(self, now_ns: int) -> None:
+    def retried(self, now_ns: int) -> None:
         """Count a retry and restart the period."""
         self._since_ns = now_ns
         self.times += 1
 
-    def heard(self, now_ns: int) -> None:
+    def reset(self, now_ns: int) -> None:
         """Reset the timer because a PDU was received from the other end."""
         self._since_ns = now_ns
         self.times = 0
 
 
 ASK_NS = 5_000_000_000
+"""Period (ns) after which an unacknowledged EOF is repeated."""
 _EOF_TRIES = 20
 """Maximum number of unacknowledged EOF PDUs that a sender sends for a cancelled transfer."""
 
@@ -236,7 +240,7 @@ class Sender:
         """Number of bytes that were sent and are not requested again."""
         return self.record.size - self._wanted.total
 
-    def again(self) -> None:
+    def resume(self) -> None:
         """Send metadata and EOF again, because the receiver may have lost its state."""
         self._metadata_due = self._end_due = True
         self._acknowledged = False
@@ -255,7 +259,7 @@ class Sender:
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
         """Process a PDU from the receiver and return the immediate answers."""
-        self._timer.heard(now_ns)
+        self._timer.reset(now_ns)
         match content:
             case Nak(gaps=gaps) if self._stopped is None:
                 for begin, end in gaps:
@@ -269,7 +273,7 @@ class Sender:
             case Finished(condition, complete, _):
                 self.condition = condition if self._stopped is None else self._stopped
                 if not self.said:
-                    self.said = "received whole" if complete else _words(condition)
+                    self.said = "received whole" if complete else _condition_text(condition)
                 return [answer_to(content)]
             case _:
                 pass
@@ -277,7 +281,7 @@ class Sender:
 
     def next(self, now_ns: int) -> Content | None:
         """Return the content of the next PDU to send, or None if no PDU is due."""
-        self._go_on_summing()
+        self._continue_checksum()
         if self.record.suspended and self._stopped is None:
             return None
         if self._metadata_due:
@@ -285,12 +289,12 @@ class Sender:
             name = self.record.name
             return Metadata(self.record.size, name, name, self.record.kind)
         if self._wanted:
-            return self._piece(now_ns)
+            return self._segment(now_ns)
         if not self._end_due and self._timer.due(now_ns):
             self._end_due = True
         if self._end_due and self._sum is None:
             self._end_due = False
-            self._timer.asked(now_ns)
+            self._timer.retried(now_ns)
             if self._stopped is not None:
                 if self._timer.times > _EOF_TRIES:
                     self.condition = self._stopped
@@ -298,7 +302,7 @@ class Sender:
             return Eof(Condition.NO_ERROR, self.record.checksum or 0, self.record.size)
         return None
 
-    def _piece(self, now_ns: int) -> Content | None:
+    def _segment(self, now_ns: int) -> Content | None:
         begin, end = self._wanted.take(self._segment_bytes)
         try:
             with self._path.open("rb") as file:
@@ -314,7 +318,7 @@ class Sender:
         self._reached = max(self._reached, end)
         return FileData(begin, data)
 
-    def _go_on_summing(self) -> None:
+    def _continue_checksum(self) -> None:
         if self._sum is None:
             return
         try:
@@ -338,16 +342,17 @@ def answer_to(finished: Finished) -> Ack:
     return Ack(Code.FINISHED, finished.condition, 2)
 
 
-def _words(condition: int) -> str:
+def _condition_text(condition: int) -> str:
     try:
         return Condition(condition).name.lower().replace("_", " ")
     except ValueError:
         return f"condition {condition}"
 
 
-LACK_NS = 2_000_000_000
-SILENT_NS = 10_000_000_000
+LACK_NS, SILENT_NS = 2_000_000_000, 10_000_000_000
+"""Time (ns) without a PDU after which missing ranges are requested, after and before the EOF."""
 FINISHED_NS = 5_000_000_000
+"""Period (ns) after which an unacknowledged Finished PDU is repeated."""
 _FINISHED_TRIES = 20
 """Maximum number of unacknowledged Finished PDUs before the receiver closes the transfer."""
 
@@ -377,35 +382,36 @@ class Receiver:
         self._most_requests, self.record = most_requests, record
         self.closed = False
         self.said = ""
-        self.heard_ns = now_ns
+        self.received_ns = now_ns
         self._store, self._accept, self._most = store, accept, most
         self._file = -1
         self._ranges = Ranges(record.ranges)
         self._dirty = True
-        self._asked_to: int | None = None  # offset up to which gaps are requested in the current round
+        self._requested_to: int | None = None  # offset up to which gaps are requested in the current round
         self._sum: FileSum | None = None
         self._finish = Timer(FINISHED_NS, now_ns - FINISHED_NS)
-        self._lack = Timer(LACK_NS, now_ns - (LACK_NS if record.name is not None else 0))
-        self._silence = Timer(SILENT_NS, now_ns - (SILENT_NS if record.name is not None else 0))
+        # A transfer that continues after a restart requests its missing ranges at once.
+        age_ns = SILENT_NS if record.name is not None else 0
+        self._lack, self._silence = (Timer(period, now_ns - age_ns) for period in (LACK_NS, SILENT_NS))
         if record.finished is not None and record.finished[1] and store.part(record).exists():
             self._place()
 
     @property
-    def came(self) -> int:
+    def received(self) -> int:
         """Number of received bytes of the file."""
         whole = self.record.finished is not None and self.record.finished[1]
         return self.record.size if whole else self._ranges.total
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
         """Process a PDU from the sender and return the immediate answers."""
-        self.heard_ns = now_ns
-        self._lack.heard(now_ns)
-        self._silence.heard(now_ns)
+        self.received_ns = now_ns
+        self._lack.reset(now_ns)
+        self._silence.reset(now_ns)
         match content:
             case Metadata() if self.record.name is None and self.record.finished is None:
                 self._begin(content)
             case FileData(offset, data) if self.record.finished is None:
-                self._keep_piece(offset, data)
+                self._store_segment(offset, data)
             case Eof():
                 return self._end(content, now_ns)
             case Ack(code=Code.FINISHED) if self.record.finished is not None:
@@ -417,17 +423,17 @@ class Receiver:
     def next(self, now_ns: int) -> Content | None:
         """Return the content of the next PDU to send, or None if no PDU is due."""
         if self.record.finished is not None:
-            return self._say_finished(now_ns)
-        if self._whole():
-            self._go_on_checking()
+            return self._next_finished(now_ns)
+        if self._is_complete():
+            self._continue_check()
             return None
         if self.record.suspended:
             return None
         timer = self._lack if self.record.end is not None else self._silence
-        if self._asked_to is None and timer.due(now_ns):
-            timer.asked(now_ns)
-            self._asked_to = 0
-        return None if self._asked_to is None else self._next_request(self._asked_to)
+        if self._requested_to is None and timer.due(now_ns):
+            timer.retried(now_ns)
+            self._requested_to = 0
+        return None if self._requested_to is None else self._next_request(self._requested_to)
 
     def suspend(self, suspended: bool) -> None:
         """Suspend or resume the requests for missing data. Raises FileError if the disk cannot be written."""
@@ -474,7 +480,7 @@ class Receiver:
         if problem:
             self.stop(Condition.FILESTORE_REJECTION, problem)
 
-    def _keep_piece(self, offset: int, data: bytes) -> None:
+    def _store_segment(self, offset: int, data: bytes) -> None:
         end = offset + len(data)
         known = self.record.size if self.record.name is not None else self._most
         if end > known:
@@ -506,7 +512,7 @@ class Receiver:
                 self._lack = Timer(LACK_NS, now_ns - LACK_NS)
         return [Ack(Code.EOF, eof.condition, TransactionStatus.ACTIVE)]
 
-    def _whole(self) -> bool:
+    def _is_complete(self) -> bool:
         end = self.record.end
         return self.record.name is not None and end is not None and self._ranges.cover(end[1])
 
@@ -514,12 +520,12 @@ class Receiver:
         """Return the request for the next gaps from offset `begin`, None at the end of the file."""
         size = self.record.end[1] if self.record.end is not None else self.record.size
         gaps = self._ranges.gaps(begin, size, self._most_requests - 1)
-        self._asked_to = gaps[-1][1] if gaps and gaps[-1][1] < size else None
+        self._requested_to = gaps[-1][1] if gaps and gaps[-1][1] < size else None
         if self.record.name is None and begin == 0:
             gaps.insert(0, (0, 0))
         return Nak(gaps[0][0], gaps[-1][1], tuple(gaps)) if gaps else None
 
-    def _go_on_checking(self) -> None:
+    def _continue_check(self) -> None:
         assert self.record.end is not None
         checksum, size = self.record.end
         # Data received before the metadata could not be checked against the size of the file.
@@ -556,11 +562,11 @@ class Receiver:
         except FileError as error:
             self.stop(Condition.FILESTORE_REJECTION, str(error))
 
-    def _say_finished(self, now_ns: int) -> Content | None:
+    def _next_finished(self, now_ns: int) -> Content | None:
         if not self._finish.due(now_ns):
             return None
         assert self.record.finished is not None
-        self._finish.asked(now_ns)
+        self._finish.retried(now_ns)
         self.closed = self._finish.times > _FINISHED_TRIES
         return Finished(*self.record.finished)
 
@@ -655,7 +661,7 @@ class Entity:
         ):
             same.record = msgspec.structs.replace(same.record, origin=origin, suspended=False)
             self._store.save(same.record)
-            same.again()
+            same.resume()
             return _of_sender(same)
         if same is not None:
             same.cancel(why="the file has changed")
@@ -700,11 +706,11 @@ class Entity:
         self._clear()
 
     def unit(self, now_ns: int) -> bytes | None:
-        """Return the next PDU to send, or None if no PDU is due."""
+        """Return the next PDU to send, or None if no PDU is due. Raises FileError if the disk fails."""
         if self._replies:
             return self._replies.popleft()
-        for _ in range(len(self._out) + len(self._in)):
-            sides: list[Sender | Receiver] = [*self._out.values(), *self._in.values()]
+        sides: list[Sender | Receiver] = [*self._out.values(), *self._in.values()]
+        for _ in sides:
             self._turn = (self._turn + 1) % len(sides)
             side = sides[self._turn]
             content = side.next(now_ns)
@@ -762,9 +768,9 @@ class Entity:
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
         """Open an incoming transfer; if too many are open, end the least recently active transfer."""
         if len(self._in) >= MOST_OPEN:
-            stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
-            stalest.stop(Condition.CANCELLED, "given up for a newer one")
-            stalest.closed = True
+            oldest = min(self._in.values(), key=lambda receiver: receiver.received_ns)
+            oldest.stop(Condition.CANCELLED, "given up for a newer one")
+            oldest.closed = True
             self._clear()
         found = self._in[record.source, record.number] = self._receiver(record, now_ns)
         return found
@@ -825,4 +831,6 @@ def _of_receiver(receiver: Receiver) -> Progress:
     condition = None if record.finished is None else record.finished[0]
     name = record.name or ""
     said = receiver.said or (_SUSPENDED if record.suspended else "")
-    return Progress(False, record.source, record.number, name, record.size, receiver.came, condition, said)
+    return Progress(
+        False, record.source, record.number, name, record.size, receiver.received, condition, said
+    )
