@@ -32,7 +32,7 @@ import sys
 import tarfile
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -46,6 +46,7 @@ MOST_TRIES = 3
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
+"""Numbers of stored reports, and of stored names of executed requests."""
 MOST_HOURS, MOST_DIGITS = 2400.0, 11
 """Longest trial (h), and maximum number of digits of the mission time (s since 1970) in a request."""
 KINDS = ("configuration", "elements", "catalogue", "release")
@@ -62,6 +63,7 @@ CONFIGURATION, RESTART = "flight.yaml", "restart"
 GROUND = "ground"
 """Name of the stored configuration that install.sh accepted on the ground."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
+# Name of a request: key, frame counter, first 16 bits and sequence count of the command's packet.
 _REQUEST = re.compile(r"\d{1,5}-\d{1,30}-\d{1,5}-\d{1,5}")
 _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 
@@ -243,12 +245,12 @@ class Board:
 
     def _set(self) -> dict[str, Path]:
         """Return the installed path of each file of a stored configuration, `CONFIGURATION` last."""
-        conf = {
-            f"{unit}.conf": self._units / f"{unit}.service.d/board.conf"
-            for unit in ("knightcube", "knightcube-safe", "knightcube-link")
+        units = ("knightcube", "knightcube-safe", "knightcube-link")
+        return {
+            **{f"{unit}.conf": self._units / f"{unit}.service.d/board.conf" for unit in units},
+            f"{CONFIGURATION}.sha256": self._settings / f"{CONFIGURATION}.sha256",
+            CONFIGURATION: self.configuration(),
         }
-        digest = {f"{CONFIGURATION}.sha256": self._settings / f"{CONFIGURATION}.sha256"}
-        return {**conf, **digest, CONFIGURATION: self.configuration()}
 
     def keep(self, name: str, folder: Path | None = None) -> str:
         """Store a copy of the installed configuration, or of the configuration in `folder`. Raises OSError.
@@ -399,15 +401,14 @@ class Renewal:
         """Store the state and the reports for the link. Raises OSError if no copy can be written."""
         state = self._state
         state.number += 1
-        data, problem, written = encoded(dataclasses.asdict(state)), OSError(), 0
+        data, problems = encoded(dataclasses.asdict(state)), list[OSError]()
         for copy in ("a", "b"):
             try:
                 replace_file(self._board.own / f"state.{copy}", data, 0o600)
-                written += 1
             except OSError as error:
-                problem = error
-        if not written:
-            raise problem
+                problems.append(error)
+        if len(problems) == 2:
+            raise problems[1]
         trial = state.trial
         text = f"{trial.kind} {trial.version}: {trial.stage}, {trial.left_s:.0f} s left" if trial else ""
         shown = {"reports": state.reports, "trial": text, "note": state.note}
@@ -448,38 +449,39 @@ class Renewal:
             self._continue()
         if self._state.returning:
             self._return()
-        for name, request in self._requests():
-            self._obey(name, request)
+        if name := self._next_request():
+            self._obey(name)
         if judged is not None and self._state.trial is judged and judged.stage == "fly":
             self._judge()
         self._count_silence()
         self._age_note()
         self._save()
 
-    def _requests(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the first request that was not executed yet, and delete executed requests before it."""
-        try:
-            names = sorted(
-                name for name in os.listdir(self._board.link / "renewal") if _REQUEST.fullmatch(name)
-            )
-        except OSError:
-            return
-        for name in names:
-            if name not in self._state.handled:
-                request: dict[str, Any] = {}
-                with (
-                    suppress(OSError, *_DAMAGED),
-                    open_beneath(self._board.link, ["renewal", name], LARGEST_RECORD) as file,
-                ):
-                    request = dict(decoded(file.read()))
-                yield name, request
-                return
-            with suppress(OSError):
-                (self._board.link / "renewal" / name).unlink()
+    def _next_request(self) -> str:
+        """Return the name of the first request that was not executed yet, or an empty text.
 
-    def _obey(self, name: str, request: dict[str, Any]) -> None:
+        The requests are executed in ascending order of the key and of the frame counter in their names.
+        Executed requests before the returned request are deleted.
+        """
+        folder, names = self._board.link / "renewal", list[str]()
+        with suppress(OSError):
+            names = list(filter(_REQUEST.fullmatch, os.listdir(folder)))
+        for name in sorted(names, key=lambda name: [int(number) for number in name.split("-")]):
+            if name not in self._state.handled:
+                return name
+            with suppress(OSError):
+                (folder / name).unlink()
+        return ""
+
+    def _obey(self, name: str) -> None:
         """Execute a request."""
         self._state.handled = [*self._state.handled, name][-KEPT_REQUESTS:]
+        request: dict[str, Any] = {}
+        with (
+            suppress(OSError, *_DAMAGED),
+            open_beneath(self._board.link, ["renewal", name], LARGEST_RECORD) as file,
+        ):
+            request = dict(decoded(file.read()))
         word, kind = str(request.get("do", "")), str(request.get("kind", ""))
         try:
             if word == "restart":
@@ -578,11 +580,8 @@ class Renewal:
             if done.returncode == 0:
                 return dict(json.loads(done.stdout))
             problems += done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
-        raise Refused(
-            problems[0]
-            if problems
-            else "no release is installed, or root.json is missing: run deploy/install.sh"
-        )
+        missing = "no release is installed, or root.json is missing: run deploy/install.sh"
+        raise Refused(problems[0] if problems else missing)
 
     def _confirm(self, name: str, kind: str) -> None:
         """End the trial and keep the new version. Raises Refused."""
@@ -769,9 +768,8 @@ class Renewal:
     def _same(self, name: str) -> bool:
         """Return whether a stored configuration is missing or equals the installed configuration."""
         with suppress(OSError):
-            return (
-                self._board.kept / name / CONFIGURATION
-            ).read_bytes() == self._board.configuration().read_bytes()
+            stored = (self._board.kept / name / CONFIGURATION).read_bytes()
+            return stored == self._board.configuration().read_bytes()
         return True
 
     def _count_silence(self) -> None:

@@ -123,6 +123,15 @@ def test_a_part_is_restarted_once_by_command(board: RenewedBoard, part: str, cal
     assert [report[1:4] for report in reports] == [[name, "completed", "restart"]]
 
 
+def test_requests_are_executed_in_the_order_of_their_counters(board: RenewedBoard) -> None:
+    board.count = 8
+    names = [board.request("restart", part="unknown") for _ in range(3)]
+    for _ in names:
+        board.step()
+    reports = decoded((board.own / "status").read_bytes())["reports"]
+    assert [report[1] for report in reports] == names == ["1-9-0-0", "1-10-0-0", "1-11-0-0"]
+
+
 @pytest.mark.parametrize(
     ("part", "unit"), [("flight", "knightcube.service"), ("link", "knightcube-link.service")]
 )
