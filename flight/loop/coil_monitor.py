@@ -441,9 +441,7 @@ class CoilMonitor:
         # Without readings of the current monitor, the search for a stuck leg cannot succeed, and is ended.
         if self._leg.is_searching and time_ns - self._looked_ns > _WINDOW_NS:
             self._leg.reset()
-        effective = values
-        if not self.correction.unchanged:
-            effective = tuple(self.correction.effective(currents).tolist())
+        effective = tuple(self.correction.effective(currents).tolist())
         for response in self._responses:
             response.commanded(time_ns if written_ns is None else written_ns, effective)
 

@@ -57,6 +57,7 @@ from knightcube.gnc.estimation.rigid_body import (
 )
 
 _SAMPLES_NS = 25_000_000
+"""Step (ns) in which recorded commands are sampled, which is one control cycle."""
 _NOTED_LATE_NS = 25_000_000
 """Time (ns) from the sending of a command to its record, which is one control cycle."""
 
@@ -175,6 +176,7 @@ coil."""
 _MEMORY_NS = 20_000_000_000
 """Time (ns) for which residual accelerations are stored."""
 _STALE_NS = 200_000_000
+"""Longest gap (ns) between two samples of a fit."""
 _REACH_NS = 3_000_000_000
 """Time (ns) for which commands are stored. The time is long, because samples arrive late and in a burst after
 a stall of the loop."""
@@ -187,6 +189,7 @@ _DISTURBANCE_NS = 10_000_000_000
 _SLOWEST_ROTATION = 1.1e-3
 """Rate (rad/s) at which the direction of the air flow rotates in a body that points to an inertial target."""
 _GAIN_PRIOR = 10.0
+"""Prior standard deviation of a gain that a hypothesis does not restrict."""
 _LEAST_GAIN_ERROR = 0.05
 """Smallest error assumed for the gain of a healthy coil."""
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
@@ -264,7 +267,6 @@ class CoilResponse:
         self._disturbed_ns, self._disturbance = -_DISTURBANCE_NS, 0.0
         self.gain: FloatArray = np.ones(coils)
         self.largest: FloatArray = np.full(coils, LARGEST_GAIN)
-        self.sigma: FloatArray = np.full(coils, np.inf)
         self.reset()
 
     def reset(self) -> None:
@@ -284,10 +286,10 @@ class CoilResponse:
         self.fastest = self._walk = 0.0
         # The newest fit determines the weights of the inertia error modes.
         self._weights: FloatArray = np.zeros(len(self._gyroscopic) // 3 - 1)
-        # The tuple of a bin: time (ns), equations (3, p + 1), and field (3,), T, of the last sample.
-        self._remainders: deque[tuple[int, FloatArray, tuple[float, ...]]] = deque()
+        # Bins of the last `_MEMORY_NS`: time (ns), equations (3, p + 1), and last field (3,), T.
+        self._history: deque[tuple[int, FloatArray, tuple[float, ...]]] = deque()
         self._in_a_row = {finding: [0] * coils for finding in Finding}
-        self.sigma = np.full(coils, np.inf)
+        self.sigma: FloatArray = np.full(coils, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
         """Record the currents (n,), A, in force from `time_ns` on."""
@@ -336,19 +338,17 @@ class CoilResponse:
         return self._quiet_field
 
     def _command_at(self, time_ns: int) -> tuple[float, ...]:
-        for since_ns, currents in reversed(self._commands):
-            if since_ns <= time_ns:
-                return currents
-        return self._commands[0][1]
+        earlier = (currents for since_ns, currents in reversed(self._commands) if since_ns <= time_ns)
+        return next(earlier, self._commands[0][1])
 
     def axes(self, finding: Finding) -> list[int]:
-        """Return the axes for which a finding held in the last `persistence` fits."""
+        """Return the axes for which a finding held in the last `_PERSISTENCE` fits."""
         counts = self._in_a_row[finding]
         return [axis for axis, count in enumerate(counts) if count >= _PERSISTENCE]
 
     def is_healthy(self, axis: int) -> bool:
-        """Return whether an axis had the gain of a healthy coil in the last `persistence` fits."""
-        return self._in_a_row[Finding.SOUND][axis] >= _PERSISTENCE
+        """Return whether an axis had the gain of a healthy coil in the last `_PERSISTENCE` fits."""
+        return axis in self.axes(Finding.SOUND)
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
         """Return the observed change of torque, divided by the change that a suspected fault would cause.
@@ -357,13 +357,14 @@ class CoilResponse:
         `since_ns` are compared with those after `settled_ns`. The result is None if the change is too small
         to be observed, and NaN if there are too few residuals.
         """
-        before = [rows for time_ns, rows, _ in self._remainders if time_ns < since_ns]
-        after = [(rows, field) for time_ns, rows, field in self._remainders if time_ns >= settled_ns]
+        before = [rows for time_ns, rows, _ in self._history if time_ns < since_ns]
+        after = [(rows, field) for time_ns, rows, field in self._history if time_ns >= settled_ns]
         if len(before) < 3 or len(after) < 3:
             return math.nan
         column, per_field = self._others + axis, constant * self._per_field[:, 3 * axis : 3 * axis + 3]
-        expected = np.mean([np.array(field) @ per_field - rows[:, column] for rows, field in after], axis=0)
-        expected = self._mask * expected
+        changes = [np.array(field) @ per_field - rows[:, column] for rows, field in after]
+        expected: FloatArray = np.mean(changes, axis=0)
+        expected *= self._mask
         size = float(expected @ expected)
         if size < _LEAST_CHANGE**2:
             return None
@@ -402,9 +403,9 @@ class CoilResponse:
             return False
         self._rows.append(rows[self._free])
         self._speeds.append(fastest)
-        self._remainders.append((self._last_ns, rows, field))
-        while self._remainders[0][0] < self._last_ns - _MEMORY_NS:
-            self._remainders.popleft()
+        self._history.append((self._last_ns, rows, field))
+        while self._history[0][0] < self._last_ns - _MEMORY_NS:
+            self._history.popleft()
         if len(self._rows) < self._settings.least_bins:
             return False
         self._fit(span)
@@ -634,7 +635,7 @@ def _bin_equations(
 
 
 class Finding(Enum):
-    """Kinds of findings about a coil that a fit can yield."""
+    """Kinds of findings about a coil: wrong sign, no torque, healthy, weak but usable, and too strong."""
 
     REVERSED = auto()
     FEEBLE = auto()
@@ -698,7 +699,6 @@ class CoilCorrection:
         deviations: relative standard deviations (n,) of the estimated gains; zero for coils without an
             estimated gain.
         sizes: absolute values of the factors, n floats.
-        unchanged: whether all factors have been 1 since the start.
     """
 
     def __init__(self, coils: int = 3) -> None:
@@ -708,15 +708,14 @@ class CoilCorrection:
         self.deviations: FloatArray = np.zeros(coils)
         self._changes: list[list[int]] = [[] for _ in range(coils)]  # times (ns) of the changes of sign
         self._unreviewed: set[int] = set()
-        self.unchanged = True
 
     def effective(self, wire: FloatArray) -> FloatArray:
         """Return the currents (n,), A, with which healthy coils would have the same dipole as the coils."""
-        return wire if self.unchanged else self.factors * wire
+        return self.factors * wire
 
     def wire(self, effective: FloatArray) -> FloatArray:
         """Return the currents (n,), A, of the coils that cause the dipole of the effective currents (n,)."""
-        return effective if self.unchanged else effective / self.factors
+        return effective / self.factors
 
     @property
     def unreviewed(self) -> frozenset[int]:
@@ -757,7 +756,6 @@ class CoilCorrection:
         if factors.shape != self.factors.shape or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
             number = f"not {len(self.factors)} factors"
             return f"{factors.tolist()}: {number} from {LEAST_GAIN:g} to 1 in magnitude"
-        self.unchanged = False
         self.factors, self.deviations = factors.copy(), deviations.copy()
         self.sizes = tuple(sizes.tolist())
         return ""
@@ -771,7 +769,6 @@ class CoilCorrection:
         return f"used with {self.factors[axis]:+.2f} of its configured dipole"
 
     def _multiply(self, axis: int, factor: float) -> None:
-        self.unchanged = False
         self.factors = self.factors.copy()
         self.factors[axis] *= factor
         self.sizes = tuple(np.abs(self.factors).tolist())
@@ -780,6 +777,7 @@ class CoilCorrection:
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
 """Sign of the continuous current through the coil, for each kind of fault with a leg stuck high."""
 _LITTLE_RESPONSE = 0.4
+"""Share of the expected change of torque below which the diagnosed fault did not happen."""
 _DOUBTED_FOR_NS = 60_000_000_000
 """Time (ns) after a refuted diagnosis during which further diagnoses are rejected if the motion is
 inconclusive."""

@@ -30,6 +30,7 @@ from knightcube.astro.quaternion import (
 QUARTER = 0.5 * math.pi
 """Angle (rad) of the rotation by hand about each body axis."""
 GRAVITY = 9.80665
+"""Standard gravity (m/s^2)."""
 RECOGNISED = math.radians(25.0)
 """Largest angle (rad) at which a measured direction is assigned to an expected direction."""
 ASKEW = math.radians(15.0)
@@ -455,10 +456,9 @@ def _fitted_field(
 ) -> FieldFound:
     """Return the magnetometer's axes from fields (3, 3) before and after the rotations, with an unknown bias.
 
-    The fit starts from the best signed permutation of the axes and from the axes of the gyro.
-
-    The common sign is undetermined: of two matrices with opposite signs, the matrix closer to the identity is
-        returned. The axes in the result are None if no matrix explains the fields.
+    The fit starts from the best signed permutation of the axes and from the axes of the gyro. The common sign
+    is undetermined: of two matrices with opposite signs, the matrix closer to the identity is returned. The
+    axes in the result are None if no matrix explains the fields.
     """
     values = np.concatenate([*before, *after])
 
@@ -611,7 +611,7 @@ def diagnose_coils(
     unmeasured = any(one.kind == "no current" for one in shared)
     state = replace(state, drawn=np.full_like(drawn, math.nan) if unmeasured else drawn / shunt, shunt=shunt)
     found += shared
-    if not any(one.part in {"coils", "inertial_unit.magnetometer"} and one.kind in _ALL for one in shared):
+    if not any(one.kind in _OF_ALL_COILS for one in shared):
         legs = np.linalg.norm(np.stack([plus, minus], axis=1), axis=2)
         for j in range(len(names)):
             found += _coil_findings(state, j, names, legs[j], float(test.absent[j].max()))
@@ -643,8 +643,8 @@ def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict
     return found
 
 
-_ALL = frozenset({"moved", "no field", "no supply", "no response", "wrong supply voltage", "sagging supply"})
-"""Kinds of faults that concern all coils; single coils are not evaluated after such a fault."""
+_OF_ALL_COILS = {"no field", "no supply", "no response", "wrong supply voltage", "sagging supply"}
+"""Kinds of shared faults after which single coils are not evaluated."""
 
 
 def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> tuple[float, list[Finding]]:
