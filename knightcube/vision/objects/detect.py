@@ -476,14 +476,13 @@ class Judge:
         regions = self.segmented.regions
         return pixels_of_region(regions.labels, regions.boxes[np.searchsorted(regions.label, label)], label)
 
-    def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
+    def merged(self, settled: list[int], strange: list[int]) -> list[SpaceObject]:
         """Return the objects in regions in which the images of objects and stars may be merged.
 
         Stars are fitted to each region. If the fitted stars do not explain all light, they are subtracted,
         and the brightest remaining light of the region is tested. In regions at the border of the image, an
         object must decrease chi-square more, and its ends lie inside the image. Regions whose label is in
-        `settled` are not examined, nor regions whose label is in `explained`, which contain only stars.
-        Regions whose label is in `strange` are examined first, then the largest.
+        `settled` are not examined. Regions whose label is in `strange` are examined first, then the largest.
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
@@ -491,8 +490,7 @@ class Judge:
         indices = np.flatnonzero(~np.isin(regions.label, settled) & bright)
         order = np.lexsort((-regions.area[indices], ~np.isin(regions.label[indices], strange)))
         objects = []
-        order = order[~np.isin(regions.label[indices[order]], explained)][: self.objects.most_merged]
-        for index in indices[order].tolist():
+        for index in indices[order[: self.objects.most_merged]].tolist():
             patch = self._patch(index)
             enough = self.objects.crossing_improvement * (_AT_BORDER if outside[index] else 1.0)
             stars, left = fit_stars(patch, self.rotation, self.pinhole, enough)
@@ -500,8 +498,8 @@ class Judge:
                 continue
             found = self._remaining_object(brightest_left(patch, left), stars)
             least = self.objects.least_share * float(regions.flux[index]) if stars else 0.0
-            clear = found is not None and found.flux >= least and found.improvement >= enough
-            objects += [found] if found is not None and clear else []
+            if found is not None and found.flux >= least and found.improvement >= enough:
+                objects.append(found)
         return objects
 
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
@@ -732,9 +730,9 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
         every.append(int(judge.segmented.candidates.label[index]))
         settled += every[-1:] if judged[-1].verdict is Verdict.OBJECT else []
         strange += every[-1:] if judged[-1].verdict is Verdict.UNCLEAR else []
-    explained = [label for label, one in zip(every, judged, strict=True) if judge.explained(one, label)]
+    settled += [label for label, one in zip(every, judged, strict=True) if judge.explained(one, label)]
     found = [one.candidate for one in judged if one.candidate is not None]
-    found += judge.merged(*(np.array(each, dtype=np.int64) for each in (settled, strange, explained)))
+    found += judge.merged(settled, strange)
     verdicts = tuple(one.verdict for one in judged)
     found.sort(key=lambda candidate: -candidate.flux)
     count = len(labels)

@@ -339,8 +339,6 @@ _AGREEING_LIGHT = 0.5
 _UNEVEN = 0.4
 # Largest accepted fraction of stars with flux beyond a streak end.
 _MOST_TRAILING = 0.5
-
-
 # Largest distance (px) across the streak between two segments of one streak.
 _CHAIN_ASIDE = 1.3
 # Smallest and largest angle between two segments of one streak, as fractions of the rotation angle.
@@ -748,7 +746,7 @@ def _attempt(
     length = float(np.median(regions.length))
     # If a camera at rest images many stars, the faint regions merge, but the brightest regions do not.
     if length >= _AT_REST and not spots:
-        seen = replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_COMMON_MOTION)
+        seen = replace(seen, length=length, reason=_NO_COMMON_MOTION)
     else:
         resting = still_fit(camera, regions)
         seen = replace(seen, length=length) if resting is None else with_stars(seen, camera, resting)
