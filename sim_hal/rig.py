@@ -213,7 +213,9 @@ def posed_camera(
     timeline = FaultTimeline()
     clock.attach(TimedSimulation(lambda _: None, [timeline, device]))
     # The faults of a camera use only these parts of the hardware.
-    parts: Any = SimpleNamespace(camera=device, monitor=None, faults=timeline, orbit=OrbitDevices())
+    parts: Any = SimpleNamespace(
+        camera=device, monitor=None, power=None, faults=timeline, orbit=OrbitDevices()
+    )
     put(faults, Bench(parts, cast(Any, None), clock.now_ns, fault_generator(section.seed)), begun_ns)
     timeline.advance(begun_ns)
     return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))
