@@ -279,6 +279,8 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
 
 # Number of measured peaks per requested star, above 1 because some peaks are not stars.
 _MEASURED_FOR_ONE = 1.5
+# Number of peaks in a long area above which the area is the track of a particle, instead of a row of stars.
+_MOST_IN_ROW = 3
 _CLUTTERED_SHARE = 0.25
 # Noise of a block of pixels, relative to the median noise of the frame, above which it is foreground.
 _RESTLESS = 2.5
@@ -311,7 +313,10 @@ def measure_areas(seen: Survey) -> Detections:
         return Detections.none(settings.psf_sigma or np.nan)
     flags = _flags_of_areas(seen.sky, areas, peaks)
     open_sky = (flags & Quality.CLUTTER) == 0
-    chosen = worth_measuring(peaks, open_sky, pixels.shape, int(_MEASURED_FOR_ONE * settings.most_stars))
+    # Particle tracks, which are long areas with many peaks, may not displace the stars from the selection.
+    track = (flags == 0) & is_streak(areas)[peaks.area] & (np.bincount(peaks.area)[peaks.area] > _MOST_IN_ROW)
+    most = int(_MEASURED_FOR_ONE * settings.most_stars)
+    chosen = worth_measuring(peaks, open_sky & ~track, pixels.shape, most)
     peaks, flags = peaks.select(chosen), flags[chosen]
     column, row = peaks.place.T
     targets = StarTargets(

@@ -176,6 +176,22 @@ def test_a_bright_corner_full_of_leaves_does_not_drown_the_stars() -> None:
     assert np.count_nonzero((found.points > 390.0).all(axis=1)) <= 8
 
 
+def test_tracks_of_particles_do_not_drown_the_stars() -> None:
+    """Each track has several peaks, and the tracks have more peaks than are measured."""
+    rng = np.random.default_rng(14)
+    frame = sky(rng, (512, 512))
+    stars = star_places(np.random.default_rng(1), 512, 30)
+    for x, y in stars:
+        add_star(frame, x, y, 3000.0)
+    for angle in rng.uniform(0.0, np.pi, 60):
+        along = np.linspace(-15.0, 15.0, 61)
+        x, y = rng.uniform(16.0, 496.0, 2)
+        frame[(y + along * np.sin(angle)).astype(int), (x + along * np.cos(angle)).astype(int)] += (
+            rng.uniform(200.0, 1000.0)
+        )
+    assert len(matched(detect(counts(frame)).stars(), stars)[0]) >= 18
+
+
 def test_a_source_whose_place_is_undetermined_is_not_a_star() -> None:
     middle, one = np.full((2, 2), 32), np.ones(2)
     covariance = np.array([0.01 * np.eye(2), 1e30 * np.eye(2)])
