@@ -23,6 +23,7 @@ from flight.schema.devices import (
     Coils,
     Power,
     PowerMonitorSection,
+    SensorsSection,
     SolarStringsSection,
     UnitSection,
     V4l2Device,
@@ -117,6 +118,12 @@ def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
     _check_testbed_coils(config.coils, refuse)
     if config.guidance.replan_period >= config.guidance.horizon:
         refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
+    unit = config.inertial_unit
+    sensors = unit.sensors if isinstance(unit, SensorsSection) else ()
+    measured = {quantity for sensor in sensors for quantity in sensor.measures}
+    if "gyro" in measured and "acceleration" not in measured:
+        problem = "measure the rate but not the acceleration, which gives the angle of the testbed"
+        refuse("inertial_unit.sensors", f"{problem}: add a sensor that measures `acceleration`")
     times = [step.at for step in config.steps]
     _check_order("steps", times, refuse)
     if config.duration <= times[-1]:

@@ -262,3 +262,19 @@ def test_a_current_beyond_the_range_of_the_power_monitor_is_refused() -> None:
     config = parse(f"power: {{battery: {{capacity: 2.6}}, {monitor}}}\n{text}")
     with pytest.raises(ConfigError, match=r"power.battery_monitor.maximum_current.*0 to 1.6 A"):
         check_settings(config)
+
+
+@pytest.mark.parametrize(
+    ("measured", "refused"),
+    [("gyro", True), ("gyro acceleration", False), ("acceleration", False), ("", False)],
+)
+def test_a_gyro_on_the_testbed_needs_an_accelerometer(measured: str, refused: bool) -> None:
+    """Gravity and magnetic field give the angle about the thread; without a gyro, the field alone does."""
+    axes = ", ".join(f"{quantity}: [x, y, z]" for quantity in ["magnetic", *measured.split()])
+    sensors = f"sensors: [{{part: lis3mdl, address: 0x1e, measures: {{{axes}}}}}]"
+    text = f"extends: step_demo\ninertial_unit: {{driver: sensors, {sensors}}}\n"
+    if not refused:
+        parse(text)
+        return
+    with pytest.raises(ConfigError, match="measure the rate but not the acceleration"):
+        parse(text)

@@ -156,7 +156,9 @@ def _control(packer: Packer, stamp: int, cycle: int, q2: float, rate: float, cur
 
 
 def _housekeeping(packer: Packer, stamp: int, bus_power: float) -> bytes:
-    values: dict[str, object] = {field.name: 0 for field in table.HOUSEKEEPING.fields}
+    values: dict[str, object] = {
+        field.name: 0 if field.count == 1 else [0] * field.count for field in table.HOUSEKEEPING.fields
+    }
     return packer.pack(table.HOUSEKEEPING, stamp, {**values, "coil_power": bus_power})
 
 
