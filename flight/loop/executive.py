@@ -454,7 +454,7 @@ _CLOSE_S = 5.0
 """Longest time (s) to wait for the end of the supervising thread."""
 
 
-class _Kept:
+class _SupervisedWorker:
     """A worker that the supervising thread keeps running, and its present job."""
 
     def __init__(self, worker: Worker, clock: Clock, cores: Set[int]) -> None:
@@ -481,18 +481,18 @@ class _Kept:
             if self.process is None:
                 if now_ns < self._due_ns:
                     # The job was accepted while the process was ending.
-                    return self._lose("died", "the worker is not running", now_ns), []
+                    return self._lost_results("died", "the worker is not running", now_ns), []
                 self._begun_ns = now_ns
                 self.process = WorkerProcess(self.worker, self._cores)
-            return self._talk(self.process, now_ns)
+            return self._exchange(self.process, now_ns)
         except EOFError:
-            return self._bury("died", "the worker's process ended", now_ns)
+            return self._reap("died", "the worker's process ended", now_ns)
         except TimeoutError as error:
-            return self._bury("timed-out", str(error), now_ns)
+            return self._reap("timed-out", str(error), now_ns)
         except Exception as error:  # noqa: BLE001 - containment boundary: the worker runner
-            return self._bury("died", f"{type(error).__name__}: {error}", now_ns)
+            return self._reap("died", f"{type(error).__name__}: {error}", now_ns)
 
-    def _talk(self, process: WorkerProcess, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
+    def _exchange(self, process: WorkerProcess, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
         news, results = [], []
         was_ready = process.ready
         answer = process.receive()
@@ -511,7 +511,7 @@ class _Kept:
             except (EOFError, OSError):
                 raise
             except Exception as error:  # noqa: BLE001 - containment boundary: the worker runner
-                results += self._lose("failed", f"{type(error).__name__}: {error}", now_ns)
+                results += self._lost_results("failed", f"{type(error).__name__}: {error}", now_ns)
         self._check(process, now_ns)
         return results, news
 
@@ -524,14 +524,14 @@ class _Kept:
         if not process.ready and now_ns - self._begun_ns > START_LIMIT_NS:
             raise TimeoutError(f"not ready within {START_LIMIT_NS * 1e-9:g} s")
 
-    def _bury(self, outcome: Outcome, text: str, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
+    def _reap(self, outcome: Outcome, text: str, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
         """Reap a failed process, and set the time of the next start."""
         self.accepts = False
         process, self.process = self.process, None
         if process is not None:
             ended = process.end()
             text = f"{text}, {ended}" if outcome == "died" else text
-        results = self._lose(outcome, text, now_ns)
+        results = self._lost_results(outcome, text, now_ns)
         wait_ns = self._attempts.died(now_ns - self._begun_ns)
         self._due_ns = self._clock.now_ns() + wait_ns
         news = [WorkerNews(self.worker.name, WorkerChange.DIED, f"{text}; starts in {wait_ns * 1e-9:g} s")]
@@ -540,7 +540,7 @@ class _Kept:
             news.append(WorkerNews(self.worker.name, WorkerChange.SPENT, spent))
         return results, news
 
-    def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
+    def _lost_results(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
         """Return failed results for all lost jobs: the running job and the waiting jobs."""
         lost = [self.submitted_ns] if self.submitted_ns >= 0 else []
         while self.inbox:
@@ -557,7 +557,7 @@ class ProcessRunner:
     def __init__(self, clock: Clock, workers: Sequence[Worker], cores: Set[int] = frozenset()) -> None:
         """Start the workers on the given cores; an empty set permits all cores."""
         self._clock = clock
-        self._kept = {worker.name: _Kept(worker, clock, cores) for worker in workers}
+        self._workers = {worker.name: _SupervisedWorker(worker, clock, cores) for worker in workers}
         self._busy: set[str] = set()
         self._results: deque[JobResult] = deque()
         self._news: deque[WorkerNews] = deque()
@@ -568,11 +568,11 @@ class ProcessRunner:
 
     def submit(self, worker: str, argument: Any) -> bool:
         """Submit a job, and return False if the worker is busy or not yet ready after a restart."""
-        kept = self._kept[worker]
-        if worker in self._busy or not kept.accepts:
+        supervised = self._workers[worker]
+        if worker in self._busy or not supervised.accepts:
             return False
         self._busy.add(worker)
-        kept.inbox.append((argument, self._clock.now_ns()))
+        supervised.inbox.append((argument, self._clock.now_ns()))
         os.eventfd_write(self._bell, 1)
         return True
 
@@ -600,30 +600,30 @@ class ProcessRunner:
 
     def process_identifiers(self) -> dict[str, int]:
         """Return the process identifier of each running worker."""
-        running = [(name, kept.process) for name, kept in self._kept.items()]
+        running = [(name, supervised.process) for name, supervised in self._workers.items()]
         return {name: process.process_id for name, process in running if process is not None}
 
     def _supervise(self) -> None:
         """Serve the workers until `close`; the kernel kills them when the thread that started them ends."""
         while not self._closing.is_set():
-            for kept in self._kept.values():
-                results, news = kept.serve()
+            for supervised in self._workers.values():
+                results, news = supervised.serve()
                 self._news.extend(news)
                 self._results.extend(results)
             self._wait()
-        for kept in self._kept.values():
-            if kept.process is not None:
-                kept.process.end()
+        for supervised in self._workers.values():
+            if supervised.process is not None:
+                supervised.process.end()
 
     def _wait(self) -> None:
         """Wait for a job, an answer, or the next time at which a worker is due."""
         poll = select.poll()
         poll.register(self._bell, select.POLLIN)
-        for kept in self._kept.values():
-            if kept.process is not None:
-                poll.register(kept.process, select.POLLIN)
+        for supervised in self._workers.values():
+            if supervised.process is not None:
+                poll.register(supervised.process, select.POLLIN)
         now_ns = self._clock.now_ns()
-        dues = [due_ns for kept in self._kept.values() for due_ns in kept.dues_ns()]
+        dues = [due_ns for supervised in self._workers.values() for due_ns in supervised.dues_ns()]
         wait_ms = min([_IDLE_MS, *(1e-6 * (due_ns - now_ns) + 1.0 for due_ns in dues)])
         poll.poll(max(wait_ms, 0.0))
         with suppress(BlockingIOError):

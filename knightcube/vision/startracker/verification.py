@@ -225,16 +225,12 @@ def verify_first(
         if found is None:
             break
         begin += found.candidate
-        answer = _verified(
-            field, matching, found, Refinement(matrices[begin], float(scales[begin]), *_UNFITTED)
-        )
+        start = Refinement(matrices[begin], float(scales[begin]), np.empty((0, 0)), np.empty(0))
+        answer = _verified(field, matching, found, start)
         if answer.status is MatchStatus.IDENTIFIED:
             return answer
         begin += 1
     return nothing(field)
-
-
-_UNFITTED = np.empty((0, 0)), np.empty(0)
 
 
 def _verified(field: StarField, matching: _Matcher, first: _Matching, start: Refinement) -> StarMatch:

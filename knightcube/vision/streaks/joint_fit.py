@@ -368,9 +368,7 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
     """Return 1 for each confirmed and 0 for each wrong end of the streaks of `scene`, as an array (n, 2).
 
     A streak end is confirmed if the pixels on its inner side contain starlight and the pixels on its outer
-    side do not.
-
-    The value is NaN for an end outside the detector and for the ends of very short streaks.
+    side do not. The value is NaN for an end outside the detector and for the ends of very short streaks.
     """
     out = np.full((len(scene.stars), 2), np.nan)
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
@@ -421,9 +419,8 @@ def _end_motions(
     """Yield five values for the first ends of all streaks, and then for the second ends.
 
     The values are the index of the end (0 or 1), the sign of the time beyond the end (-1 or 1), the uniform
-    motion, the positions of the ends (n, 2), px, and the speeds (n,), px per exposure.
-
-    The paths are extrapolated with a uniform motion, because the star may have no speed at a streak end.
+    motion, the positions of the ends (n, 2), px, and the speeds (n,), px per exposure. The paths are
+    extrapolated with a uniform motion, because the star may have no speed at a streak end.
     """
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     steady = CameraMotion.steady(scene.motion.rotation)

@@ -222,7 +222,7 @@ from hal.interfaces.wires import SECOND_NS
 from tests.flight.loop.odd_jobs import hang
 runner = ProcessRunner(SystemClock(), [Worker("hang", hang, 0, 10**12)])
 runner.submit("hang", None)
-while not all(kept.process and kept.process.ready for kept in runner._kept.values()):
+while not all(one.process and one.process.ready for one in runner._workers.values()):
     time.sleep(0.01)
 print(*runner.process_identifiers().values(), flush=True)
 time.sleep(60.0)
