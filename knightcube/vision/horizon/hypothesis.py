@@ -277,10 +277,18 @@ class Hypothesis:
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (3, 3) of the nadir, rad^2, including the allowance for unmodelled effects."""
+        """The covariance (3, 3) of the nadir, rad^2, including the allowance for unmodelled effects.
+
+        If the edges contradict a known altitude by more than one standard deviation, the limb has another
+        height or the focal length is wrong, which also displaces the nadir. The covariance is then multiplied
+        by the square of `altitude_off`.
+        """
         nadir = self.fit.view.nadir
         across = np.eye(3) - np.outer(nadir, nadir)
-        return np.asarray(self.fit.nadir_covariance + self.allowance**2 * across)
+        covariance = np.asarray(self.fit.nadir_covariance + self.allowance**2 * across)
+        if self.guess.place.altitude_sigma >= UNKNOWN:
+            return covariance
+        return max(1.0, self.altitude_off**2) * covariance
 
 
 def examine(

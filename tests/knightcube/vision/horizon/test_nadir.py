@@ -254,6 +254,20 @@ def test_a_horizon_of_few_edges_is_read_more_closely_where_it_runs() -> None:
     assert _error_deg(twice, scene) < 3.0 * np.degrees(twice.nadir.sigma)
 
 
+@pytest.mark.parametrize("factor", [0.95, 1.0, 1.05])
+def test_a_limb_that_contradicts_the_known_altitude_has_a_larger_uncertainty(
+    day: tuple[EarthScene, Image], factor: float
+) -> None:
+    """With a wrong focal length, the edges imply another altitude by up to three standard deviations."""
+    scene, frame = day
+    camera = MODEL.lens.rescaled(factor)
+    measured = find_nadir(frame, camera, _gps(scene), SETTINGS).nadir
+    assert measured is not None
+    error = measured.basis @ (measured.direction - nadir(scene))
+    assert error @ np.linalg.solve(measured.tangent_covariance, error) < 13.8  # 99.9 % quantile
+    assert (np.degrees(measured.sigma) < 0.15) == (factor == 1.0)
+
+
 @pytest.mark.parametrize("altitude", [400e3, 450e3, 800e3])
 def test_a_wrong_altitude_is_refused_with_the_altitude_of_the_limb(
     day: tuple[EarthScene, Image], altitude: float
