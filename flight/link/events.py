@@ -214,8 +214,8 @@ COIL_SUSPECT = _warn(
 POWER_DOUBTED = _warn(
     37,
     "power-doubted",
-    "the current monitor contradicts the measured motion",
-    "check the shunt and the sign of the current monitor; the motion is used instead",
+    "the current monitor contradicts the measured motion, or measures all currents wrong by one factor",
+    "check the shunt and the sign of the current monitor; the motion or the corrected current is used",
 )
 POWER_FAULT = _warn(
     32,

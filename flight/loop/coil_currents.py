@@ -8,9 +8,10 @@ the other input is pulsed.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from functools import cache
 
@@ -417,3 +418,113 @@ class BrakeProof:
             self._axes.clear()
             self._exceeds.clear()
         return wrong
+
+
+_MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
+"""Maximum number of predictions in a segment, and maximum number of segments."""
+_TELLING = 4.0
+"""Smallest expected current that shows the gain of the monitor, as a multiple of a coil's error bound."""
+
+
+class Evidence:
+    """Predictions of the current readings since a fault was suspected. Each probe begins a new segment.
+
+    A hypothesis must explain the readings of each segment. Without segments, the few readings of a probe that
+    contradict a hypothesis would be treated as outliers, because the many other readings agree with every
+    hypothesis.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self._bounds = bounds
+        self._segments: deque[deque[Predicted]] = deque(maxlen=_MOST_SEGMENTS)
+        self.clear()
+
+    def __len__(self) -> int:
+        """Return the number of predictions."""
+        return sum(len(segment) for segment in self._segments)
+
+    def clear(self) -> None:
+        """Discard all predictions."""
+        self._segments.clear()
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """Begin a new segment for the readings from now on."""
+        self._segments.append(deque(maxlen=_MOST_EVIDENCE))
+
+    def add(self, predictions: Sequence[Predicted]) -> None:
+        """Append the predictions of a reading to the newest segment."""
+        self._segments[-1].extend(predictions)
+
+    def readings(self) -> list[Predicted]:
+        """Return all predictions in order of time."""
+        return [one for segment in self._segments for one in segment]
+
+    def monitor_gain(self, known: Mapping[int, CoilFault]) -> float | None:
+        """Return the gain of a current monitor that measures all currents with a common error, or None.
+
+        With this gain, healthy coils, besides the `known` faults, fit the readings of each segment, and no
+        segment agrees better with a correct monitor. At least two coils must have been driven, because a
+        fault of the only driven coil explains the readings too.
+        """
+        coils = range(len(self._bounds.full_current))
+        if any(PLACE.get(fault) is None or fault is CoilFault.SHORTED for fault in known.values()):
+            return None  # the current of a coil is unknown
+        driven = {
+            axis for one in self.readings() for axis in coils if axis not in known and one.mean[axis, 0]
+        }
+        ratios = [self._ratios(segment, known) for segment in self._segments if segment]
+        every = [ratio for segment in ratios for ratio in segment]
+        gain = float(np.median(every)) if every else 1.0
+        if len(driven) < 2 or abs(gain - 1.0) <= self._bounds.gain or not 0.2 <= gain <= 5.0:
+            return None
+        if any(abs(math.log(np.median(one) / gain)) > abs(math.log(np.median(one))) for one in ratios if one):
+            return None
+        scaled = [[replace(one, current=one.current / gain) for one in part] for part in self._segments]
+        return gain if all(fits(part, self._bounds, known) for part in scaled if part) else None
+
+    def _ratios(self, segment: Iterable[Predicted], known: Mapping[int, CoilFault]) -> list[float]:
+        """Return the ratios of measured to expected currents of a segment's readings of driven coils."""
+        places = [PLACE[known.get(axis)] for axis in range(len(self._bounds.full_current))]
+        pairs = [(one.current, float(one.mean[range(len(places)), places].sum())) for one in segment]
+        least = _TELLING * self._bounds.uncertainty
+        return [max(current, self._bounds.noise) / due for current, due in pairs if due > least]
+
+    def possible_faults(self, known: Mapping[int, CoilFault]) -> list[tuple[int, CoilFault]]:
+        """Return axes and faults that explain the readings, together with the known faults."""
+        segments = [segment for segment in self._segments if segment]
+        return [
+            (axis, fault)
+            for axis in range(len(self._bounds.full_current))
+            if axis not in known
+            for fault in ELECTRICAL
+            if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)
+        ]
+
+    def shows_working_monitor(self, known: Mapping[int, CoilFault]) -> bool:
+        """Return whether a probe showed a healthy coil's current, which proves that the monitor works."""
+        return any(
+            fits(segment, self._bounds, known) and any(one.mean[:, 0].any() for one in segment)
+            for segment in list(self._segments)[1:]
+            if segment
+        )
+
+    def rejects_healthy_now(self, known: Mapping[int, CoilFault]) -> bool:
+        """Return whether the readings of the newest segment contradict healthy coils."""
+        newest = self._segments[-1]
+        return bool(newest) and not fits(newest, self._bounds, known)
+
+    def is_normal_again(
+        self, known: Mapping[int, CoilFault], possible: Sequence[tuple[int, CoilFault]]
+    ) -> bool:
+        """Return whether the newest readings agree with healthy coils.
+
+        Unless all coils were commanded to zero, the newest readings must also contradict each of the
+        `possible` faults. Coils at zero current show no fault, and their currents are known.
+        """
+        newest = self.readings()[-8:]
+        if not fits(newest, self._bounds, known):
+            return False
+        if not any(one.mean[:, 0].any() for one in newest):
+            return True
+        return not any(fits(newest, self._bounds, known, axis, fault) for axis, fault in possible)

@@ -16,7 +16,8 @@ current. The other coils carry no current for the 1.6 s of a probe, so that one 
 draws current. A reversed coil is detected from the angular acceleration, which also distinguishes a faulty
 current monitor from a broken coil. Averaged over longer bins, the acceleration reveals missing torque at
 currents that are too small for the current monitor. If torque is missing, a probe shows whether the coil is
-open.
+open. If one gain of the current monitor explains the readings while different coils are driven, the current
+monitor is considered faulty, and its later readings are divided by this gain.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -62,6 +63,7 @@ from flight.loop.coil_currents import (
     BrakeProof,
     CoilFault,
     Commands,
+    Evidence,
     Sampling,
     StuckLeg,
     fits,
@@ -74,7 +76,6 @@ from flight.loop.coil_response import (
     CoilCommands,
     CoilCorrection,
     CoilResponse,
-    Evidence,
     Finding,
     MotionWitness,
     ResponseSettings,
@@ -345,6 +346,7 @@ class CoilMonitor:
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
         self._proof = BrakeProof()
         self._witness = MotionWitness(self._response, settings.full_current)
+        self._gain = 1.0  # gain of a current monitor that measures all currents with a common error
         self._strangeness = ""
 
     @property
@@ -550,6 +552,9 @@ class CoilMonitor:
         if gap_ns <= 0 or not self._commands:
             return
         self._reading_ns = reading.time_ns
+        if self._gain != 1.0:
+            current, newest = reading.current / self._gain, reading.newest / self._gain
+            reading = replace(reading, current=current, newest=newest)
         self._look_at_legs(reading)
         if self._leg.is_searching:
             self._unmixed_ns = reading.time_ns
@@ -637,15 +642,16 @@ class CoilMonitor:
         return windows
 
     def _check_healthy(self, reading: PowerReading) -> None:
-        windows, known = self._windows(reading), self._known
+        windows = self._windows(reading)
         asked = sum([sum(map(abs, currents)) for currents in windows[0][1]]) / len(windows[0][1])
-        if known:
-            healthy = all(fits([predict(*window)], self._bounds, known) for window in windows)
-        else:
-            healthy = all(is_healthy_current(*window) for window in windows)
+        healthy = self._are_healthy(windows)
+        if self._gain != 1.0 and not healthy:
+            healthy = self._are_healthy([(self._gain * one[0], *one[1:]) for one in windows])
+            self._gain = 1.0 if healthy else self._gain
         if healthy:
             self._strange = 0
-            self._witness.trust_monitor()
+            if self._gain == 1.0:
+                self._witness.trust_monitor()
             if asked > self._bounds.uncertainty:
                 self._sound_ns = reading.newest_since_ns
             return
@@ -655,6 +661,12 @@ class CoilMonitor:
             self._suspect(why)
             if reading.newest > asked > 0.0:
                 self._leg.ask_for_rest(why)
+
+    def _are_healthy(self, windows: list[tuple[float, Commands, Bounds, Sampling, bool]]) -> bool:
+        known = self._known
+        if known:
+            return all(fits([predict(*window)], self._bounds, known) for window in windows)
+        return all(is_healthy_current(*window) for window in windows)
 
     def _suspect(self, why: str) -> None:
         self._suspected_ns = self._unmixed_ns = self._reading_ns
@@ -691,17 +703,29 @@ class CoilMonitor:
             self._reset()  # a small excess may be an error of the current monitor
             return
         works = self._evidence.shows_working_monitor(self._known)
-        if not works and self._is_contradicted(axis, fault):
+        gain = self._evidence.monitor_gain(self._known)
+        if gain is not None or (not works and self._is_contradicted(axis, fault)):
             if self._begin_comparison(axis, fault, now_ns):
                 return
-            why = f"{self._strangeness}; but the measured motion shows no fault of coil {COIL_NAMES[axis]}"
-            self._witness.doubt_monitor(why, now_ns)
+            why = f"but the measured motion shows no fault of coil {COIL_NAMES[axis]}"
+            self._doubt_monitor(why, gain, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)
             if fault in _BRAKED:
                 self._proof.add(axis)
                 self._fresh = 0
         self._reset()
+
+    def _doubt_monitor(self, why: str, gain: float | None, now_ns: int) -> None:
+        """Consider the current monitor faulty, and divide its later readings by `gain` if it is known."""
+        if gain is not None:
+            self._gain *= gain
+            why = f"the monitor measures {self._gain:.2f} of the current of each coil"
+        if gain is not None and abs(self._gain - 1.0) <= self._bounds.gain:  # the fault has ended
+            self._gain = 1.0
+            self._witness.trust_monitor()
+        else:
+            self._witness.doubt_monitor(f"{self._strangeness}; {why}", now_ns)
 
     def _begin_comparison(self, axis: int, fault: CoilFault, now_ns: int) -> bool:
         """Probe another coil for comparison, and return whether the probe began.
@@ -726,10 +750,15 @@ class CoilMonitor:
     def _look_further(self, axes: set[int], now_ns: int) -> None:
         """Probe the next suspected axis; after the last axis, collect new evidence.
 
-        After the last axis, no hypothesis explained the evidence, as with an intermittent fault or a faulty
+        After the last axis, no coil fault explained the evidence, as with an intermittent fault or a faulty
         monitor.
         """
         ends_ns = self._probe.begin(axes, now_ns, self._prime)
+        gain = self._evidence.monitor_gain(self._known) if ends_ns is None else None
+        if gain is not None:
+            self._doubt_monitor("", gain, now_ns)
+            self._reset()
+            return
         self._evidence.begin_segment()
         if ends_ns is None:
             self._evidence.clear()

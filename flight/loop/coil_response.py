@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight.loop.coil_currents import ELECTRICAL, NEWEST, Bounds, CoilFault, Predicted, Supplied, fits
+from flight.loop.coil_currents import NEWEST, Bounds, CoilFault, Supplied
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.compiled import compiled_form_of
@@ -818,81 +818,3 @@ class MotionWitness:
             # Without residuals from before the fault, only the present torque shows a healthy coil.
             return fault in _DRIVEN or self._response.is_healthy(axis)
         return observed < _LITTLE_RESPONSE
-
-
-_MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
-"""Maximum number of predictions in a segment, and maximum number of segments."""
-
-
-class Evidence:
-    """Predictions of the current readings since a fault was suspected. Each probe begins a new segment.
-
-    A hypothesis must explain the readings of each segment. Without segments, the few readings of a probe that
-    contradict a hypothesis would be treated as outliers, because the many other readings agree with every
-    hypothesis.
-    """
-
-    def __init__(self, bounds: Bounds) -> None:
-        self._bounds = bounds
-        self._segments: deque[deque[Predicted]] = deque(maxlen=_MOST_SEGMENTS)
-        self.clear()
-
-    def __len__(self) -> int:
-        """Return the number of predictions."""
-        return sum(len(segment) for segment in self._segments)
-
-    def clear(self) -> None:
-        """Discard all predictions."""
-        self._segments.clear()
-        self.begin_segment()
-
-    def begin_segment(self) -> None:
-        """Begin a new segment for the readings from now on."""
-        self._segments.append(deque(maxlen=_MOST_EVIDENCE))
-
-    def add(self, predictions: Sequence[Predicted]) -> None:
-        """Append the predictions of a reading to the newest segment."""
-        self._segments[-1].extend(predictions)
-
-    def readings(self) -> list[Predicted]:
-        """Return all predictions in order of time."""
-        return [one for segment in self._segments for one in segment]
-
-    def possible_faults(self, known: Mapping[int, CoilFault]) -> list[tuple[int, CoilFault]]:
-        """Return axes and faults that explain the readings, together with the known faults."""
-        segments = [segment for segment in self._segments if segment]
-        return [
-            (axis, fault)
-            for axis in range(len(self._bounds.full_current))
-            if axis not in known
-            for fault in ELECTRICAL
-            if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)
-        ]
-
-    def shows_working_monitor(self, known: Mapping[int, CoilFault]) -> bool:
-        """Return whether a probe showed a healthy coil's current, which proves that the monitor works."""
-        return any(
-            fits(segment, self._bounds, known) and any(one.mean[:, 0].any() for one in segment)
-            for segment in list(self._segments)[1:]
-            if segment
-        )
-
-    def rejects_healthy_now(self, known: Mapping[int, CoilFault]) -> bool:
-        """Return whether the readings of the newest segment contradict healthy coils."""
-        newest = self._segments[-1]
-        return bool(newest) and not fits(newest, self._bounds, known)
-
-    def is_normal_again(
-        self, known: Mapping[int, CoilFault], possible: Sequence[tuple[int, CoilFault]]
-    ) -> bool:
-        """Return whether the newest readings agree with healthy coils.
-
-        Unless all coils were commanded to zero, the newest readings must also contradict each of the
-        `possible` faults. Coils at zero current show no fault, and their currents are known.
-        """
-        newest = self.readings()[-8:]
-        if not fits(newest, self._bounds, known):
-            return False
-        if not any(one.mean[:, 0].any() for one in newest):
-            return True
-        return not any(fits(newest, self._bounds, known, axis, fault) for axis, fault in possible)

@@ -17,6 +17,7 @@ from flight.loop.coil_currents import (
     Bounds,
     BrakeProof,
     CoilFault,
+    Evidence,
     Predicted,
     Sampling,
     StuckLeg,
@@ -27,10 +28,9 @@ from flight.loop.coil_currents import (
     supply_currents,
 )
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
-from flight.loop.coil_response import Evidence
 from hal.interfaces.devices import NO_AXES, ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray
-from tests.sim_hal.faults.coil_bench import hold, observe
+from tests.sim_hal.faults.coil_bench import Command, hold, observe
 
 TARGET = -0.6
 FAULT_AT = 6.0
@@ -229,7 +229,48 @@ def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
 def test_a_monitor_that_lies_is_doubted_and_no_coil_is_taken_out_of_use() -> None:
     seen = observe(hold(TARGET), 15.0, [f"monitor: wrong @ {FAULT_AT}"])
     assert seen.found == []
-    assert "shows no fault" in seen.watch.monitor_doubted
+    assert "the monitor measures 2.0" in seen.watch.monitor_doubted
+
+
+def changing(time: float, _: ImuReading) -> FloatArray:
+    """Return currents of all coils that change every 2 s, as in a tumble."""
+    draw = np.random.default_rng(int(time / 2.0))
+    return FULL * draw.uniform(-1.0, 1.0, 3)
+
+
+@pytest.mark.parametrize("law", [full, changing])
+@pytest.mark.parametrize("gain", [0.3, 0.5, 0.65, 1.4, 2.0])
+def test_a_common_error_of_all_currents_is_a_fault_of_the_monitor(law: Command, gain: float) -> None:
+    """No motion is known, so only the readings show that the monitor is faulty and the coils are healthy."""
+    seen = observe(law, 36.0, [f"monitor: wrong (gain={gain}) @ {FAULT_AT} for 20"], monitor_only=True)
+    assert seen.found == []
+    assert seen.suspicious < 0.5 * seen.readings, "the suspicion does not return while the monitor is faulty"
+    assert seen.watch.suspicion == ""
+    assert seen.watch.monitor_doubted == "", "the monitor works again"
+
+
+@pytest.mark.parametrize("law", [full, changing])
+@pytest.mark.parametrize("gain", [0.75, 1.25])
+def test_a_small_error_of_all_currents_isolates_no_coil(law: Command, gain: float) -> None:
+    assert observe(law, 30.0, [f"monitor: wrong (gain={gain}) @ {FAULT_AT}"], monitor_only=True).found == []
+
+
+@pytest.mark.parametrize("law", [full, changing])
+def test_an_open_coil_is_found_with_a_monitor_whose_error_is_known(law: Command) -> None:
+    faults = [f"monitor: wrong (gain=0.5) @ {FAULT_AT}", "coil-y: open @ 20"]
+    seen = observe(law, 35.0, faults, monitor_only=True)
+    assert [axis for _, axis, _ in seen.found] == ["y"]
+    assert "the monitor measures 0.5" in seen.watch.monitor_doubted
+
+
+@pytest.mark.parametrize("share", [0.25, 0.33, 0.5])
+def test_an_open_coil_is_not_mistaken_for_an_error_of_the_monitor(share: float) -> None:
+    """The readings during the probe of another coil show that the monitor works."""
+    others = 0.5 * FULL * (1.0 - share) / max(share, 0.5)
+    drawn = np.array([others, FULL * share / max(share, 0.5), others])
+    seen = observe(lambda *_: drawn, 25.0, [f"coil-y: open @ {FAULT_AT}"], monitor_only=True)
+    assert [axis for _, axis, _ in seen.found] == ["y"]
+    assert seen.watch.monitor_doubted == ""
 
 
 def test_an_axis_that_is_never_driven_is_not_judged() -> None:
