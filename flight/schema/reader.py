@@ -561,10 +561,8 @@ def _check_body(document: Document) -> None:
     """
     shapes = {"testbed": TestbedConfig, "orbit": OrbitConfig}
     body = document.values.get("body", "testbed")
-    other = "testbed" if body == "orbit" else "orbit"
-    foreign = {*shapes[other].__struct_fields__} - {
-        *shapes[body if body == "orbit" else "testbed"].__struct_fields__
-    }
+    own, other = ("orbit", "testbed") if body == "orbit" else ("testbed", "orbit")
+    foreign = {*shapes[other].__struct_fields__} - {*shapes[own].__struct_fields__}
     found = next((key for key in document.values if key in foreign), None)
     if found is None:
         return
@@ -573,9 +571,8 @@ def _check_body(document: Document) -> None:
         raise document.error(
             found, f"belongs to `body: {other}`, but no `extends` and no `body` is given: {cure}"
         )
-    raise document.error(
-        found, f"belongs to `body: {other}`, but `body` is {body}: omit it, or change `body`"
-    )
+    cure = {"targets": "give `steps` instead", "steps": "give `targets` instead"}.get(found, "omit it")
+    raise document.error(found, f"belongs to `body: {other}`, but `body` is {body}: {cure}, or change `body`")
 
 
 def _replace_unit(document: Document) -> None:

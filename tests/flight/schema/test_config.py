@@ -140,7 +140,12 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
             "craft:",
             ":[0-9]+: `craft` belongs to `body: orbit`, but no `extends` and no `body` is given: ",
         ),
-        ("plant:", "body: testbed\ncraft:", "`craft` belongs to `body: orbit`, but `body` is testbed"),
+        (
+            "plant:",
+            "body: testbed\ncraft:",
+            "`craft` belongs to `body: orbit`, but `body` is testbed: omit it, or",
+        ),
+        ("\nsteps:", "\nbody: testbed\ntargets:", "but `body` is testbed: give `steps` instead, or"),
         ("duration: 700.0", "", "`duration` is missing: give the duration of the flight, s"),
         (
             "duration: 700.0",
