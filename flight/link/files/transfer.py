@@ -677,21 +677,22 @@ class Entity:
 
     def cancel(self, source: int, number: int) -> None:
         """Cancel an incoming or outgoing transfer. Raises FileError if there is no such transfer."""
-        if source == self.number and number in self._out:
-            self._out[number].cancel()
-        elif (source, number) in self._in:
-            self._in[source, number].stop(Condition.CANCELLED, "cancelled")
+        side = self._transfer(source, number)
+        if isinstance(side, Sender):
+            side.cancel()
         else:
-            raise FileError(f"no transfer {number} of entity {source} is open")
+            side.stop(Condition.CANCELLED, "cancelled")
 
     def suspend(self, source: int, number: int, suspended: bool) -> None:
         """Suspend or resume a transfer. Raises FileError if there is no such transfer."""
-        side: Sender | Receiver | None = self._in.get((source, number))
-        if source == self.number:
-            side = self._out.get(number)
+        self._transfer(source, number).suspend(suspended)
+
+    def _transfer(self, source: int, number: int) -> Sender | Receiver:
+        """Return an open transfer. Raises FileError if there is no such transfer."""
+        side = self._out.get(number) if source == self.number else self._in.get((source, number))
         if side is None:
             raise FileError(f"no transfer {number} of entity {source} is open")
-        side.suspend(suspended)
+        return side
 
     def take(self, unit: bytes, now_ns: int) -> None:
         """Process a received PDU for this entity. Raises PduError, and FileError if the disk fails."""
