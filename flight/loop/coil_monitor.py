@@ -681,6 +681,8 @@ class CoilMonitor:
             return
         left = evidence.possible_faults(self._known)
         if evidence.is_normal_again(self._known, left):
+            if (gain := evidence.monitor_gain(self._known)) is not None:
+                self._doubt_monitor("", gain, now_ns)
             self._reset()
             return
         axes = {axis for axis, _ in left}
