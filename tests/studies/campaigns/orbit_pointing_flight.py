@@ -34,6 +34,7 @@ from knightcube.gnc.control.pointing_law import PathRecovery, PointingLaw, dampi
 from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.estimation.free_filter import (
     ATTITUDE,
+    COIL_ERROR,
     GYRO,
     FilterEnvironment,
     FreeFilter,
@@ -60,7 +61,6 @@ CYCLE, PAUSE = 2.0, 0.2
 """Durations (s) of a cycle and of the pause of the coils."""
 SAMPLES = 4
 """Number of magnetometer samples in a pause of the coils."""
-COIL_ERROR = FreeFilterSettings().coil_error
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
 """Times (s): between star attitudes, between plans, before a failed plan is repeated, and length of the
 prediction."""
