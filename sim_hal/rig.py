@@ -40,7 +40,6 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.errors import UsageError
 from sim_hal.assembly import (
     Hardware,
-    OrbitDevices,
     StarRenderer,
     assemble,
     emulated_camera,
@@ -213,9 +212,7 @@ def posed_camera(
     timeline = FaultTimeline()
     clock.attach(TimedSimulation(lambda _: None, [timeline, device]))
     # The faults of a camera use only these parts of the hardware.
-    parts: Any = SimpleNamespace(
-        camera=device, monitor=None, power=None, faults=timeline, orbit=OrbitDevices()
-    )
+    parts: Any = SimpleNamespace(camera=device, faults=timeline)
     put(faults, Bench(parts, cast(Any, None), clock.now_ns, fault_generator(section.seed)), begun_ns)
     timeline.advance(begun_ns)
     return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))

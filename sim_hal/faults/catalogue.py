@@ -281,6 +281,20 @@ def _nanoseconds(given: Parameters) -> int:
     return round(given["delay"] * 1e9)
 
 
+_PARTS: dict[str, Callable[[Hardware], Sequence[object]]] = {
+    "monitor": lambda hardware: (hardware.monitor,),
+    "camera": lambda hardware: (hardware.camera,),
+    "gps": lambda hardware: (hardware.orbit.gps,),
+    "strings": lambda hardware: (hardware.orbit.cells,),
+    "wide": lambda hardware: hardware.orbit.wide,
+    "battery": lambda hardware: (hardware.power,),
+    "panels": lambda hardware: (hardware.power,),
+    "battery-monitor": lambda hardware: (hardware.power and hardware.power.rails[0],),
+    "bus-monitor": lambda hardware: (hardware.power and hardware.power.rails[1],),
+}
+"""Emulated parts of each device whose faults set an attribute; None for a part that is not configured."""
+
+
 def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
     """Return the `begin` of a fault that sets an attribute of a device to `value` until it is removed.
 
@@ -288,20 +302,8 @@ def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], soun
     """
 
     def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
-        hardware, power = bench.hardware, bench.hardware.power
-        parts: dict[str, Sequence[object]] = {
-            "monitor": (hardware.monitor,),
-            "camera": (hardware.camera,),
-            "gps": (hardware.orbit.gps,),
-            "strings": (hardware.orbit.cells,),
-            "wide": hardware.orbit.wide,
-            "battery": (power,),
-            "panels": (power,),
-            "battery-monitor": (power and power.rails[0],),
-            "bus-monitor": (power and power.rails[1],),
-        }
-        number = round(given.get("camera", 0.0))
-        chosen = [part for index, part in enumerate(parts[fault.device], start=1) if number in {0, index}]
+        number, parts = round(given.get("camera", 0.0)), _PARTS[fault.device](bench.hardware)
+        chosen = [part for index, part in enumerate(parts, start=1) if number in {0, index}]
         held = value(fault, given)
         return all_of([hold(part, attribute, held, sound) for part in chosen])
 
