@@ -544,8 +544,13 @@ class ModeControl:
             if kind is events.BATTERY_CRITICAL and self.mode is not before:
                 self._returns = self._return_to(before)
 
-    def _return_to(self, before: Mode) -> Trigger:
-        """Return the trigger that continues the flight after a low battery has ended the mode `before`."""
+    def _return_to(self, before: Mode) -> Trigger | None:
+        """Return the trigger that continues the flight after a low battery has ended the mode `before`.
+
+        The result is None if the flight would have stayed in SAFE after BOOT.
+        """
+        if before is Mode.BOOT and self._initial is Mode.SAFE:
+            return None
         if self._acquires:
             return Trigger.CHARGED_ACQUIRE
         demo = before is Mode.TESTBED_DEMO or (before is Mode.BOOT and self._initial is Mode.TESTBED_DEMO)

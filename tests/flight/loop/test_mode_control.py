@@ -428,3 +428,15 @@ def test_a_charged_battery_does_not_end_a_safe_mode_with_another_latched_fault()
             bench.facts.update(facts.BATTERY_CRITICAL, critical, bench.now_ns, "charge")
             bench.facts.update(facts.TOO_HOT, True, bench.now_ns, "99 degrees")
     assert bench.mode() is Mode.SAFE
+
+
+@pytest.mark.parametrize("modes", [TESTBED, SATELLITE])
+def test_a_flight_that_is_to_begin_in_safe_stays_there_when_the_battery_is_charged(
+    modes: frozenset[Mode],
+) -> None:
+    bench = ModeBench(modes, Modes(initial="safe"))
+    assert bench.step(answers=False) is Mode.BOOT
+    for critical in (True, False):
+        for _ in range(3):
+            bench.facts.update(facts.BATTERY_CRITICAL, critical, bench.now_ns, "charge")
+        assert bench.mode() is Mode.SAFE
