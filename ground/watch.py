@@ -166,7 +166,8 @@ class PingAnswer:
 
 def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAnswer]:
     """Yield the answers to pings until no answer has been received for `patience` s. Raises UsageError."""
-    packer, answered, shown_ns = CommandPacker(), time.monotonic(), -1
+    packer, answered = CommandPacker(), time.monotonic()
+    shown: frozenset[bytes] = frozenset()  # events of the previous answer
     while not ended.is_set():
         asked = time.monotonic()
         ping = packer.pack(Ping(int(asked * 1e3) & 0xFFFFFFFF), utc_ns())
@@ -181,8 +182,9 @@ def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAn
             continue
         answered = time.monotonic()
         found = packets[EVENT.name]
-        packets[EVENT.name] = found[found["time_ns"] > shown_ns]
-        shown_ns = max([shown_ns, *found["time_ns"].tolist()])
+        # An event may be older than the events before it, because it was held back or the flight restarted.
+        packets[EVENT.name] = found[[row.tobytes() not in shown for row in found]]
+        shown = frozenset(row.tobytes() for row in found)
         yield PingAnswer(packets, int(row["count"]), answered - asked)
 
 

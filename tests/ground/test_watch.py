@@ -311,6 +311,19 @@ def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
         assert "answered in" in line
 
 
+def test_an_event_that_is_older_than_a_shown_event_is_shown_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An event that was held back is recorded later with its own time, and a restart begins at time zero."""
+    monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
+    listener, packer = Listener(tmp_path / "socket"), Packer()
+    newer, older = (event(packer, events.IMU_SILENT, time, f"at {time}") for time in (5.7, 2.3))
+    said = answer(True)
+    listener.will_say(said + newer, said + newer + older, said + newer + older, b"x")
+    lines = command("watch", tmp_path / "socket", "--patience", "0.2").stdout.splitlines()
+    assert [line.split(": ")[1] for line in lines if "imu-silent" in line] == ["at 5.7", "at 2.3"]
+
+
 def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
