@@ -245,9 +245,11 @@ class LinkFeed:
         until = time.monotonic() + _ANSWER_S
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
-            if reports and reports[-1].stage is not Stage.ACCEPTED:
-                # A list command is answered by reports, one per line, after the report of acceptance.
-                listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
+            lists = bool(reports) and reports[-1].name == LIST.name
+            # A list command is answered by one report of its start per line, before the report of completion.
+            awaited = {Stage.ACCEPTED, Stage.STARTED} if lists else {Stage.ACCEPTED}
+            if reports and reports[-1].stage not in awaited:
+                listed = reports[1:] if lists else reports[-1:]
                 text = "; ".join(explained(report) for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
             time.sleep(0.02)

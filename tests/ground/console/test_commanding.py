@@ -15,6 +15,8 @@ import pytest
 
 from flight.link.commands import ChangeMode, CommandPacker
 from flight.link.events import Mode
+from flight.link.telemetry.definitions import VERIFICATION
+from flight.link.telemetry.packets import LAYOUTS
 from ground.console import commanding
 from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles, flying
 from ground.xtce import TELECOMMANDS
@@ -33,10 +35,11 @@ class Satellite:
     def __init__(self, ends: BothEnds, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ends = ends
         # While the terminal waits, the satellite's end of the link runs.
-        monkeypatch.setattr(ends.terminal, "packets", self._packets)
+        monkeypatch.setattr(ends.terminal, "packets", self.packets)
         self.feed = LinkFeed(ends.terminal)
 
-    def _packets(self, seconds: float) -> list[tuple[int, bytes]]:
+    def packets(self, seconds: float) -> list[tuple[int, bytes]]:
+        """Run one cycle of the satellite's end, and return the packets that it sent."""
         before = len(self.ends.packets)
         self.ends.turn(0.5)
         return self.ends.packets[before:]
@@ -82,6 +85,30 @@ def test_the_forms_of_a_link_schedule_a_command_and_list_it(satellite: Satellite
     assert listed["text"] == "1: 2099-01-01T00:00:00Z slew to q2 +0.2000; 1 scheduled"
     with pytest.raises(UsageError, match="new-key: no such command"):
         forms.text("new-key", {})
+
+
+def test_a_schedule_whose_reports_arrive_one_after_another_is_listed_whole(
+    satellite: Satellite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forms = CommandForms(satellite.feed.send, TELECOMMANDS)
+    for minute in (1, 2):
+        given = {"at": f"2099-01-01T00:0{minute}:00", "words": "slew 0.2"}
+        answered(satellite, lambda given=given: forms.obey("schedule", given))  # type: ignore[misc]
+    waiting: list[tuple[int, bytes]] = []
+    report = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
+
+    def up_to_a_report(seconds: float) -> list[tuple[int, bytes]]:
+        waiting.extend(satellite.packets(seconds))
+        reports = (k for k, (_, packet) in enumerate(waiting) if packet[:2] == report)
+        stop = next(reports, len(waiting)) + 1
+        found, waiting[:stop] = waiting[:stop], []
+        time.sleep(0.05)
+        return found
+
+    monkeypatch.setattr(satellite.ends.terminal, "packets", up_to_a_report)
+    listed = answered(satellite, lambda: forms.obey("list-schedule", {}))
+    entries = [f"{k}: 2099-01-01T00:0{k}:00Z slew to q2 +0.2000" for k in (1, 2)]
+    assert listed["text"] == "; ".join([*entries, "2 scheduled"])
 
 
 def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite: Satellite) -> None:
