@@ -52,10 +52,21 @@ class History:
         self._folder.cleanup()
 
     def append(self, packets: Mapping[str, PacketArray]) -> None:
-        """Append packets to the history in order of arrival."""
-        for name, rows in packets.items():
-            if len(rows):
-                self._tracks[name].append(rows)
+        """Append packets to the history in order of arrival.
+
+        Raises OSError if a file cannot be written; the history then contains none of the packets.
+        """
+        added: list[tuple[_Track, int]] = []
+        try:
+            for name, rows in packets.items():
+                if len(rows):
+                    track = self._tracks[name]
+                    added.append((track, len(track.times)))
+                    track.append(rows)
+        except OSError:
+            for track, count in added:
+                track.shorten(count)
+            raise
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -115,6 +126,7 @@ class _Track:
 
     def append(self, rows: PacketArray) -> None:
         with self._path.open("ab") as file:
+            file.truncate(self._count * self._layout.length)  # a failed write may have left bytes
             file.write(rows.tobytes())
         stop = self._count + len(rows)
         if stop > len(self._kept):
@@ -125,6 +137,10 @@ class _Track:
         times[0] = max(times[0], self._kept[self._count - 1] if self._count else times[0])
         self._kept[self._count : stop] = np.maximum.accumulate(times)
         self._count = stop
+
+    def shorten(self, count: int) -> None:
+        """Remove all packets but the first `count`."""
+        self._count = count
 
     def rows(self, first: int, stop: int) -> PacketArray:
         first, stop = max(first, 0), min(stop, self._count)

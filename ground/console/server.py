@@ -30,13 +30,13 @@ from aiohttp.http_exceptions import HttpProcessingError
 from flight.link.commands import Point, words_of
 from flight.link.process.directives import KINDS
 from flight.link.telemetry.definitions import CONTROL, LINK, NAVIGATION, SPIN, TRANSFER, VERIFICATION
-from flight.link.telemetry.packets import LAYOUTS, TelemetryError
+from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import CommandForms, Files
 from ground.console.history import MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
 from ground.documentation import Body, add_components, database, endings
 from ground.watch import PacketSource
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
@@ -86,6 +86,7 @@ class Console:
         files: files of the satellite, or None if the files are not accessible.
         stations: ground stations in the panel of passes until the operator enters other stations.
         settled_ns: newest time (ns) up to which all packets have been received, which the live page shows.
+        unstored: packets that were read but could not be stored in the history yet.
         sockets: open WebSockets.
     """
 
@@ -102,6 +103,7 @@ class Console:
     trouble: str = ""
     doubts: tuple[Callable[[], str], ...] = ()
     settled_ns: int = 0
+    unstored: dict[str, PacketArray] = field(default_factory=dict)
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
     @property
@@ -116,14 +118,18 @@ class Console:
 
     def read(self) -> None:
         """Read the new packets. A failure is stored in `trouble`, and the next read tries again."""
+        newest_ns = self.history.span_ns[1]
         try:
-            packets = self.feed.new()
+            self.unstored = self.unstored or self.feed.new()
+            self.history.append(self.unstored)
         except KnightCubeError as error:
             self.trouble = str(error)
             return
+        except OSError as error:
+            self.trouble = f"the console cannot store new packets: {reason_of(error)}: free disk space"
+            return
+        packets, self.unstored = self.unstored, {}
         self.trouble = "; ".join(text for doubt in self.doubts if (text := doubt()))
-        newest_ns = self.history.span_ns[1]
-        self.history.append(packets)
         # Packets of one time may arrive in two reads, so the page shows times up to the previous read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]

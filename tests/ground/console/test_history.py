@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import io
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from flight.link.telemetry.packets import LAYOUTS
+from ground.console.commanding import CommandForms
 from ground.console.history import History, PageCursor, PageState, values
+from ground.console.server import Console
+from ground.console.surroundings import UNKNOWN
 from ground.telemetry import Run, read_run
 from tests.ground.report.synthetic import Recipe, make_run
 
@@ -112,3 +120,34 @@ def test_a_cursor_moves_at_its_speed_stays_within_and_goes_live_again() -> None:
     assert [cursor.at_ns(span, now) for now in (100.0, 101.0, 200.0)] == [2 * 10**9, 5 * 10**9, span[1]]
     assert cursor.obey('{"live": true}', 200.0)
     assert cursor.live
+
+
+def test_packets_that_the_disk_refuses_are_stored_whole_later(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file on a full disk keeps the first bytes of a failed write."""
+    packets = {name: rows for name, rows in run.flight.packets.items() if len(rows) > 1}
+    halves = [{name: rows[part] for name, rows in packets.items()} for part in (slice(1), slice(1, None))]
+
+    class FullDisk(io.FileIO):
+        def write(self, data: Any, /) -> int:
+            super().write(bytes(data)[:7])
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def opened(path: Path, mode: str = "r") -> Any:
+        full = path.name.startswith(max(packets)) and mode == "ab"
+        return FullDisk(path, "ab") if full else open(path, mode)
+
+    with History() as history:
+        history.append(halves[0])
+        feed = Mock(new=Mock(return_value=dict(run.flight.packets) | halves[1]))
+        console = Console("run", feed, history, UNKNOWN, CommandForms(None))
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "open", opened)
+            console.read()
+            assert "No space left" in console.trouble
+            assert {name: history.count(name, LATER) for name in packets} == dict.fromkeys(packets, 1)
+        console.read()
+        assert (console.trouble, feed.new.call_count) == ("", 1)
+        for name, rows in packets.items():
+            assert history.rows(name, 0, 10**9).tobytes() == rows.tobytes()
