@@ -570,6 +570,8 @@ RANGE_ERROR = 3.0
 """Assumed standard deviation (m) of the position for a dilution of precision of 1."""
 KNOT = 1852.0 / 3600.0
 _LONGEST = 4096
+_FIELDS = {"RMC": 10, "GGA": 12}
+"""Minimum numbers of fields of the sentences from which a reading is made."""
 _VERTICAL_SPEED_S = 10.0
 """Longest time (s) between two fixes from which a vertical velocity is computed."""
 _NO_FIX = "the receiver has no fix: check the antenna and the view of the sky"
@@ -636,7 +638,7 @@ class NmeaReceiver:
     def _take(self, fields: list[str], arrival_ns: int, length: int) -> GpsReading | None:
         """Return the reading that a sentence completes, or None if the other sentence is missing."""
         kind = fields[0][2:]
-        if kind not in {"RMC", "GGA"} or len(fields) < 10:
+        if len(fields) < _FIELDS.get(kind, math.inf):
             return None
         other = self._halves.get("GGA" if kind == "RMC" else "RMC")
         self._halves[kind] = fields
@@ -645,7 +647,7 @@ class NmeaReceiver:
         try:
             pvt = self._pvt(self._halves["RMC"], self._halves["GGA"])
             reading = reading_of(pvt, arrival_ns, self._port.baud_rate, self._earliest_ns, length)
-        except (ValueError, OutOfRange) as error:
+        except (ValueError, OverflowError, OutOfRange) as error:
             self._out_of_range += 1
             self._condition = f"a sentence is implausible: {error}"
             return None
@@ -659,7 +661,7 @@ class NmeaReceiver:
     def _pvt(self, rmc: list[str], gga: list[str]) -> Pvt:
         """Return the content of the sentences RMC and GGA in the units of a NAV-PVT message.
 
-        Raises ValueError.
+        Raises ValueError or OverflowError.
         """
         clock, date = rmc[1], rmc[9]
         fix = gga[6] not in {"", "0"} and rmc[2] == "A"
@@ -699,6 +701,9 @@ class NmeaReceiver:
 
 
 def _degrees(text: str, hemisphere: str) -> float:
-    """Return an angle (deg) written as degrees and minutes (dddmm.mmmm). Raises ValueError."""
+    """Return an angle (deg) written as degrees and minutes (dddmm.mmmm).
+
+    Raises ValueError or OverflowError.
+    """
     whole = int(float(text)) // 100
     return (whole + (float(text) - 100.0 * whole) / 60.0) * (-1.0 if hemisphere in {"S", "W"} else 1.0)

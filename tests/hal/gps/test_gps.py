@@ -303,7 +303,14 @@ def test_a_damaged_sentence_is_counted_and_not_used(index: int) -> None:
     assert driver.link().bad_checksum == 1
 
 
-def test_text_instead_of_numbers_is_refused() -> None:
-    readings, driver = read(rmc(), sentence("GNGGA,120000.00,north,N,01215.0,E,1,09,1.0,1.0,M,0.0,M,,"))
+def test_a_sentence_that_lacks_fields_is_not_used() -> None:
+    short = sentence("GNGGA,120000.00,4530.000,N,01215.000,E,1,09,1.0,100.0,M")
+    readings, _ = read(rmc(), short, rmc("120001.00"), gga("120001.00"))
+    assert len(readings) == 1
+
+
+@pytest.mark.parametrize("latitude", ["north", "inf", "nan", "1e999"])
+def test_text_instead_of_numbers_is_refused(latitude: str) -> None:
+    readings, driver = read(rmc(), sentence(f"GNGGA,120000.00,{latitude},N,01215.0,E,1,09,1.0,1.0,M,0.0,M,,"))
     assert readings == []
     assert driver.link().out_of_range == 1
