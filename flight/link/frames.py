@@ -119,9 +119,13 @@ class TelemetryFramer:
         return bool(self._data)
 
     def add(self, packet: bytes) -> list[bytes]:
-        """Add a packet and return the frames that it completes."""
+        """Add a packet and return the frames that it completes. If `seal` fails, the packet is kept."""
         self._starts.append(len(self._data))
         self._data += packet
+        return self.take()
+
+    def take(self) -> list[bytes]:
+        """Return the completed frames, of which there are none unless `seal` failed in an earlier call."""
         return [self._take() for _ in range(len(self._data) // self._room)]
 
     def flush(self) -> list[bytes]:

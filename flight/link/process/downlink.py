@@ -295,14 +295,19 @@ class Downlink:
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:
-        """Return the frames that are due at `now_ns`. Raises KnightCubeError if no frame can be protected."""
+        """Return the frames that are due at `now_ns`.
+
+        Raises KnightCubeError if no frame can be protected. No further packets are then taken from the queues
+        until the completed frames can be protected.
+        """
         before = now_ns if self._credit_ns is None else self._credit_ns
         most = max(2.0 * self._frame_bytes, self._rate * _BURST_S)
         self._credit = min(most, self._credit + self._rate * (now_ns - before) * 1e-9)
         self._credit_ns = now_ns
         due: list[bytes] = []
         while self._credit >= self._frame_bytes:
-            made = self._next_live(now_ns) or self._next_in_turn()
+            late = next(filter(None, (one.take() for one in (self._live, self._replay, self._filed))), None)
+            made = late or self._next_live(now_ns) or self._next_in_turn()
             if not made:
                 break
             due += made

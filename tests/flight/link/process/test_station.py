@@ -6,7 +6,7 @@ import errno
 import math
 import os
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,15 @@ import pytest
 
 from flight.link.commands import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
 from flight.link.events import Mode
+from flight.link.frames import idle_packet
 from flight.link.process import directives, station
 from flight.link.process.directives import Deletion, NewKey, Play, Stop
-from flight.link.process.downlink import LIVE, PLAYBACK
+from flight.link.process.downlink import LIVE, PLAYBACK, Downlink
 from flight.link.security import Admitted
 from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, crc16
+from hal.interfaces.wires import SECOND_NS
+from knightcube.errors import KnightCubeError
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.flight.link.vaults import frame_with
@@ -365,6 +368,26 @@ def test_without_counters_of_telemetry_the_reserve_serves_and_commands_always_co
         assert bool(link.packets) is survives
         assert len(link.obeyed) == spi - 2
         assert (link.stages(counter)[-1:] == ["completed"]) is survives
+
+
+def test_telemetry_returns_at_the_rate_of_the_line_after_a_time_without_keys() -> None:
+    """Lets 1200 bytes/s of reports wait for a minute, and then reads one second of frames of 128 bytes."""
+    keys: list[str] = []
+
+    def seal(header: bytes, data: bytes) -> bytes:
+        if not keys:
+            raise KnightCubeError("no key")
+        return header + bytes(14) + data + bytes(16)
+
+    downlink = Downlink(1, 128, 1200.0, seal, lambda: None)
+    for number in range(600):
+        downlink.report(idle_packet(120))
+        with suppress(KnightCubeError):
+            downlink.frames(number * SECOND_NS // 10)
+    keys.append("a key")
+    made = [len(downlink.frames(60 * SECOND_NS + number * SECOND_NS // 50)) for number in range(51)]
+    assert 8 <= sum(made) <= 12
+    assert sum(made[26:]) >= 4
 
 
 @pytest.mark.parametrize("damage", [b"", b"\0", b"x" * 40])
