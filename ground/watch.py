@@ -18,9 +18,11 @@ from flight.link import events
 from flight.link.commands import CommandPacker, Ping
 from flight.link.process.commanding import Stage
 from flight.link.telemetry.definitions import (
+    ATTITUDE,
     COMMAND,
     EVENT,
     FACTS,
+    HEALTH,
     LINK,
     MODES,
     SEVERITIES,
@@ -50,6 +52,8 @@ _FROM_START_S = 0.1  # mission time (s) up to which the first packet of a comple
 _REPEATED = frozenset({"run", "parameters"})  # packets of the start that a flight sends again later
 _OF_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name, "run"})
 """Packets that the link process sends also without a flight."""
+_OF_EACH_FLIGHT = frozenset({ATTITUDE.name, HEALTH.name})
+"""Periodic packets of a flight, whose times decrease only if the flight restarts."""
 _BAD_STAGES = frozenset({Stage.REFUSED, Stage.FAILED})
 
 
@@ -232,7 +236,13 @@ class FlightState:
         self._received = time.monotonic()
 
     def update(self, packets: Mapping[str, PacketArray]) -> list[LoggedEvent]:
-        """Update the state with new packets and return the events and failed commands among them."""
+        """Update the state with new packets and return the events and failed commands among them.
+
+        If the flight has restarted, mission time and number of faults begin at zero again.
+        """
+        for name in _OF_EACH_FLIGHT & packets.keys() & self.newest.keys():
+            if len(packets[name]) and packets[name][-1]["time_ns"] < self.newest[name]["time_ns"]:
+                self.time, self.ended, self.faults, self.since = 0.0, "", 0, None
         found = [
             LoggedEvent(
                 float(row["time_ns"]) * 1e-9,
@@ -347,8 +357,9 @@ class PlainLines:
             inside = {name: rows[slots[name] == slot] for name, rows in packets.items()}
             for event in self._state.update(inside):
                 self._write(event_line(event, self._state.utc(event.time)) + "\n")
-            if slot > self._written:
-                self._written = slot
+            newest = math.floor(min(self._state.time, _MAX_TIME) / self._every)
+            if newest != self._written:
+                self._written = newest
                 self._write(state_line(self._state) + "\n")
 
 

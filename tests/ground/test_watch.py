@@ -465,6 +465,19 @@ def test_failed_commands_of_a_link_are_shown() -> None:
     ]
 
 
+def test_a_flight_that_restarts_is_shown_from_its_start_on() -> None:
+    lines: list[str] = []
+    shown, packer = PlainLines(FlightState(), 1.0, lines.append), Packer()
+    before = [pack(packer, HEALTH, 100.0 + k, mode=3) for k in range(2)]
+    after = [pack(packer, HEALTH, 0.5 + k, mode=1) for k in range(2)]
+    late = event(packer, events.IMU_SILENT, 97.0, "held back")
+    for data in (*before, late, *after):
+        shown.feed(scan(data).packets)
+    states = [line.split()[0] for line in lines if "alarms" in line]
+    assert states == ["100.000", "101.000", "0.500", "1.500"]
+    assert lines[-1].endswith("faults received 0 since 0.5 s\n")
+
+
 def test_faults_that_were_not_recorded_are_counted() -> None:
     state, fault = FlightState(), int(events.Severity.FAULT)
     state.update(scan(pack(Packer(), EVENT, 5.0, severity=fault, name="imu-silent", suppressed=4)).packets)
