@@ -45,12 +45,15 @@ def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path
     the measured right ascension and declination (ICRS) at mid-exposure of each frame. Stellar aberration due
     to the camera's velocity is corrected, but light time is not. Standard deviations are written as comments,
     because the message format has no keyword for them. The keyword MAG gives the mean magnitude of the last
-    sightings. Raises UsageError if no object was tracked or `path` cannot be written.
+    sightings. Raises UsageError if no object was tracked, or if `path` has the suffix `.oem` or cannot be
+    written.
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
     if not len(measured) or not len(run["run"]):
         raise _no_object(run)
+    if path.suffix == ".oem":
+        raise UsageError(f"{path}: the suffix .oem is for the orbit beside the tracks: give another suffix")
     start_ns = int(run["run"]["utc_ns"][-1])
     lines = _header("CCSDS_TDM_VERS = 2.0")
     for number in sorted(set(measured["number"].tolist())):

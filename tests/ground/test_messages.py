@@ -54,6 +54,8 @@ def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path:
         ],
     )
     path = tmp_path / "new" / "tracks.tdm"
+    with pytest.raises(UsageError, match=r"tracks\.oem: the suffix \.oem is for the orbit beside the tracks"):
+        messages.write_tracking_data(run, path.with_suffix(".oem"))
     assert messages.write_tracking_data(run, path) == [path]
     text = path.read_text(encoding="ascii")
     assert text.endswith("\n")
