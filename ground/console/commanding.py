@@ -153,10 +153,12 @@ def _text_of(data: bytes) -> str:
 
 def _value(name: str, field: Field, given: Any) -> Any:
     """Return a field's value. An empty input is NaN in a field that permits NaN. Raises UsageError."""
-    if field.count > 1 and isinstance(given, str):
+    if field.count > 1 and field.kind == "u1" and isinstance(given, str):
         return _bytes(name, field, given)
     if field.count > 1:
         items = list(given) if isinstance(given, list) else [given] if given is not None else []
+        if len(items) > field.count:
+            raise UsageError(f"{name}: {field.name} has {len(items)} values: give at most {field.count}")
         return [_number(name, field, item) for item in [*items, *[None] * field.count][: field.count]]
     return str(given or "") if field.kind.startswith("S") else _number(name, field, given)
 

@@ -359,6 +359,16 @@ def test_the_confirmation_of_a_command_is_in_words() -> None:
     assert forms.text("schedule", scheduled) == "at 2099-01-01T00:00:00: mode safe: night"
 
 
+@pytest.mark.parametrize(
+    ("numbers", "complaint"),
+    [([0.0, 0.0, 0.0, 1.0, 0.5], "numbers has 5 values: give at most 4"), ("00000001", "must be finite")],
+)
+def test_an_inertial_goal_needs_four_numbers(numbers: Any, complaint: str) -> None:
+    given = {"goal": int(Goal.INERTIAL), "numbers": numbers}
+    with pytest.raises(UsageError, match=complaint):
+        CommandForms(None).text("point", given)
+
+
 def test_a_satellite_points_by_named_numbers_and_refuses_what_only_a_testbed_obeys() -> None:
     forms = CommandForms(None, TELECOMMANDS)
     forms.body = "orbit"
