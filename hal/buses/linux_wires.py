@@ -393,12 +393,14 @@ class LinuxSpiDevice:
 
     def __init__(self, device: str, speed_hz: int, mode: int) -> None:
         """Open the device at a clock rate (Hz) in an SPI mode, 0 to 3. Raises NotResponding."""
-        self._speed_hz = speed_hz
+        self._speed_hz, self._descriptor = speed_hz, -1
         try:
             self._descriptor = os.open(device, os.O_RDWR | os.O_CLOEXEC)
             ioctl(self._descriptor, SPI_MODE, pack("=B", mode))
             ioctl(self._descriptor, SPI_SPEED, pack("=I", speed_hz))
         except OSError as error:
+            if self._descriptor >= 0:
+                os.close(self._descriptor)
             cure = "is the SPI bus enabled, and may this user open it?"
             raise NotResponding(device, f"cannot be opened ({error.strerror}): {cure}") from error
 
@@ -449,6 +451,7 @@ class LinuxWires:
         self._patient, self._exclusive = patient, exclusive
         self._ports: dict[str, PySerialPort] = {}
         self._buses: dict[str, LinuxI2cBus] = {}
+        self._spi: dict[tuple[str, int, int], LinuxSpiDevice] = {}
 
     def serial(self, device: str, baud_rate: int) -> PySerialPort:
         """Return the serial port of a device file. Raises NotResponding."""
@@ -471,6 +474,8 @@ class LinuxWires:
 
     def spi(self, device: str, speed_hz: int, mode: int) -> LinuxSpiDevice:
         """Return a device on an SPI bus. Raises NotResponding."""
-        opened = LinuxSpiDevice(device, speed_hz, mode)
-        self._stack.callback(opened.close)
-        return opened
+        # A sensor that does not answer is started again and again, and must not open a file each time.
+        if (device, speed_hz, mode) not in self._spi:
+            opened = self._spi[device, speed_hz, mode] = LinuxSpiDevice(device, speed_hz, mode)
+            self._stack.callback(opened.close)
+        return self._spi[device, speed_hz, mode]

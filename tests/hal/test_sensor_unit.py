@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import errno
+import os
 import struct
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flight.schema.devices import axis_matrix
-from hal.buses.linux_wires import LinuxSpiDevice
+from hal.buses.linux_wires import LinuxSpiDevice, LinuxWires
 from hal.buses.system import SystemClock
 from hal.drivers.sensor_unit import (
     Adis16470,
@@ -248,6 +251,27 @@ def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
         assert (length, speed, bits, change) == (2, 1_000_000, 8, reselected)
         assert gap >= 16
         assert 0 not in {sent, received}
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_a_sensor_that_is_started_again_and_again_opens_its_spi_device_once(
+    works: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    device = tmp_path / "spidev0.0"
+    device.touch()
+
+    def ioctl(*_: object) -> int:
+        if not works:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        return 0
+
+    monkeypatch.setattr("hal.buses.linux_wires.ioctl", ioctl)
+    with ExitStack() as stack:
+        wires, before = LinuxWires(SystemClock(), stack, 1), len(os.listdir("/proc/self/fd"))
+        for _ in range(10):
+            with suppress(NotResponding):
+                wires.spi(str(device), 1_000_000, 3)
+        assert len(os.listdir("/proc/self/fd")) == before + works
 
 
 def test_an_spi_device_that_is_missing_is_named_with_the_cure() -> None:
