@@ -46,7 +46,9 @@ from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import CameraDevice, ServedCamera
 from hal.drivers.coils import (
     CONTROL,
+    LAST_STEP,
     OFF,
+    STEP_V,
     CoilSettings,
     Drv8830Bridges,
     Drv8830Coils,
@@ -409,7 +411,15 @@ def coil_settings(coils: Coils) -> CoilSettings:
     return CoilSettings(wired, coils.supply_voltage, max(coils.limits), coils.stale_after)
 
 
-check_pca9685 = check_drv8830 = coil_settings
+check_pca9685 = coil_settings
+
+
+def check_drv8830(coils: Coils) -> CoilSettings:
+    """Return the settings of coils on DRV8830 bridges. Raises OutOfRange beyond their highest voltage."""
+    volts, most = coils.supply_voltage, round(LAST_STEP * STEP_V, 2)
+    if volts > most:
+        raise OutOfRange("coils", "supply voltage of DRV8830 bridges", volts, 0.1, most, "V")
+    return coil_settings(coils)
 
 
 def open_pca9685(rig: Rig, coils: Coils) -> TorqueCoils:
@@ -430,7 +440,7 @@ def off_pca9685(coils: Coils) -> Sequence[tuple[int, int, int]]:
 
 def open_drv8830(rig: Rig, coils: Coils) -> TorqueCoils:
     """Return the driver of coils on DRV8830 bridges."""
-    settings = coil_settings(coils)
+    settings = check_drv8830(coils)
     bridges = Drv8830Bridges(rig.wires.i2c(coils.bus), coils.address, rig.clock, settings)
     return Drv8830Coils(bridges, rig.clock, settings)
 

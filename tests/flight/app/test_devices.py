@@ -11,7 +11,7 @@ import pytest
 from flight.app import devices
 from flight.schema.devices import Sensor, SensorsSection
 from flight.schema.document import ConfigError
-from hal.interfaces.errors import NotResponding
+from hal.interfaces.errors import NotResponding, OutOfRange
 
 
 @pytest.mark.parametrize("answers", [True, False])
@@ -51,3 +51,18 @@ def test_axes_that_no_sensor_has_are_refused(quantity: str, names: tuple[str, ..
     with pytest.raises(ConfigError, match=problem) as caught:
         devices.open_sensors(Mock(), section)
     assert caught.value.where == f"inertial_unit.sensors[0].measures.{quantity}"
+
+
+def test_a_voltage_that_no_drv8830_has_is_refused() -> None:
+    """The highest output voltage of the chip is 5.06 V (TI SLVSAB2, table 1)."""
+    section = {
+        "channels": [(0, 1)],
+        "resistance": [23.0],
+        "signs": [1],
+        "limits": [0.2],
+        "stale_after": 0.25,
+        "supply_voltage": 5.0,
+    }
+    assert devices.check_drv8830(cast(Any, SimpleNamespace(**section))).supply_voltage == 5.0
+    with pytest.raises(OutOfRange, match="supply voltage of DRV8830 bridges"):
+        devices.check_drv8830(cast(Any, SimpleNamespace(**section | {"supply_voltage": 6.0})))
