@@ -386,7 +386,7 @@ class Gate:
         """
         self._vault, self._parse, self._mask, self._window = vault, parse, mask, window
         self._store_every, self._encrypted = store_every, encrypted
-        self._ciphers: dict[tuple[int, int], AESGCM] = {}
+        self._ciphers: dict[bytes, AESGCM] = {}
         self._open: dict[int, Association | None] = {spi: vault.read(spi) for spi in spis}
         for entry in self._open.values():
             if entry is not None and vault.copies(entry.spi) < len(COPIES):
@@ -460,9 +460,9 @@ class Gate:
         return entry
 
     def _cipher(self, entry: Association) -> AESGCM:
-        known = self._ciphers.get((entry.spi, entry.generation))
+        known = self._ciphers.get(entry.key)
         if known is None:
-            known = self._ciphers[entry.spi, entry.generation] = entry.cipher
+            known = self._ciphers[entry.key] = entry.cipher
         return known
 
     def _by_newer_key(self, entry: Association, header: bytes, protected: bytes) -> tuple[Association, bytes]:
@@ -478,11 +478,10 @@ class Gate:
             data = unprotect(newer.cipher, header, self._mask, protected, self._encrypted)
             if data is None:
                 continue
-            if name == spi:
-                self._open[spi], self._stored[spi] = newer, newer.unused
-            else:
-                self.replace_key(spi, newer.generation, newer.key)
+            # A next key that could not be stored as the present key is kept for the next start.
+            if name != spi and self.replace_key(spi, newer.generation, newer.key):
                 self._vault.remove(name)
+            self._open[spi], self._stored[spi] = newer, newer.unused
             return newer, data
         raise RefusedError(Refusal.MAC, spi)
 

@@ -216,6 +216,36 @@ def test_every_process_of_the_ground_follows_a_new_key_of_telemetry(sky: Vault, 
     assert cause(gates[1], before) is Refusal.MAC
 
 
+def test_a_next_key_that_cannot_be_stored_is_not_lost(
+    sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    following = Association(1, 2, 0, new_key())
+    ground.write(following, f"1-{NEXT}")
+    sky.write(following)
+    sender = Ground(sky)
+
+    def fail(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as broken:
+        entrance, frame = Gate(ground, [1], parse, TELECOMMAND_MASK, store_every=256), sender.frame(b"first")
+        broken.setattr(os, "pwrite", fail)
+        assert entrance.admit(frame).data == b"first"
+    restarted = Gate(ground, [1], parse, TELECOMMAND_MASK, store_every=256)
+    assert restarted.admit(sender.frame(b"second")).data == b"second"
+    assert ground.read(1) == following
+
+
+def test_a_new_key_of_the_same_generation_replaces_the_old_key(sky: Vault, ground: Vault) -> None:
+    entrance, old = gate(sky), Ground(ground)
+    entrance.admit(old.frame(b"old"))
+    late, changed = old.frame(b"late"), Association(1, 1, 0, new_key())
+    assert entrance.replace_key(1, 1, changed.key)
+    ground.write(changed)
+    assert cause(entrance, late) is Refusal.MAC
+    assert entrance.admit(Ground(ground).frame(b"new")).data == b"new"
+
+
 def test_a_counter_that_cannot_be_stored_lets_nothing_in(
     sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
 ) -> None:
