@@ -333,6 +333,8 @@ class Timetable:
         copy = _Copy(self._now.version + 1, last, entries)
         data = to_record(msgspec.json.encode(copy))
         if not sum([overwrite(self._path(name), data) for name in COPIES]):
+            # A version is never reused, because a write that failed may have reached the disk.
+            self._now = msgspec.structs.replace(self._now, version=copy.version)
             raise TimetableError("the schedule could not be stored")
         self._now = copy
 

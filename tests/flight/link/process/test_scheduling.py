@@ -220,6 +220,22 @@ def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
     assert len(again.entries) == (writes == 0)
 
 
+def test_an_entry_whose_removal_reached_one_copy_is_not_there_after_a_failed_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first write reaches the disk although it fails, and the next write reaches the second copy only."""
+    table = Timetable(tmp_path)
+    table.add(5, 1, 9, "ping 1")
+    monkeypatch.setattr(commanding, "overwrite", lambda path, data: overwrite(path, data) and False)
+    with pytest.raises(TimetableError):
+        table.add(6, 1, 10, "ping 2")
+    monkeypatch.setattr(
+        commanding, "overwrite", lambda path, data: path.name.endswith("b") and overwrite(path, data)
+    )
+    table.remove(1)
+    assert Timetable(tmp_path).entries == ()
+
+
 def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
     link: BothEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
