@@ -378,8 +378,9 @@ class Renewal:
         with suppress(OSError, *_DAMAGED):
             modified_ns = self._status.stat().st_mtime_ns
             if modified_ns != self._modified_ns:
+                entries = decoded(read_regular(self._status, _LARGEST) or b"")["reports"]
                 self._modified_ns = modified_ns
-                return self._reports(decoded(read_regular(self._status, _LARGEST) or b"")["reports"])
+                return self._reports(entries)
         return []
 
     def _reports(self, entries: list[list[Any]]) -> list[Report]:

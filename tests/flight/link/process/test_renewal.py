@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from flight.link import events
 from flight.link.events import Mode
+from flight.link.process import filing
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
 from flight.link.process.filing import Renewal, decoded, encoded
 from flight.link.telemetry.definitions import EVENT, FIX
@@ -86,6 +88,22 @@ def test_an_activation_is_a_request_for_exactly_the_checked_bytes(ends: Ends) ->
     ends.restart()
     ends.turn(2.5)
     assert len(stages(ends, "activate")) == 4, "a restarted link repeats no report"
+
+
+def test_a_report_that_could_not_be_read_once_is_sent_later(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    ends.turn(2.5)
+    with monkeypatch.context() as broken:
+        broken.setattr(filing, "read_regular", fail)
+        ends.write_status([1, "", "failed", "activate", "no"])
+        ends.turn(2.5)
+    assert stages(ends, "activate") == []
+    ends.turn(2.5)
+    assert stages(ends, "activate") == [("failed", "no")]
 
 
 def test_an_activation_has_the_time_of_the_receiver_and_never_that_of_the_host(ends: Ends) -> None:
