@@ -97,20 +97,24 @@ class LogFollower:
         return packets
 
     def _go_on(self) -> None:
-        """Continue with the next segment, or with a newer run if the current run has no further segment."""
-        if self._path is not None:
+        """Continue with the next segment, or with a newer run if the current run has no further segment.
+
+        If the current segment was removed, which the flight answers with a new log, read from the oldest one.
+        """
+        is_gone = self._path is not None and _size(self._path) < self._offset
+        if self._path is not None and not is_gone:
             number = _number(self._path)
             later = [path for path in _segments(self._path.parent) if _number(path) > number]
             if later:
                 self._path, self._offset = later[0], 0
                 return
-        self._attach()
+        self._attach(again=is_gone)
 
-    def _attach(self, *, at_end: bool = False) -> None:
+    def _attach(self, *, at_end: bool = False, again: bool = False) -> None:
         runs = _runs(self.place)
         newest = runs[-1] if runs else self.place
         segments = _segments(newest)
-        if newest == self._run or not segments:
+        if (newest == self._run and not again) or not segments:
             return
         self._run, self._path, self._offset = newest, segments[0], 0
         self._stream = _PacketStream()
@@ -167,6 +171,14 @@ def _segments(folder: Path) -> list[Path]:
 def _number(path: Path) -> int:
     """Return the number at the end of a segment's file name."""
     return int(path.stem.rpartition("-")[2])
+
+
+def _size(path: Path) -> int:
+    """Return the size (bytes) of a file, or -1 if the file is missing."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
 
 
 def _read(path: Path, offset: int) -> bytes:

@@ -20,6 +20,7 @@ from flight.link.process.directives import Deletion, NewKey, Play, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK, Downlink
 from flight.link.security import Admitted
 from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
+from flight.link.telemetry.log import SegmentStore
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, crc16
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError
@@ -272,6 +273,26 @@ def test_an_archive_that_cannot_be_listed_for_a_while_ends_nothing(
     link.record(*timing_packets(3))
     link.turn(1.0)
     assert link.of("cycle_timing") == timing_packets(3)
+
+
+@pytest.mark.parametrize(("count", "segments"), [(200, 1), (2000, 2)])
+def test_a_log_that_was_removed_and_begun_again_is_followed(
+    link: BothEnds, count: int, segments: int
+) -> None:
+    """The new log of the same run begins with the first segment again."""
+    folder = link.place / "runs" / "run-000001"
+    link.record(*timing_packets(count))
+    link.turn(4.0)
+    removed = list(folder.glob("flight-*"))
+    assert len(removed) == segments
+    link.log.close()
+    for path in removed:
+        path.unlink()
+    link.turn(1.0)
+    link.log, before = SegmentStore(folder, "flight", 1 << 16, 1 << 24), len(link.of("cycle_timing"))
+    link.record(*timing_packets(5))
+    link.turn(2.0)
+    assert link.of("cycle_timing")[before:] == timing_packets(5)
 
 
 def test_live_packets_come_in_order_and_none_is_lost(link: BothEnds) -> None:
