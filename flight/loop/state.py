@@ -355,7 +355,7 @@ class LinuxFiles:
 
 
 def replace_file(files: LinuxFiles, path: Path, data: bytes) -> None:
-    """Replace the content of a file durably. If OSError is raised, the file keeps its old content."""
+    """Replace the content of a file durably. After an OSError, the file has its old or its new content."""
     temporary = path.with_suffix(".tmp")
     file = files.create(temporary)
     try:

@@ -8,8 +8,8 @@ separate performance log. The flight log of a lock-step simulation is reproducib
 
 Each boot creates a new run folder such as `run-000042`, into which no later boot writes. Runs are ordered by
 number, because the wall clock of the flight computer may be wrong. The oldest runs are deleted if the archive
-exceeds its budget or the disk is full, but the last run is never deleted. If the disk cannot be written, the
-flight continues without a log.
+exceeds its budget or the disk is full; a full disk alone does not delete the last run. If the disk cannot be
+written, the flight continues without a log.
 """
 
 from __future__ import annotations
