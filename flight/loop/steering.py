@@ -287,7 +287,9 @@ class Steering:
             current, text = False, "neither gyro nor estimate gives the rate: coils set to zero"
         self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)
         if not current:
-            return self.rest(now_ns)
+            steered = self.rest(now_ns)
+            law.sent(self._drive.command)
+            return steered
         self._body.control.tracker.reset()
         wanted = law.command(now_ns)
         self._drive.send(wanted.currents, lambda: law.field(now_ns))

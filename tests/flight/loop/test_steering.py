@@ -307,6 +307,8 @@ def test_old_readings_set_the_coils_to_zero() -> None:
     assert flown.steering.detumble([], False, 7).state is SteeringState.OFF
     assert flown.said["control-lost"] == (True, "readings too old for detumbling: coils set to zero")
     flown.body.control.detumbling.command.assert_not_called()
+    (sent,) = flown.body.control.detumbling.sent.call_args.args
+    assert sent.tolist() == [0.0, 0.0, 0.0], "the law propagates the motion without a dipole moment"
 
 
 def test_a_body_without_sun_acquisition_rests() -> None:
