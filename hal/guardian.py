@@ -150,12 +150,11 @@ class Guardian:
         self._flight, self._switch, self._now_ns = flight, switch, now_ns
         self._watch = Watch(now_ns())
         self._reported = 0  # number of reported interruptions of the heartbeats
-        self._failing = False
+        self._failing = self._is_ready = False
 
     def serve(self) -> None:
         """Run the guardian until the flight process sends the goodbye message or dies."""
-        if self._switch.off():
-            self._send(READY)
+        self._zero()
         while not self._watch.over(self._now_ns()):
             if self._listen():
                 self._switch.off()
@@ -189,6 +188,9 @@ class Guardian:
             return
         self._failing = False
         self._watch.acknowledged()
+        if not self._is_ready:
+            self._is_ready = True
+            self._send(READY)
         if self._watch.outages > self._reported:
             self._reported = self._watch.outages
             self._send(ACTED)

@@ -149,6 +149,16 @@ def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
     assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
 
 
+def test_coils_that_answer_only_after_the_start_are_reported_as_zero(log: Path) -> None:
+    broken = log.with_name("bytes.broken")
+    broken.touch()
+    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ((ADDRESS, 0xFD, 0x10),)))
+    line.wait_ready(10.0, patient=True)
+    broken.unlink()
+    assert news_until(line, GuardianNews.READY) == [GuardianNews.READY]
+    line.close()
+
+
 def test_a_guardian_that_hangs_is_replaced_and_reported(guardian: GuardianLine) -> None:
     first = guardian.process_id
     os.kill(first, signal.SIGSTOP)
