@@ -475,7 +475,9 @@ class Station:
         folder = vault.folder.absolute().parent / "renewal"
         self._renewal = Renewal(folder, settings.renewal, settings.command_loss)
         self._verification = Verification()
-        self._packer, self._commands, self._joiner = Packer(), CommandPacker(), directives.Joiner()
+        self._packer, self._commands = Packer(), CommandPacker()
+        # Portions that were sent with different keys are not joined.
+        self._joiners = {spi: directives.Joiner() for spi in COMMAND_SPIS}
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._label, self._zero_utc_ns = b"", 0
         self._utc_offset_ns: int | None = None  # best known UTC minus the time of the host's clock
@@ -614,7 +616,7 @@ class Station:
         """
         if is_unit(admitted.data, UP) or not isinstance(portion := directives.unpack(admitted.data), Portion):
             return admitted
-        whole = self._joiner.add(portion)
+        whole = self._joiners[admitted.spi].add(portion)
         return replace(admitted, data=whole) if whole else admitted
 
     def _hand_over(self, sent: Sent, packet: bytes, now_ns: int) -> None:

@@ -16,7 +16,7 @@ from flight.link.commands import ChangeMode, Command, CommandError, CommandPacke
 from flight.link.events import Mode
 from flight.link.frames import idle_packet
 from flight.link.process import directives, station
-from flight.link.process.directives import Deletion, NewKey, Play, Stop
+from flight.link.process.directives import Deletion, NewKey, Play, Portion, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK, Downlink
 from flight.link.security import Admitted
 from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
@@ -365,6 +365,17 @@ def test_a_stolen_primary_key_cannot_change_the_keys_of_the_reserves(link: BothE
         link.turn()
         assert link.stages(counter, spi=2) == ["accepted", "completed"]
     assert link.status()["generation"].tolist() == [2, 2, 1, 2]
+
+
+def test_a_stolen_primary_key_cannot_begin_a_packet_that_the_reserve_key_ends(link: BothEnds) -> None:
+    """The first portion contains a whole packet, and its sender waits for a portion of the reserve SPI."""
+    whole = directives.pack(NewKey(2, 2, bytes(range(32))), 1)
+    first = Portion(2, 1, whole.ljust(72, b"\0"))
+    link.terminal.send(directives.pack(first, 1))
+    counter = link.terminal.send(directives.pack(Portion(2, 2, bytes(72)), 2), spi=2)
+    link.turn()
+    assert link.stages(counter, spi=2) == ["refused"]
+    assert link.status()["generation"].tolist() == [1, 1, 1, 1]
 
 
 def test_a_new_key_of_telemetry_is_followed_by_the_ground(link: BothEnds) -> None:
