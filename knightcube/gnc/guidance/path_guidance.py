@@ -136,8 +136,8 @@ class PathGuidance:
     ) -> PlanVerdict:
         """Follow the path of `plan` from `origin_ns` on if the plan satisfies the acceptance rules.
 
-        The arguments `angle` (rad) and `rate` (rad/s) are the estimated state at the start of the path. The
-        current limit is checked for the estimated `disturbance` (rad/s^2).
+        The arguments `estimate_angle` (rad) and `estimate_rate` (rad/s) are the state at the start of the
+        path. The current limit is checked for the estimated `disturbance` (rad/s^2).
         """
         reason = (
             self._untimely(origin_ns, now_ns)
@@ -175,13 +175,13 @@ class PathGuidance:
         """Return whether an attitude other than the target is held, because no new plan arrived in time."""
         if self._path is None or not self._path.has_ended(now_ns):
             return False
-        if not self._arrives:
+        if not self._arrives and self._path.horizon > 0.0:
             return True
         waited = (now_ns - self._aimed_ns) * 1e-9
         return not self._reaches_target(self._path) and waited > self._rules.late_after
 
     def remains(self, now_ns: int) -> PolynomialPath | None:
-        """Return the path that is being followed, with its origin relative to `now_ns`; None without one."""
+        """Return the path being followed to the target, with its origin relative to `now_ns`, or None."""
         path = self._path
         if path is None or path.has_ended(now_ns) or not self._reaches_target(path):
             return None

@@ -185,6 +185,14 @@ def test_an_end_that_is_the_target_is_held_without_alarm_unless_paths_should_not
         assert guidance.is_adrift(11 * SECOND) is not arrives
 
 
+def test_a_held_attitude_is_not_adrift_while_the_first_plan_of_a_slew_is_made() -> None:
+    guidance = PathGuidance(KNIGHTCUBE, RULES, arrives=False)
+    guidance.hold(0.0, 0)
+    guidance.aim(0.3, now_ns=5 * SECOND)
+    assert not guidance.is_adrift(5 * SECOND)
+    assert guidance.is_adrift(7 * SECOND), "the plan is late"
+
+
 def test_holding_the_old_target_is_adrift_once_a_plan_for_the_new_one_is_late(guidance: PathGuidance) -> None:
     guidance.aim(0.3, 0.0, 120 * SECOND)
     assert not guidance.is_adrift(120 * SECOND + SECOND // 2)
