@@ -53,7 +53,9 @@ _REPEATED = frozenset({"run", "parameters"})  # packets of the start that a flig
 _OF_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name, "run"})
 """Packets that the link process sends also without a flight."""
 _OF_EACH_FLIGHT = frozenset({ATTITUDE.name, HEALTH.name})
-"""Periodic packets of a flight, whose times decrease only if the flight restarts."""
+"""Periodic packets of a flight; a decrease of their times by more than `_REORDERED_S` shows a restart."""
+_REORDERED_S = 5.0
+"""Largest decrease (s) of packet times because a network reordered the frames of a link."""
 _BAD_STAGES = frozenset({Stage.REFUSED, Stage.FAILED})
 
 
@@ -241,7 +243,8 @@ class FlightState:
         If the flight has restarted, mission time and number of faults begin at zero again.
         """
         for name in _OF_EACH_FLIGHT & packets.keys() & self.newest.keys():
-            if len(packets[name]) and packets[name][-1]["time_ns"] < self.newest[name]["time_ns"]:
+            times = packets[name]["time_ns"][-1:] * 1e-9
+            if np.any(times < float(self.newest[name]["time_ns"]) * 1e-9 - _REORDERED_S):
                 self.time, self.ended, self.faults, self.since = 0.0, "", 0, None
         found = [
             LoggedEvent(

@@ -471,7 +471,7 @@ def test_a_flight_that_restarts_is_shown_from_its_start_on() -> None:
     before = [pack(packer, HEALTH, 100.0 + k, mode=3) for k in range(2)]
     after = [pack(packer, HEALTH, 0.5 + k, mode=1) for k in range(2)]
     late = event(packer, events.IMU_SILENT, 97.0, "held back")
-    for data in (*before, late, *after):
+    for data in (*before, before[0], late, *after):
         shown.feed(scan(data).packets)
     states = [line.split()[0] for line in lines if "alarms" in line]
     assert states == ["100.000", "101.000", "0.500", "1.500"]
