@@ -459,9 +459,10 @@ class Receiver:
         self._file = -1
 
     def stop(self, condition: int, why: str) -> None:
-        """End the transfer and reject further data."""
-        kept = FileStatus.REJECTED if condition == Condition.FILESTORE_REJECTION else FileStatus.DISCARDED
-        self._conclude(condition, complete=False, kept=kept, why=why)
+        """End the transfer and reject further data. A transfer that has ended keeps its result."""
+        if self.record.finished is None:
+            kept = FileStatus.REJECTED if condition == Condition.FILESTORE_REJECTION else FileStatus.DISCARDED
+            self._conclude(condition, complete=False, kept=kept, why=why)
 
     def _begin(self, metadata: Metadata) -> None:
         # If the disk fails here, nothing is recorded, and the metadata are requested again.
@@ -560,7 +561,8 @@ class Receiver:
             self.close()
             self._store.place(self.record)
         except FileError as error:
-            self.stop(Condition.FILESTORE_REJECTION, str(error))
+            condition, kept = Condition.FILESTORE_REJECTION, FileStatus.REJECTED
+            self._conclude(condition, complete=False, kept=kept, why=str(error))
 
     def _next_finished(self, now_ns: int) -> Content | None:
         if not self._finish.due(now_ns):

@@ -372,6 +372,26 @@ def test_the_same_file_asked_for_again_goes_on_and_a_ninth_is_refused(tmp_path: 
         pair.send(SATELLITE, file, "b")
 
 
+@pytest.mark.parametrize("displaced", [False, True])
+def test_a_file_that_was_received_whole_is_not_reported_as_cancelled(tmp_path: Path, displaced: bool) -> None:
+    """The sender has not yet acknowledged the end when the transfer is cancelled or others need its place."""
+    pair, transaction, data = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE), b"data"
+    end = pair.ends[SATELLITE]
+    end.take(pack(transaction, Metadata(4, "a", "a", CRC32)), 0)
+    end.take(pack(transaction, FileData(0, data)), 0)
+    end.take(pack(transaction, Eof(0, zlib.crc32(data), 4)), 0)
+    while end.unit(0) is not None or end.transfers()[0].condition is None:
+        pass
+    assert pair.received(SATELLITE, "a") == data
+    if displaced:
+        for number in range(10, 10 + MOST_OPEN):
+            end.take(pack(Transaction(GROUND, number, SATELLITE), FileData(0, data)), number)
+    else:
+        end.cancel(GROUND, 9)
+    (progress,) = end.ended if displaced else end.transfers()
+    assert (progress.number, progress.condition, progress.said) == (9, 0, "whole")
+
+
 def test_ranges_against_a_set_of_bytes() -> None:
     draw = np.random.default_rng(1)
     for _ in range(50):
