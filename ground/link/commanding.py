@@ -274,8 +274,8 @@ def change_key(
 
     The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
     confirmed it. If the result of an earlier change is unknown, a ping protected with that change's new key
-    is sent first. Raises UsageError if the satellite would refuse the change, and KnightCubeError if no
-    answer arrives.
+    is sent first. Raises UsageError if the satellite would refuse the change, and KnightCubeError if the new
+    key cannot be stored or no answer arrives.
     """
     if not may_change(spi, changed):
         raise UsageError(
@@ -295,7 +295,7 @@ def change_key(
         following = vault.read(name)
     if following is None or following.generation != old.generation + 1:
         following = Association(changed, old.generation + 1, 0, new_key())
-        vault.write(following, name)
+        _store(vault, following, name)
     packet = directives.pack(NewKey(changed, following.generation, following.key), utc_ns())
     reports = command(terminal, packet, spi, seconds, show)
     if obeyed(reports) and changed in COMMAND_SPIS:
@@ -307,8 +307,17 @@ def _promote(vault: Vault, spi: int) -> None:
     with vault.locked():
         following = vault.read(f"{spi}-{NEXT}")
         if following is not None:
-            vault.write(following)
+            _store(vault, following, spi)
             vault.remove(f"{spi}-{NEXT}")
+
+
+def _store(vault: Vault, association: Association, name: int | str) -> None:
+    """Store a new key under a name. Raises KnightCubeError if no copy can be written."""
+    if vault.write(association, name) == 0:
+        raise KnightCubeError(
+            f"{vault.folder}: the new key of SPI {association.spi} cannot be stored: make room on the disk, "
+            f"and send new-key {association.spi} again"
+        )
 
 
 class FileSession:

@@ -190,6 +190,28 @@ def test_a_refused_key_is_kept_for_the_next_attempt(vault: Vault) -> None:
     assert bytes(sent_key(silent.sent[1]).key) == kept.key
 
 
+def test_a_new_key_that_cannot_be_stored_is_not_sent(vault: Vault, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Vault, "write", lambda *_: 0)
+    line = terminal(vault)
+    with pytest.raises(KnightCubeError, match="the new key of SPI 1 cannot be stored"):
+        commanding.change_key(line, vault, 1, 2, 1.0, lambda _: None)
+    assert line.sent == []
+
+
+def test_a_new_key_that_cannot_replace_the_old_one_is_kept(
+    vault: Vault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line, write = terminal(vault, [report(Stage.ACCEPTED), report(Stage.COMPLETED)]), Vault.write
+    monkeypatch.setattr(
+        Vault, "write", lambda self, key, name: write(self, key, name) if NEXT in str(name) else 0
+    )
+    with pytest.raises(KnightCubeError, match="the new key of SPI 1 cannot be stored"):
+        commanding.change_key(line, vault, 1, 2, 1.0, lambda _: None)
+    following = vault.read(f"1-{NEXT}")
+    assert following is not None
+    assert following.generation == 2
+
+
 def test_a_key_that_the_satellite_already_has_is_adopted_by_a_ping(vault: Vault) -> None:
     vault.write(Association(1, 2, 0, bytes(32)), f"1-{NEXT}")
     line = terminal(vault, [report(Stage.COMPLETED)])
