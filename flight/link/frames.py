@@ -125,8 +125,19 @@ class TelemetryFramer:
         return self.take()
 
     def take(self) -> list[bytes]:
-        """Return the completed frames, of which there are none unless `seal` failed in an earlier call."""
-        return [self._take() for _ in range(len(self._data) // self._room)]
+        """Return the completed frames that can be protected; there are none unless `seal` failed before.
+
+        Raises the error of `seal` if there are completed frames and none can be protected.
+        """
+        made: list[bytes] = []
+        while len(self._data) >= self._room:
+            try:
+                made.append(self._take())
+            except KnightCubeError:
+                if not made:
+                    raise
+                break
+        return made
 
     def flush(self) -> list[bytes]:
         """Fill the current frame with an idle packet and return the completed frames."""

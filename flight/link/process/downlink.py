@@ -24,6 +24,7 @@ from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import COMMAND, EVENT, MODE, PLAN, RUN, STARS, STREAK, TARGET
 from flight.link.telemetry.log import find_runs, find_segments
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, LONGEST_PACKET, walk
+from knightcube.errors import KnightCubeError
 
 _STEM = "flight"
 _CHUNK = 1 << 16
@@ -318,8 +319,15 @@ class Downlink:
         self._credit_ns = now_ns
         due: list[bytes] = []
         while self._credit >= self._frame_bytes:
-            late = next(filter(None, (one.take() for one in (self._live, self._replay, self._filed))), None)
-            made = late or self._next_live(now_ns) or self._next_in_turn()
+            try:
+                late = next(
+                    filter(None, (one.take() for one in (self._live, self._replay, self._filed))), None
+                )
+                made = late or self._next_live(now_ns) or self._next_in_turn()
+            except KnightCubeError:
+                if not due:
+                    raise
+                break  # the frames that were protected are sent first
             if not made:
                 break
             due += made

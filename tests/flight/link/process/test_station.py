@@ -402,6 +402,23 @@ def test_without_counters_of_telemetry_the_reserve_serves_and_commands_always_co
         assert (link.stages(counter)[-1:] == ["completed"]) is survives
 
 
+def test_frames_that_were_protected_are_sent_before_the_counters_end() -> None:
+    counters = iter(range(3))
+
+    def seal(header: bytes, data: bytes) -> bytes:
+        if next(counters, None) is None:
+            raise KnightCubeError("no counter")
+        return header + bytes(14) + data + bytes(16)
+
+    downlink = Downlink(1, 128, 1e5, seal, lambda: None)
+    for _ in range(20):
+        downlink.report(idle_packet(120))
+    downlink.frames(0)
+    assert len(downlink.frames(SECOND_NS)) == 3
+    with pytest.raises(KnightCubeError):
+        downlink.frames(2 * SECOND_NS)
+
+
 def test_telemetry_returns_at_the_rate_of_the_line_after_a_time_without_keys() -> None:
     """Lets 1200 bytes/s of reports wait for a minute, and then reads one second of frames of 128 bytes."""
     keys: list[str] = []
