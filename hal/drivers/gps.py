@@ -637,7 +637,7 @@ class NmeaReceiver:
 
     def _take(self, fields: list[str], arrival_ns: int, length: int) -> GpsReading | None:
         """Return the reading that a sentence completes, or None if the other sentence is missing."""
-        kind = fields[0][2:]
+        kind = fields[0].removeprefix("P")[2:]  # proprietary sentences, such as PGRMC, begin with P
         if len(fields) < _FIELDS.get(kind, math.inf):
             return None
         other = self._halves.get("GGA" if kind == "RMC" else "RMC")

@@ -303,6 +303,12 @@ def test_a_damaged_sentence_is_counted_and_not_used(index: int) -> None:
     assert driver.link().bad_checksum == 1
 
 
+def test_a_proprietary_sentence_is_ignored() -> None:
+    proprietary = sentence("PGRMC,A,218.8,100,6378137.000,298.257223563,0.0,0.0,0.0,A,3,1,1,4,30")
+    readings, _ = read(rmc(), proprietary, gga())
+    assert len(readings) == 1
+
+
 def test_a_sentence_that_lacks_fields_is_not_used() -> None:
     short = sentence("GNGGA,120000.00,4530.000,N,01215.000,E,1,09,1.0,100.0,M")
     readings, _ = read(rmc(), short, rmc("120001.00"), gga("120001.00"))
