@@ -33,7 +33,10 @@ case "$*" in
         ln "$(readlink -f "$0")" "$folder/bin/python"
         cp "$home/label" "$folder/label" ;;
     *"-m pip "*"-r "*) mkdir -p "$packages/numpy"; echo numpy >"$packages/numpy/numpy.py" ;;
-    *"-m pip "*) mkdir -p "$packages/ground"; cp "$home/label" "$packages/flight/label" ;;
+    *"-m pip "*)
+        mkdir -p "$packages/ground" "$packages/knightcube"
+        cp "$home/label" "$packages/flight/label"
+        cp "$home/label" "$packages/knightcube/label" ;;
     *"-m flight run /"*"step_demo.yaml"*) grep -q . "$packages/flight/label" ;;
     *"-m flight --version"* | *"import flight"* | *"import self_test"*) ;;
     *"-m flight run "* | *"-m flight link "*) echo "flies $(cat "$packages/flight/label")" ;;

@@ -229,6 +229,13 @@ def test_without_releases_py_a_damaged_release_gives_way_but_flies_where_none_is
     assert f"fly: release {SECOND} flies (runs): " in said
 
 
+@pytest.mark.parametrize("package", ["flight", "knightcube"])
+def test_without_releases_py_damage_to_either_package_gives_way(board: FakeBoard, package: str) -> None:
+    _chooser(board).unlink()
+    _replace(board.prefix / f"current/venv/lib/python3/site-packages/{package}/label", "hu")
+    assert board.fly()[0] == "old"
+
+
 def test_without_releases_py_a_damaged_manifest_gives_way(board: FakeBoard) -> None:
     _chooser(board).unlink()
     manifest = board.prefix / "current/manifest"
