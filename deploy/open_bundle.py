@@ -8,12 +8,12 @@ the unpacked bundle instead of downloading files.
 
 The program writes the artefact to FOLDER/artefact. For a configuration, the program also writes FOLDER/set
 with the configuration and the drop-ins of its units. For orbital elements or a star catalogue, the
-configuration in FOLDER/set is a copy of the configuration PRESENT with one value replaced. KEPT is the folder
-in which the star catalogue is installed later. UTC is the mission time (s since 1970) with which expiry dates
-are compared. With an empty UTC the mission time is unknown, and expiry dates are not checked, because the
-system clock of a board may be wrong. PRESENT, KEPT and UTC may be omitted for a release. The program prints
-the version, the permission to replace a newer version, and the SHA-256 as one JSON object. For a refused
-bundle, the program prints one line and exits with status 1.
+configuration in FOLDER/set is a copy of the configuration PRESENT, which must match its checksum file, with
+one value replaced. KEPT is the folder in which the star catalogue is installed later. UTC is the mission time
+(s since 1970) with which expiry dates are compared. With an empty UTC the mission time is unknown, and expiry
+dates are not checked, because the system clock of a board may be wrong. PRESENT, KEPT and UTC may be omitted
+for a release. The program prints the version, the permission to replace a newer version, and the SHA-256 as
+one JSON object. For a refused bundle, the program prints one line and exits with status 1.
 """
 
 from __future__ import annotations
@@ -117,6 +117,14 @@ def verified(
     return {"version": custom["version"], "back": custom.get("back") is True}
 
 
+def accepted_text(path: Path) -> str:
+    """Return the text of a configuration that matches its checksum file. Raises OSError and Refused."""
+    data, accepted = path.read_bytes(), path.with_name(f"{path.name}.sha256").read_bytes()
+    if accepted.split()[:1] != [hashlib.sha256(data).hexdigest().encode()]:
+        raise Refused("the present configuration is damaged (SHA-256): activate a configuration instead")
+    return data.decode("utf-8")
+
+
 def replaced(text: str, path: Sequence[str], value: str) -> str:
     """Return a configuration text in which the value at `path` is replaced by the YAML text `value`.
 
@@ -196,7 +204,7 @@ def main(words: Sequence[str]) -> int:
         with artefact.open("rb") as file:
             facts["sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
         if kind != "release":
-            before = Path(present).read_text(encoding="utf-8") if kind in _VALUES else ""
+            before = accepted_text(Path(present)) if kind in _VALUES else ""
             write_set(renewed_text(kind, artefact, before, kept, facts["sha256"]), place / "set")
     except (Refused, OSError) as error:
         sys.stderr.write(f"{str(error).splitlines()[0]}\n")

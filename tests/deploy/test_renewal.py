@@ -329,6 +329,16 @@ def test_elements_replace_one_value_of_the_present_configuration(board: RenewedB
     assert "has no `elements`" in board.reports(request)[-1][1], "a testbed has none"
 
 
+def test_a_damaged_configuration_is_not_accepted_with_new_elements(board: RenewedBoard) -> None:
+    """The new configuration would contain the damaged value, and have a valid checksum."""
+    board.config.write_text(board.config.read_text().replace("duration: ", "duration: 1"))
+    path = board.place / "elements.txt"
+    path.write_text("\n".join(ELEMENTS) + "\n")
+    request = board.activate(board.bundle("elements", path, 1), "elements")
+    board.step()
+    assert "the present configuration is damaged" in board.reports(request)[-1][1]
+
+
 def test_a_release_is_built_from_the_packages_of_the_present_one_and_tried(board: RenewedBoard) -> None:
     board.processes = True
     assert board.release() == "old"
