@@ -505,7 +505,7 @@ class FlightLoop:
 
     def _has_fast_cameras(self) -> bool:
         """Return whether the horizon cameras take frames more often than once in two seconds."""
-        return any(camera.period < 2.0 for camera in self._config.wide_cameras)
+        return any(min(camera.period, camera.fine_period) < 2.0 for camera in self._config.wide_cameras)
 
     def _replan(self, cycle: Cycle) -> None:
         if self._tasks.shedding.makes_plan(cycle.slot):

@@ -15,8 +15,11 @@ from flight.link.telemetry.definitions import ATTITUDE, COIL_CURRENTS
 from flight.loop import imaging, navigation
 from flight.loop.body import PLANNER, ControlOutput
 from flight.loop.executive import Cycle
-from flight.loop.flight_loop import ATTITUDE_EVERY, ControlCycle
+from flight.loop.flight_loop import ATTITUDE_EVERY, ControlCycle, FlightLoop, Supervisors
 from flight.loop.navigation import CurrentValidity
+from flight.schema import reader as configuration
+from flight.schema.devices import WideCamera
+from flight.schema.document import config_path
 from hal.interfaces.devices import MOST_COILS, CoilState
 
 PERIOD_NS = 25_000_000
@@ -257,3 +260,18 @@ def test_every_fourth_cycle_is_recorded_and_only_more_than_three_coils_apart() -
     assert few.recorded(COIL_CURRENTS) == []
     (values,) = few.recorded(ATTITUDE)
     assert np.isnan([*values["quaternion"], *values["rate"], *values["wanted_rate"], *values["target"]]).all()
+
+
+@pytest.mark.parametrize(
+    ("period", "fine_period", "fast"), [(5.0, 1.0, True), (1.0, 5.0, True), (2.0, 2.0, False)]
+)
+def test_horizon_cameras_with_either_period_below_two_seconds_have_a_group_of_their_own(
+    period: float, fine_period: float, fast: bool
+) -> None:
+    camera = WideCamera(period=period, fine_period=fine_period)
+    config = configuration.replace(configuration.load(config_path("orbit")), wide_cameras=(camera,))
+    body, tasks = Mock(), Mock()
+    body.estimation.learned_problems = []
+    FlightLoop(config, body, tasks, Mock(), Supervisors())
+    (groups,) = tasks.health.watch.call_args.args
+    assert ("horizon" in {group.name for group in groups}) is fast
