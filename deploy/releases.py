@@ -26,6 +26,7 @@ from pathlib import Path
 UNCLEAN = 3
 """Number of starts after which an unproven release is no longer chosen."""
 MANIFEST, TRIALS = "manifest", "releases.json"
+INCOMPLETE = "does not point to a complete release"
 DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 """Exceptions that a damaged JSON record can cause."""
 LARGEST_RECORD, LARGEST_MANIFEST = 1 << 16, 1 << 24
@@ -152,9 +153,7 @@ def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
     found = [release for release in (current, previous) if release is not None]
     if not found:
         return None, ""
-    reasons = (
-        [] if current is not None else ["the symbolic link `current` does not point to a complete release"]
-    )
+    reasons = [] if current is not None else [f"the symbolic link `current` {INCOMPLETE}"]
     if len(found) > 1 and trials.failed(found[0]) and not trials.failed(found[1]):
         reasons.append(f"release {found[0].name} ended {UNCLEAN} times within a minute of its start")
         found.reverse()
@@ -191,8 +190,12 @@ def main(words: list[str]) -> int:
     problems = 0
     for link in ("current", "previous"):
         release = linked(prefix, link)
-        problem = damage(release, thorough=True) if release is not None else ""
-        sys.stdout.write(f"{link}: {release.name if release else 'none'} {problem or 'whole'}\n")
+        if release is not None:
+            problem = damage(release, thorough=True)
+            sys.stdout.write(f"{link}: {release.name} {problem or 'whole'}\n")
+        else:  # a board has no previous release before its first update
+            problem = INCOMPLETE if link == "current" or os.path.lexists(prefix / link) else ""
+            sys.stdout.write(f"{link}: none {problem}".rstrip() + "\n")
         problems += bool(problem)
     return int(problems > 0)
 

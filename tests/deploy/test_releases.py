@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -115,6 +116,21 @@ def test_the_content_of_each_of_our_packages_is_compared_at_a_start(board: FakeB
     assert releases.damage(current) == ""
     path.write_text("sOund", encoding="ascii")
     assert f"{package}/module.py is damaged" in releases.damage(current)
+
+
+def test_verify_fails_if_a_link_does_not_point_to_a_complete_release(board: FakeBoard) -> None:
+    def verify() -> tuple[int, str]:
+        words = [sys.executable, "-I", "-S", str(board.prefix / "bin/releases.py"), "verify"]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        return done.returncode, done.stdout
+
+    assert verify() == (0, f"current: {SECOND} whole\nprevious: {FIRST} whole\n")
+    (board.prefix / "previous/manifest").unlink()
+    assert verify() == (1, f"current: {SECOND} whole\nprevious: none {releases.INCOMPLETE}\n")
+    (board.prefix / "previous").unlink()
+    assert verify() == (0, f"current: {SECOND} whole\nprevious: none\n"), "as before the first update"
+    (board.prefix / "current").unlink()
+    assert verify() == (1, f"current: none {releases.INCOMPLETE}\nprevious: none\n")
 
 
 def test_of_libraries_the_size_is_compared_at_a_start_and_the_content_on_request(board: FakeBoard) -> None:
