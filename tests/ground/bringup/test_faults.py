@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from flight.app.devices import emulated_bench
 from flight.app.run import RunRequest
@@ -150,6 +151,11 @@ def without_stars(pixels: Any) -> Any:
     """Return a frame without stars, in which one pixel of a hundred is hot."""
     hot = np.random.default_rng(1).random(pixels.shape) < 0.01
     return np.where(hot, 3000, pixels).astype(pixels.dtype)
+
+
+def blurred(pixels: Any) -> Any:
+    """Return a frame whose stars have Gaussian point spreads of 10 px instead of 1 px."""
+    return gaussian_filter(pixels.astype(float), np.sqrt(10.0**2 - 1.0)).round().astype(pixels.dtype)
 
 
 BOTH = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -411,7 +417,7 @@ FRAMES = {
 FOCUS = {
     "camera out of focus": Case({"camera": {"psf_sigma": 3.5}}, "focus", ["camera out of focus"]),
     "camera far out of focus": Case(
-        {"camera": {"psf_sigma": 10.0}}, "focus", ["camera out of focus"], says="width 9.9"
+        {}, "focus", ["camera out of focus"], says="width 10.0", spoil=pictured(blurred)
     ),
 }
 PIXELS = {
