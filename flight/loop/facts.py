@@ -395,7 +395,8 @@ class StreamWatch:
             return StreamState.STALE
         if not self._valid:
             return StreamState.INVALID
-        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # NaN, an unknown rate, compares false
+        # The fraction is rounded so that exactly 80 % is not slow. NaN, an unknown rate, compares false.
+        if round(self.rate(now_ns) / self.stream.rate_hz, 9) < LEAST_RATE:
             return StreamState.SLOW
         return StreamState.GOOD
 

@@ -331,6 +331,17 @@ def test_a_stream_is_slow_below_80_percent_of_its_rate() -> None:
         assert watch.state(now) is state
 
 
+@pytest.mark.parametrize("period_s", [1.0, 2.0, 2.5, 3.0, 5.0, 6.0, 10.0, 20.0, 30.0])
+def test_four_readings_in_five_periods_are_80_percent_for_every_period(period_s: float) -> None:
+    row = replace(ROW, rate_hz=1.0 / period_s, max_age=10.0 * period_s)
+    for missing, state in (((2,), StreamState.GOOD), ((2, 4), StreamState.SLOW)):
+        watch = StreamWatch(row, 0)
+        for k in range(1, 6):
+            if k not in missing:
+                watch.note(round(k * period_s * 1e9), 0.5)
+        assert watch.state(round(5.0 * period_s * 1e9)) is state
+
+
 def test_the_values_at_the_ends_of_the_range_are_valid() -> None:
     for value, state in ((0.0, StreamState.GOOD), (1.0, StreamState.GOOD), (1.0001, StreamState.INVALID)):
         watch, now = fed(3.0, value=value)
