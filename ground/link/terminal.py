@@ -367,6 +367,7 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
             if place.startswith("/"):
                 device, _, baud = place.partition("@")
                 port = serial.Serial(device, int(baud), exclusive=True)
+                os.set_blocking(port.fileno(), True)  # pySerial's port fails when its output buffer is full
                 line = StreamGround(address, port.fileno(), framing, port.close)
             elif kiss or place.startswith("tcp:"):
                 where = checked_address(place.removeprefix("tcp:"))

@@ -7,6 +7,7 @@ import os
 import socket
 import stat
 import threading
+import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -185,6 +186,32 @@ def test_a_report_has_the_fields_of_its_packet() -> None:
         "too far",
     )
     assert (found.request.packet, found.request.sequence) == (0x1A01, 6)
+
+
+def test_frames_that_exceed_the_output_buffer_of_a_serial_line_wait_until_they_are_sent(keys: Path) -> None:
+    satellite, device = os.openpty()
+    tty.setraw(satellite)
+    failed: list[KnightCubeError] = []
+    with contextlib.closing(open_terminal(f"{os.ttyname(device)}@9600", keys)) as terminal:
+        sealer = terminal.sealer(1, 64)
+
+        def send() -> None:
+            try:
+                for _ in range(60):
+                    terminal.send_by(sealer, bytes(900))
+            except KnightCubeError as error:
+                failed.append(error)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        sender.join(0.5)  # the output buffer of 4 to 64 KiB is full now
+        received = 0
+        while received < 60 * 900 and not failed:
+            received += len(os.read(satellite, 1 << 16))
+        sender.join()
+    assert failed == []
+    os.close(device)
+    os.close(satellite)
 
 
 def test_only_the_reports_on_the_own_command_are_followed_up_to_the_final_one(
