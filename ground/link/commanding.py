@@ -334,7 +334,7 @@ class FileSession:
     def __init__(self, terminal: Terminal, store: Store, spi: int, rate: float, now_ns: int) -> None:
         """Send at most `rate` bytes/s of frames. Raises KnightCubeError."""
         self._terminal = terminal
-        self._rate = rate
+        self._rate, self._spi = rate, spi
         self._sealer = terminal.sealer(spi, _BLOCK)
         self._units = units.UnitPacker(units.UP)
         self._wanted = {LISTING}
@@ -380,7 +380,8 @@ class FileSession:
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
                 # If a counter was used before, the command is sent again with a higher counter.
-                if report.counter in self._counters and report.stage is not Stage.REPEATED:
+                own = report.spi == self._spi and report.counter in self._counters
+                if own and report.stage is not Stage.REPEATED:
                     if report.stage is not Stage.ACCEPTED:
                         self._asked = None
                     self._reports.append(report)

@@ -209,7 +209,7 @@ class Gateway:
         self._complain = complain
         self._packer = CommandPacker()
         self._asked_at: float | None = None
-        self._own: set[int] = set()
+        self._own: set[int] = set()  # counters of the gateway's own pings under the present key
         self._connections: dict[socket.socket, _StationConnection] = {}
         self.down = self.up = self.refused = 0
         try:
@@ -267,8 +267,10 @@ class Gateway:
         self._listener.close()
 
     def _hand_over(self, packet: bytes) -> None:
-        if packet[:2] == _VERIFIED and report_of(packet).counter in self._own:
-            return  # a report on one of the gateway's own pings
+        if packet[:2] == _VERIFIED:
+            report = report_of(packet)
+            if report.spi == _SPI and report.counter in self._own:
+                return  # a report on one of the gateway's own pings
         self.down += 1
         for line, connection in list(self._connections.items()):
             if connection.stream.authenticated:
@@ -302,7 +304,8 @@ class Gateway:
                 most = max(self._terminal.packet_bytes, LONGEST_IN_PORTIONS)
                 if len(packet) > most:
                     raise StreamError(f"{len(packet)} bytes: the link carries {most}")
-                self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
+                counter = self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
+                self._own.discard(counter)  # after a change of the key the counters begin again at 0
                 self.up += 1
         except StreamError as error:
             self._refuse(line, str(error))

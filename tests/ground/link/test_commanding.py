@@ -245,12 +245,12 @@ def session(folder: Path, line: Any, rate: float = 1e6) -> commanding.FileSessio
     return commanding.FileSession(line, Store(folder), 1, rate, 0)
 
 
-def verification(counter: int, stage: Stage) -> bytes:
+def verification(counter: int, stage: Stage, spi: int = 1) -> bytes:
     """Return a verification packet."""
     values: dict[str, Any] = {
         field.name: "" if field.kind.startswith("S") else 0 for field in VERIFICATION.fields
     }
-    return Packer().pack(VERIFICATION, 0, {**values, "counter": counter, "spi": 1, "stage": int(stage)})
+    return Packer().pack(VERIFICATION, 0, {**values, "counter": counter, "spi": spi, "stage": int(stage)})
 
 
 def test_an_unanswered_directive_is_repeated_every_five_seconds(tmp_path: Path) -> None:
@@ -283,6 +283,16 @@ def test_a_late_report_on_an_earlier_directive_does_not_complete_the_next(tmp_pa
     assert files.reports() == []
     files.take([(0, verification(2, Stage.COMPLETED))], 3 * S)
     assert [one.counter for one in files.reports()] == [2]
+
+
+def test_a_report_of_another_spi_does_not_answer_a_directive(tmp_path: Path) -> None:
+    """Each SPI has its own counters, so that two programs may use the same counter at the same time."""
+    files = session(tmp_path, terminal())
+    files.ask(SendFile("a"), 0)
+    files.take([(0, verification(1, Stage.COMPLETED, spi=2))], S)
+    assert files.reports() == []
+    files.take([(0, verification(1, Stage.COMPLETED))], 2 * S)
+    assert [one.spi for one in files.reports()] == [1]
 
 
 def test_units_are_sent_within_the_rate(tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ import pytest
 from flight.link.commands import ChangeMode, CommandPacker, Ping
 from flight.link.events import Mode
 from flight.link.files.units import UP, UnitPacker
-from flight.link.telemetry.definitions import HEALTH
+from flight.link.process.commanding import Stage
+from flight.link.telemetry.definitions import HEALTH, VERIFICATION
 from flight.link.telemetry.packets import Packer
 from ground.link import gateway as module
 from ground.link.gateway import Gateway, new_token, token_file, token_path
@@ -153,6 +154,27 @@ def test_a_connection_without_the_token_neither_commands_nor_receives_telemetry(
     known.sendall(SAFE[9:])
     station.turn()
     assert [packet[15:-2] for packet in station.satellite.commands] == [SAFE[15:-2]]
+
+
+def test_only_reports_on_the_pings_of_the_gateway_are_withheld(station: Station) -> None:
+    """A counter identifies a command only together with its SPI and the present key."""
+
+    def report(spi: int) -> bytes:
+        values = plain_contents(VERIFICATION) | {"spi": spi, "counter": 1, "stage": int(Stage.COMPLETED)}
+        return Packer().pack(VERIFICATION, 1, values)
+
+    known = station.connect(station.line)
+    assert len(station.satellite.up) == 1, "the ping has the counter 1"
+    for spi in (1, 2):
+        station.satellite.say(report(spi))
+        station.turn()
+    assert known.recv(4096) == report(2)
+    station.satellite.up.clear()  # another program changes the key
+    known.sendall(SAFE)
+    station.turn()
+    station.satellite.say(report(1))
+    station.turn()
+    assert known.recv(4096) == report(1)
 
 
 def test_a_byte_that_no_command_has_closes_a_known_connection_and_is_reported(station: Station) -> None:
