@@ -36,6 +36,8 @@ def step_dark(session: Session) -> Outcome:
     frames = [frame.pixels for frame in taken]
     if session.hand is not None:
         session.hand.cover(False)
+    if len(taken) < 2:  # the finding states how many triggers gave no frame
+        raise StepSkipped("camera delivers only one frame, and its noise needs two", findings[0])
     camera = session.config.camera
     assert camera is not None, "the device is open"
     first, second = (pixels.astype(float) for pixels in frames[-2:])

@@ -158,6 +158,13 @@ def test_noise_below_one_count_is_measured_from_the_few_differences() -> None:
     assert found.findings == []
 
 
+def test_a_single_dark_frame_shows_only_that_the_camera_is_intermittent() -> None:
+    with pytest.raises(StepSkipped, match="camera delivers only one frame") as ended:
+        step_dark(bench(noisy(), None, None, None, None)[0])
+    assert ended.value.finding is not None
+    assert ended.value.finding.kind == "intermittent"
+
+
 def test_a_repeated_frame_number_is_a_frozen_camera() -> None:
     session, device = bench(*dark())
     device.frozen = True
