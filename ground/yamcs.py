@@ -354,7 +354,7 @@ def command_line(folder: Path) -> list[str]:
 
 
 def main() -> None:
-    """Write the configuration that the command line `words` describes."""
+    """Write the configuration that the command line describes."""
     parser = argparse.ArgumentParser(prog="python -m ground.yamcs", description=__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the configuration and the archive")
     parser.add_argument("--gateway", default=ADDRESS, metavar="HOST:PORT", help=f"default {ADDRESS}")
