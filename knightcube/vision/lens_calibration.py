@@ -422,7 +422,8 @@ def calibrate_one_lens(
     1 %, or if a fit rejects more than half of its matches. Raises CalibrationError for the same reasons as
     `calibrate`.
     """
-    usual = float(np.median(focal_lengths))
+    # The middle value, of an even number the upper one, so that at least one frame is kept.
+    usual = float(np.sort(focal_lengths)[len(focal_lengths) // 2])
     different = np.abs(focal_lengths - usual) > np.maximum(5.0 * sigmas, 0.01 * usual)
     excluded = {
         number: f"its focal length is {focal_lengths[number]:.1f} px, that of the others {usual:.1f} px"

@@ -20,6 +20,7 @@ from knightcube.vision.lens_calibration import (
     _mirrored_back,
     calibrate,
     calibrate_determined,
+    calibrate_one_lens,
     lens_accuracy,
 )
 from knightcube.vision.lens_knowledge import (
@@ -238,6 +239,18 @@ def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None
     rays = lens.unit_vectors(np.random.default_rng(2).uniform([0.0, 0.0], [999.0, 799.0], (50, 2)))
     expected = np.array([999.0, 0.0]) + np.array([-1.0, 1.0]) * lens.project(rays)
     assert back.project(rays * np.array([-1.0, 1.0, 1.0])) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_frames_of_another_focus_are_excluded_also_if_they_are_half_of_the_frames(count: int) -> None:
+    rng = np.random.default_rng(92)
+    begun, other = _begun(20.0), _begun(22.0)
+    frames = [*_frames(rng, Lens.of(begun), count, 40)[0], *_frames(rng, Lens.of(other), count, 40)[0]]
+    focal_lengths = np.repeat([begun.focal_length, other.focal_length], count)
+    found, excluded = calibrate_one_lens(frames, begun, focal_lengths, np.full(2 * count, 0.5))
+    assert found.calibration.lens.focal_length == pytest.approx(begun.focal_length, rel=2e-3)
+    assert set(excluded) == set(range(count, 2 * count))
+    assert all("its focal length is" in reason for reason in excluded.values())
 
 
 def test_malformed_frames_are_refused() -> None:
