@@ -15,6 +15,7 @@ from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -176,7 +177,7 @@ def _kept(path: Path, key: str) -> dict[str, Outcome]:
         return {name: _restored(path.parent, name, one) for name, one in steps.items()}
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, BadZipFile) as error:
         raise UsageError(f"{path}: cannot be read ({error}): give --again, or another --out") from error
 
 
@@ -185,7 +186,7 @@ def _restored(folder: Path, name: str, stored: dict[str, Any]) -> Outcome:
     arrays: dict[str, Any] = {}
     file = folder / f"{name}.npz"
     if file.exists():
-        with np.load(file) as kept:
+        with file.open("rb") as opened, np.load(opened) as kept:
             arrays = {key: kept[key] for key in kept.files}
     return Outcome(findings, stored["values"], stored["changes"], arrays)
 

@@ -338,6 +338,19 @@ def test_results_of_another_configuration_are_measured_again(
     assert "unknown" not in scripted.report()["steps"]
 
 
+@pytest.mark.parametrize("size", [0, 100])
+def test_damaged_arrays_of_a_step_are_refused_as_a_damaged_report(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dark = Outcome([], VALUES["dark"], {}, {"a": np.arange(3)})
+    scripted = Scripted(monkeypatch, tmp_path, find=ANSWERS, dark=dark)
+    scripted.run("--only", "find", "--only", "dark")
+    (arrays,) = (tmp_path / "bench").glob("*.npz")
+    arrays.write_bytes(arrays.read_bytes()[:size])
+    with pytest.raises(UsageError, match=r"cannot be read \(.*\): give --again, or another --out"):
+        scripted.run()
+
+
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"steps": {"rest": 1}}', '{"steps": {"rest": {}}}'])
 def test_a_damaged_report_is_refused_unless_all_steps_are_done_again(
     text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
