@@ -25,6 +25,7 @@ from flight.link.events import Mode
 from flight.link.files.store import Store
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage, final_mode, utc_of
+from flight.link.process.downlink import LIVE
 from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import (
@@ -382,9 +383,9 @@ def _ask_by_link(
     kinds = {TELEMETRY_LAYOUTS[kind.name].identifier: kind for kind in (PARAMETERS, VERIFICATION)}
     with closing(terminal_of(options)) as terminal:
         counter = terminal.send(packet, options.spi)
-        for _, data in terminal.packets(options.timeout):
+        for channel, data in terminal.packets(options.timeout):
             kind = kinds.get(int.from_bytes(data[:2], "big"))
-            if kind is PARAMETERS:
+            if kind is PARAMETERS and channel == LIVE:
                 (row,) = decode(data)[kind.name]
                 table = ParameterTable.of(row)
             elif kind is VERIFICATION:

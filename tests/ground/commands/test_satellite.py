@@ -33,6 +33,7 @@ from flight.link.process.directives import (
     Stop,
     SuspendFile,
 )
+from flight.link.process.downlink import LIVE, PLAYBACK
 from flight.link.process.filing import LISTING
 from flight.link.telemetry.definitions import (
     COMMAND,
@@ -248,6 +249,7 @@ class Link:
     """A ground terminal whose telemetry is a list."""
 
     packet_bytes = 987
+    channel = LIVE
 
     def __init__(self, *packets: bytes) -> None:
         self.received = list(packets)
@@ -261,7 +263,7 @@ class Link:
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
         while self.received:
-            yield 0, self.received.pop(0)
+            yield self.channel, self.received.pop(0)
 
     def close(self) -> None:
         self.closed += 1
@@ -431,6 +433,13 @@ def test_the_table_arrives_before_or_after_its_verification(link: Link) -> None:
         link.received, link.sent = list(other), []
         with pytest.raises(KnightCubeError, match=r"within 0\.5 s"):
             by_link(options)
+
+
+def test_an_old_table_of_a_playback_is_not_the_table_in_use(link: Link) -> None:
+    options = SimpleNamespace(spi=1, timeout=0.5, link="here")
+    link.channel = PLAYBACK
+    link.received, link.sent = [table(DEFAULTS), verified(Stage.COMPLETED)], []
+    assert by_link(options) == (None, "")
 
 
 class Session:
