@@ -339,7 +339,9 @@ class StarTracker:
             )
         if not self._fov_error_deg:
             return camera, (1.0, 1.0)
-        return camera, camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)[1]
+        middle, scale = camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)
+        ratio = camera.focal_length / middle.focal_length
+        return camera, (scale[0] * ratio, scale[1] * ratio)
 
 
 def field_of_view(camera: CameraModel) -> float:

@@ -283,6 +283,10 @@ def test_a_wrong_field_of_view_is_refused_with_the_searched_fields(resting: SkyF
     solution = StarTracker(fov_deg=30.0, fov_error_deg=3.0).solve(resting.pixels)
     assert solution.status == "no-match"
     assert solution.reason.endswith("; fields of view of 27 to 33 deg were searched")
+    rows, columns = resting.pixels.shape
+    camera = Pinhole.from_field_of_view(columns, rows, math.radians(60.0))
+    solution = StarTracker(camera=camera, fov_error_deg=15.0).solve(resting.pixels)
+    assert solution.reason.endswith("; fields of view of 45 to 75 deg were searched")
 
 
 def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> None:
