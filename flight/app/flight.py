@@ -276,8 +276,7 @@ def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Op
     inhibit = SeparationInhibit(SystemClock())
 
     def open_after_inhibit(judged: _Judged, stack: ExitStack) -> _Opened:
-        if (folder := state_folder(judged.config, os.environ)) is not None:
-            inhibit.check(folder, judged.config.separation.inhibit)
+        inhibit.check(state_folder(judged.config, os.environ), judged.config.separation.inhibit)
         return _open(judged, stack)
 
     opened = retried_start(judge, open_after_inhibit, stack, retry)

@@ -169,7 +169,7 @@ def pauses() -> Iterator[float]:
         pause = min(2.0 * pause, LONGEST_PAUSE_S)
 
 
-_LARGEST_POWERED = 64
+_POWERED, _LARGEST_POWERED = "powered", 64
 
 
 class InhibitedError(KnightCubeError):
@@ -184,7 +184,7 @@ class SeparationInhibit:
     inhibit nor begins it again. Flight and link count the time separately, each in its own folder.
 
     A damaged or missing file counts as the first power-up, because it does less harm to keep the coils off
-    for too long than to drive them too early.
+    for too long than to drive them too early. Without a folder, each start of the process begins the inhibit.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -192,24 +192,23 @@ class SeparationInhibit:
         self._counted_ns = clock.now_ns()
         self._elapsed: float | None = None
 
-    def check(self, folder: Path, seconds: float) -> None:
-        """Store the time with power in `folder`.
+    def check(self, folder: Path | None, seconds: float) -> None:
+        """Store the time with power in `folder`, unless it is None.
 
         Raises InhibitedError while the time with power is shorter than `seconds` s.
         """
         if seconds == 0.0:
             return
-        path = folder / "powered"
         if self._elapsed is None:
-            self._elapsed = _powered(path)
+            self._elapsed = 0.0 if folder is None else _powered(folder / _POWERED)
         now_ns = self._clock.now_ns()
         stored = self._elapsed
         self._elapsed += (now_ns - self._counted_ns) / SECOND_NS
         self._counted_ns = now_ns
-        if stored < seconds:
+        if stored < seconds and folder is not None:
             with suppress(OSError):  # a disk that cannot be written only prolongs the inhibit at a restart
                 folder.mkdir(parents=True, exist_ok=True)
-                replace_file(LinuxFiles(), path, to_record(b"%.1f" % self._elapsed))
+                replace_file(LinuxFiles(), folder / _POWERED, to_record(b"%.1f" % self._elapsed))
         if (left := seconds - self._elapsed) > 0.0:
             raise InhibitedError(f"separation inhibit of {seconds:g} s: {left:.0f} s of powered time remain")
 

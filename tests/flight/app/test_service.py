@@ -118,10 +118,13 @@ def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_th
     assert StateStore(tmp_path / "state", lambda *_: None).load().boot_count == 1
 
 
-def test_a_board_flies_after_the_separation_inhibit(board: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("stores", [True, False])
+def test_a_board_flies_after_the_separation_inhibit(board: list[str], tmp_path: Path, stores: bool) -> None:
+    """Without a state folder, the inhibit holds at each start."""
     (tmp_path / "later").mkdir()
-    with Path(board[1]).open("a", encoding="utf-8") as file:
-        file.write("\nseparation: {inhibit: 0.4}\n")
+    config = Path(board[1])
+    text = config.read_text(encoding="utf-8") + "\nseparation: {inhibit: 0.4}\n"
+    config.write_text(text if stores else text.replace(f"state: {{folder: {tmp_path}/state}}", ""))
     assert main(board) == 0
     assert main(board) == 0
     texts = []
@@ -129,7 +132,7 @@ def test_a_board_flies_after_the_separation_inhibit(board: list[str], tmp_path: 
         events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(run)["event"]}
         texts.append(events.get("start-waited", ""))
     assert "separation inhibit of 0.4 s" in texts[0]
-    assert texts[1] == ""
+    assert ("separation inhibit of 0.4 s" in texts[1]) is not stores
 
 
 def test_a_board_that_is_stopped_while_it_waits_ends_well(
