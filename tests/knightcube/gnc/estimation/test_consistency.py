@@ -48,8 +48,8 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says(
 
 def test_variances_that_are_claimed_too_small_are_found_out() -> None:
     """If the filter assumes half of the IMU's true noise, NEES and NIS exceed their bounds."""
-    facts = consistency.scene_facts(fly("testbed", 8, claimed=0.25))
-    assert facts["nees_final"] > band(8 * facts["degrees"], 0.999)[1]
+    facts = consistency.scene_facts(fly("testbed", 12, claimed=0.25))
+    assert facts["nees_final"] > band(12 * facts["degrees"], 0.999)[1]
     assert facts["nis"]["gyro"]["mean"] > 2.0
 
 
