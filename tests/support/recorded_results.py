@@ -129,8 +129,8 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
     """Fail if a result differs from its record, a file in the folder of the test module.
 
     The `ANSWERS` agree if they differ by at most the fraction `tolerance`, or by `zero`. The fraction of
-    other values is `OTHER_TOLERANCE`, or `COMPILED_TOLERANCE` if compiled functions are used, unless
-    `tolerance` is larger.
+    other values is `OTHER_TOLERANCE` if `tolerance` is not given, and `tolerance` otherwise. If compiled
+    functions are used, the fraction of other values is at least `COMPILED_TOLERANCE`.
     """
     path = Path(module).with_name("recorded_results.json")
     records: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -146,10 +146,10 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
 def unlike(record: Any, found: Any, tolerance: float, zero: float, compiled: bool) -> list[str]:
     """Return the key paths at which results differ from their record.
 
-    If `compiled` is true, compiled functions were used, and values other than the `ANSWERS` have a larger
-    tolerance.
+    Values other than the `ANSWERS` have a larger tolerance if `tolerance` is the default, or if compiled
+    functions were used (`compiled`).
     """
     lines = differences(record, found, tolerance, zero=zero)
     answers = [line for line in lines if set(line.partition(":")[0].split(".")) & set(ANSWERS)]
-    others = COMPILED_TOLERANCE if compiled else OTHER_TOLERANCE
+    others = COMPILED_TOLERANCE if compiled else OTHER_TOLERANCE if tolerance == TOLERANCE else tolerance
     return answers + differences(record, found, max(tolerance, others), zero=zero)

@@ -100,7 +100,8 @@ class LogFollower:
     def _go_on(self) -> None:
         """Continue with the next segment, or with a newer run if the current run has no further segment.
 
-        If the current segment was removed, which the flight answers with a new log, read from the oldest one.
+        If the current segment was removed, the flight has begun a new log, which is read from its oldest
+        segment.
         """
         is_gone = self._path is not None and _size(self._path) < self._offset
         if self._path is not None and not is_gone:
