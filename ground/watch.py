@@ -63,6 +63,10 @@ class PacketSource(Protocol):
     """A source of the packets of a flight, such as its log or its link."""
 
     @property
+    def restarts(self) -> int:
+        """Number of restarts of the flight, at each of which the mission time began again."""
+
+    @property
     def silence(self) -> float:
         """Time (s) since the last packet."""
 
@@ -75,6 +79,8 @@ class PacketSource(Protocol):
 
 class LogTail:
     """Reader of a flight log that may be growing and may end in an incomplete packet."""
+
+    restarts = 0  # each restart of the flight begins another log
 
     def __init__(self, folder: Path) -> None:
         """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""

@@ -25,12 +25,12 @@ from flight.link.files.store import Store, problem_of_name
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage, utc_of
 from flight.link.process.directives import KINDS, LIST, SCHEDULE, ListFiles, SendFile
-from flight.link.process.downlink import LIVE
+from flight.link.process.downlink import LIVE, time_of
 from flight.link.process.filing import LISTING
+from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Field
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
-from flight.link.telemetry.definitions import VERIFICATION, Field
 from flight.link.telemetry.log import find_segments
-from flight.link.telemetry.packets import Layout, Packer, PacketArray, TelemetryError
+from flight.link.telemetry.packets import LAYOUTS, Layout, Packer, PacketArray, TelemetryError
 from flight.schema.document import merged_text, read_text
 from flight.schema.reader import parse
 from flight.schema.sections import Commands
@@ -39,6 +39,7 @@ from ground.documentation import Body, commands_for, foreign_modes, layouts_for
 from ground.link.commanding import FileSession, exchange, explained, no_answer, obeyed, sha256_of
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, scan
+from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError, UsageError
 
 Object = dict[str, Any]
@@ -47,6 +48,12 @@ Send = Callable[[bytes], Object]
 KnightCubeError."""
 _TIMEOUT_S = 3.0  # longest time (s) to wait for an answer from a socket
 _LISTEN_S = 0.02  # longest time (s) for which one read of a link waits
+_RESTART_NS = 10 * SECOND_NS
+"""Smallest fall of the mission time that is a restart of the flight; packets of one flight are less late."""
+_RUN, *_OF_THE_LINK = (
+    LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (RUN, LINK, VERIFICATION, TRANSFER)
+)
+"""First bytes of each packet of type `run`, and of each packet that the link process makes."""
 _PING_AFTER_S = 2.0
 """Time (s) without telemetry after which a ping is sent, because the link forgets silent UDP senders."""
 _ANSWER_S = 5.0  # longest time (s) to wait for the report on a command over the link
@@ -196,6 +203,9 @@ class LinkFeed:
 
     Packets of playback are not shown, because they are older than the live packets. The attribute `lock`
     protects the terminal and an open file session.
+
+    Attributes:
+        restarts: number of restarts of the flight that the packets have shown.
     """
 
     def __init__(self, terminal: Terminal) -> None:
@@ -206,6 +216,10 @@ class LinkFeed:
         self._reports: dict[int, list[Report]] = {}
         self._received = time.monotonic()
         self._asked = -np.inf
+        self._run = b""  # newest packet `run`
+        self._run_changed = False  # whether this packet differs from the one before
+        self._newest_ns = 0  # newest mission time
+        self.restarts = 0
 
     @property
     def silence(self) -> float:
@@ -213,7 +227,10 @@ class LinkFeed:
         return time.monotonic() - self._received
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name received since the last call. Raises KnightCubeError."""
+        """Return the packets by name received since the last call. Raises KnightCubeError.
+
+        At a restart of the flight, only the packets after the restart are returned.
+        """
         with self.lock:
             now = time.monotonic()
             if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
@@ -226,8 +243,7 @@ class LinkFeed:
             live = [packet for channel, packet in packets if channel == LIVE]
         if live:
             self._received = time.monotonic()
-        found = scan(b"".join(live)).packets
-        for row in found[VERIFICATION.name]:
+        for row in scan(b"".join(live)).packets[VERIFICATION.name]:
             report = report_of(row.tobytes())
             if report.spi == _SPI:
                 earlier = self._reports.setdefault(report.counter, [])
@@ -235,7 +251,28 @@ class LinkFeed:
                     earlier.append(report)
         while len(self._reports) > _KEPT_REPORTS:
             del self._reports[next(iter(self._reports))]
-        return found
+        return scan(b"".join(self._since_restart(live))).packets
+
+    def _since_restart(self, packets: list[bytes]) -> list[bytes]:
+        """Return the packets after the last restart of the flight, or all packets without a restart.
+
+        At a restart, another packet `run` arrives and the mission time falls. A packet `run` alone may state
+        a correction of UTC, and the link repeats packets of the flight when the link process restarts.
+        """
+        first = 0
+        for place, packet in enumerate(packets):
+            kind = packet[:2]
+            if kind == _RUN:
+                self._run_changed |= packet != self._run
+                self._run = packet
+            elif kind not in _OF_THE_LINK:
+                time_ns = time_of(packet)
+                if self._run_changed and time_ns < self._newest_ns - _RESTART_NS:
+                    self.restarts += 1
+                    self._newest_ns, first = 0, place
+                self._run_changed = False
+                self._newest_ns = max(self._newest_ns, time_ns)
+        return packets[first:]
 
     def send(self, packet: bytes) -> Object:
         """Send a command and return its state after acceptance.
@@ -244,6 +281,7 @@ class LinkFeed:
         """
         with self.lock:
             counter = self._terminal.send(packet, _SPI)
+            self._reports.pop(counter, None)  # a report on a frame with an earlier key
         until = time.monotonic() + _ANSWER_S
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))

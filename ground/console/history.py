@@ -34,10 +34,14 @@ _FIRST_CAPACITY = 1024
 
 
 class History:
-    """Packets of a flight by name and time, as a context manager that removes its files at the end."""
+    """Packets of a flight by name and time, as a context manager that removes its files at the end.
+
+    The attribute `clears` is the number of times that all packets were removed.
+    """
 
     def __init__(self) -> None:
         """Make a temporary folder for the packets."""
+        self.clears = 0
         self._folder = tempfile.TemporaryDirectory(prefix="knightcube-console-")
         self._tracks = {name: _Track(layout, Path(self._folder.name)) for name, layout in LAYOUTS.items()}
 
@@ -67,6 +71,12 @@ class History:
             for track, count in added:
                 track.shorten(count)
             raise
+
+    def clear(self) -> None:
+        """Remove all packets."""
+        for track in self._tracks.values():
+            track.shorten(0)
+        self.clears += 1
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -197,6 +207,7 @@ class PageState:
 
     def __init__(self, history: History) -> None:
         self._history = history
+        self._clears = history.clears
         self._shown: dict[str, int] = {}
 
     def reset(self) -> None:
@@ -208,6 +219,9 @@ class PageState:
 
         The value `omitted` is the number of older packets of a type that are not in its list.
         """
+        if self._history.clears != self._clears:
+            self._clears = self._history.clears
+            self.reset()
         newest: Object = {}
         omitted: dict[str, int] = {}
         again = not self._shown

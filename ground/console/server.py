@@ -86,6 +86,7 @@ class Console:
         files: files of the satellite, or None if the files are not accessible.
         stations: ground stations in the panel of passes until the operator enters other stations.
         settled_ns: newest time (ns) up to which all packets have been received, which the live page shows.
+        restarts: number of restarts of the flight; the history contains the packets since the last restart.
         unstored: packets that were read but could not be stored in the history yet.
         sockets: open WebSockets.
     """
@@ -103,6 +104,7 @@ class Console:
     trouble: str = ""
     doubts: tuple[Callable[[], str], ...] = ()
     settled_ns: int = 0
+    restarts: int = 0
     unstored: dict[str, PacketArray] = field(default_factory=dict)
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
@@ -118,9 +120,12 @@ class Console:
 
     def read(self) -> None:
         """Read the new packets. A failure is stored in `trouble`, and the next read tries again."""
-        newest_ns = self.history.span_ns[1]
         try:
             self.unstored = self.unstored or self.feed.new()
+            if self.feed.restarts != self.restarts:
+                self.restarts, self.utc_ns = self.feed.restarts, None
+                self.history.clear()
+            newest_ns = self.history.span_ns[1]
             self.history.append(self.unstored)
         except KnightCubeError as error:
             self.trouble = str(error)
@@ -129,7 +134,12 @@ class Console:
             self.trouble = f"the console cannot store new packets: {reason_of(error)}: free disk space"
             return
         packets, self.unstored = self.unstored, {}
-        self.trouble = "; ".join(text for doubt in self.doubts if (text := doubt()))
+        doubts = [text for doubt in self.doubts if (text := doubt())]
+        if self.restarts:
+            doubts.append(
+                f"restarts of the flight: {self.restarts}; the page shows the packets since the last"
+            )
+        self.trouble = "; ".join(doubts)
         # Packets of one time may arrive in two reads, so the page shows times up to the previous read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]

@@ -15,11 +15,15 @@ import pytest
 
 from flight.link.commands import ChangeMode, CommandPacker
 from flight.link.events import Mode
-from flight.link.telemetry.definitions import VERIFICATION
+from flight.link.telemetry.definitions import MODE, RUN, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS
 from ground.console import commanding
 from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles, flying
+from ground.console.history import History, PageState
+from ground.console.server import Console
+from ground.console.surroundings import UNKNOWN
 from ground.xtce import TELECOMMANDS
+from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError, UsageError
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
@@ -60,6 +64,43 @@ def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite:
     assert sum(len(packets["link"]) for packets in came) >= 1
     assert len(ends.obeyed) == 1, "the ping that asks for telemetry"
     assert feed.silence < 60.0
+
+
+def test_after_a_restart_of_the_flight_the_console_shows_the_new_flight_only(satellite: Satellite) -> None:
+    ends, feed = satellite.ends, satellite.feed
+
+    def run(utc_ns: int, time_s: int) -> bytes:
+        fields = {field.name: [0.0] * 3 if field.count == 3 else 0 for field in RUN.fields}
+        texts = {"config_name": "orbit", "software": "1"}
+        return ends.packer.pack(RUN, time_s * SECOND_NS, {**fields, **texts, "utc_ns": utc_ns})
+
+    def mode(time_s: int, trigger: str = "") -> bytes:
+        fields = {"before": 0, "mode": int(Mode.HOLD), "trigger": trigger, "reason": "", "target_q2": 0.0}
+        return ends.packer.pack(MODE, time_s * SECOND_NS, fields)
+
+    with History() as history:
+        console = Console("x", feed, history, UNKNOWN, CommandForms(None))
+        page = PageState(history)
+
+        def show() -> dict[str, Any]:
+            for _ in range(12):
+                console.read()
+            return page.at(history.span_ns[1], ("mode",))
+
+        ends.record(run(10**18, 0), mode(100), mode(101))
+        assert show()["newest"]["mode"]["time_ns"] == 101 * SECOND_NS
+        ends.record(run(10**18 + 1, 102), mode(103))  # a correction of UTC
+        show()
+        ends.record(mode(80))  # sent again after a restart of the link process alone
+        show()
+        assert (history.count("mode", 10**18), feed.restarts, console.trouble) == (4, 0, "")
+        ends.record(run(10**18 + 200 * SECOND_NS, 0), mode(1), mode(2, "new"))
+        shown = show()
+        assert (shown["again"], shown["newest"]["mode"]["trigger"]) == (True, "new")
+        times, _ = history.series("mode", "mode", 0, (0, 10**18), 100)
+        assert (times.tolist(), feed.restarts) == ([1.0, 2.0], 1)
+        assert console.utc_ns == 10**18 + 200 * SECOND_NS, "the link repeats the packet `run`"
+        assert "restarts of the flight: 1" in console.trouble
 
 
 def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dict[str, object]:

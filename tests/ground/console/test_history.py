@@ -140,7 +140,7 @@ def test_packets_that_the_disk_refuses_are_stored_whole_later(
 
     with History() as history:
         history.append(halves[0])
-        feed = Mock(new=Mock(return_value=dict(run.flight.packets) | halves[1]))
+        feed = Mock(new=Mock(return_value=dict(run.flight.packets) | halves[1]), restarts=0)
         console = Console("run", feed, history, UNKNOWN, CommandForms(None))
         with monkeypatch.context() as patch:
             patch.setattr(Path, "open", opened)
