@@ -253,9 +253,7 @@ def _followed(
     while left > 0.0:
         wait, heard = min(left, _SILENCE_S), terminal.gate.admitted
         left -= wait
-        for report in terminal.follow(counter, spi, wait):
-            if report.stage is Stage.REPEATED and found:
-                continue  # the frame of an accepted command was replayed by a third party
+        for report in terminal.follow(counter, spi, wait, reported=bool(found)):
             show(report)
             found.append(report)
             if ended(found) or report.stage.final or report.stage is Stage.REPEATED:

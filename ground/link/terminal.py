@@ -202,13 +202,13 @@ class Terminal:
                     self._pass_by(packet)
                 yield channel, packet
 
-    def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
+    def follow(self, counter: int, spi: int, seconds: float, *, reported: bool = False) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
         If the first report states that the frame's counter was used before, it is also the final report. A
-        later report of a used counter is skipped, because a third party has replayed the frame.
+        later report of a used counter is skipped, because a third party has replayed the frame; if `reported`
+        is true, the first report was received in an earlier call.
         """
-        reported = False
         for _, packet in self.packets(seconds):
             if packet[:2] != _VERIFICATION:
                 continue

@@ -232,4 +232,6 @@ def test_only_the_reports_on_the_own_command_are_followed_up_to_the_final_one(
         assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.ACCEPTED] * 2 + [Stage.COMPLETED]
         received[1:2] = []
         assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.REPEATED]
+        later = terminal.follow(5, 1, 1.0, reported=True)
+        assert [one.stage for one in later] == [Stage.ACCEPTED, Stage.COMPLETED]
         assert terminal.lost_frames == 0
