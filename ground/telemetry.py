@@ -181,11 +181,11 @@ def read_run(folder: Path) -> Run:
         raise UsageError(f"{folder}: is not a folder: give a run's folder, such as {folder.parent}")
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a run (option --out of the run)")
-    flight_segments(folder)
+    segments = flight_segments(folder)
     logs = []
     for stem in ("flight", "truth", "performance"):
         try:
-            paths = find_segments(folder, stem)
+            paths = segments if stem == "flight" else find_segments(folder, stem)
             # The first packets of a log whose oldest segments were deleted are not missing by damage.
             whole = stem == "flight" and is_first(paths[0])
             logs.append(scan(b"".join(path.read_bytes() for path in paths), whole))

@@ -16,8 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.link.telemetry.definitions import CONTROL, EVENT, HOUSEKEEPING, IMU, RUN, TARGET, TRUTH
-from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.log import FlightLog, find_segments
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
+from ground import telemetry
 from ground.telemetry import Run, ScanResult, decode, export, read_run, scan
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
@@ -82,6 +83,22 @@ def test_a_folder_without_a_run_is_a_clear_error(tmp_path: Path) -> None:
         read_run(tmp_path / "archive")
     (tmp_path / "flight-0001.ccsds").write_bytes(b"not a log")
     with pytest.raises(UsageError, match="no valid packet in the 9 bytes"):
+        read_run(tmp_path)
+
+
+def test_segments_that_are_removed_meanwhile_are_a_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "flight-0001.ccsds").write_bytes(timing_packets(1)[0])
+
+    def found(folder: Path, stem: str) -> list[Path]:
+        paths = find_segments(folder, stem)
+        for path in paths:
+            path.unlink()
+        return paths
+
+    monkeypatch.setattr(telemetry, "find_segments", found)
+    with pytest.raises(UsageError, match="the flight log cannot be read: No such file"):
         read_run(tmp_path)
 
 
