@@ -25,7 +25,7 @@ from flight.schema.devices import (
     axis_matrix,
     driver_of,
 )
-from flight.schema.document import ConfigError, imported
+from flight.schema.document import ConfigError, call_named, imported
 from flight.schema.sections import Config
 from hal.buses.linux_wires import device_file
 from hal.drivers.coils import CoilSettings, wirings
@@ -292,7 +292,8 @@ def emulate_sensors(emulation: Emulation, unit: SensorsSection) -> tuple[Any, ..
         place = SENSOR_PARTS.get(sensor.part, sensor.part)
         part: Any
         if sensor.emulator is not None:
-            part = imported(key, sensor.emulator, {}, os.environ)(measured, sensor)
+            made_by = imported(key, sensor.emulator, {}, os.environ)
+            part = call_named(key, sensor.emulator, made_by, measured, sensor)
         elif place in EMULATORS:
             part = EMULATORS[place](sensor.address or _ADDRESSES.get(place, 0), measured)
         else:

@@ -12,7 +12,7 @@ import importlib
 import math
 import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -38,6 +38,7 @@ from flight.schema.document import (
     Sign,
     SignedAxis,
     Vector,
+    call_named,
     imported,
 )
 from hal.interfaces.wires import Rig
@@ -777,7 +778,29 @@ def _named(kind: str, named: str, key: str) -> Driver:
         raise ConfigError(
             key, f"is {named!r}: this object is not a Driver (flight.schema.devices) of `{kind}`"
         )
-    return driver
+    return driver if named in DRIVERS[kind] else _explained(driver, named, key)
+
+
+def _explained(driver: Driver, named: str, key: str) -> Driver:
+    """Return a driver of another package, whose functions raise ConfigError for mistakes in their code."""
+
+    def explained(word: str) -> Any:
+        function = getattr(driver, word)
+
+        def run(*arguments: Any) -> Any:
+            made = call_named(key, named, function, *arguments)
+            if made is None and word in {"open", "emulate"}:
+                raise ConfigError(
+                    key, f"is {named!r}, whose function `{word}` returns None: return the device"
+                )
+            return made
+
+        return None if function is None else run
+
+    functions: dict[str, Any] = {
+        word: explained(word) for word in ("open", "probe", "emulate", "files", "check", "off")
+    }
+    return replace(driver, **functions)
 
 
 def with_drivers(shape: type[Any], document: Document) -> type[Any]:

@@ -30,7 +30,7 @@ import yaml
 from msgspec import Meta, inspect
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.errors import InputError
+from knightcube.errors import InputError, KnightCubeError
 from knightcube.gnc.guidance.plant import Q2_LIMIT
 from knightcube.gnc.guidance.pointing_target import ROLLS, Goal, PointingTarget
 
@@ -84,7 +84,8 @@ MODULES = "KNIGHTCUBE_MODULES"
 configuration may import, in addition to the known objects."""
 
 
-_IMPORT_MISTAKES = (
+_MISTAKES = (
+    AssertionError,
     ImportError,
     AttributeError,
     SyntaxError,
@@ -94,8 +95,9 @@ _IMPORT_MISTAKES = (
     LookupError,
     ArithmeticError,
     OSError,
+    RuntimeError,
 )
-"""Exceptions that mistakes in a module usually raise while it is imported."""
+"""Exceptions that mistakes in a module usually raise during its import and in its functions."""
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
@@ -112,7 +114,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
         raise ConfigError(key, f"is {named!r}, which is not permitted: add it as a line to {file} as root")
     try:
         return getattr(importlib.import_module(module), name)
-    except _IMPORT_MISTAKES as error:
+    except _MISTAKES as error:
         problem = _import_problem(module, name, error, on_board=file is not None)
         raise ConfigError(key, f"is {named!r}, which cannot be imported: {problem}") from error
 
@@ -129,10 +131,31 @@ def _import_problem(module: str, name: str, error: Exception, on_board: bool) ->
         return f"{error}" + (f", did you mean `{module}:{similar[0]}`?" if similar else "")
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: {error.msg}"
-    own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
+    return _mistake(error, None, ": correct this line, or install the package that it needs")
+
+
+def call_named(key: str, named: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of a function of the object `named` (`module:object`), which the key `key` gives.
+
+    Raises ConfigError, with the file and line, if the function fails because of a mistake in its code.
+    """
+    try:
+        return function(*arguments)
+    except KnightCubeError:
+        raise
+    except _MISTAKES as error:
+        file = getattr(sys.modules.get(named.partition(":")[0]), "__file__", None)
+        name = getattr(function, "__name__", type(function).__name__)
+        problem = _mistake(error, file, ": correct this line")
+        raise ConfigError(key, f"is {named!r}, whose function `{name}` failed: {problem}") from error
+
+
+def _mistake(error: Exception, file: str | None, cure: str) -> str:
+    """Return an error with file and line, if possible of the given file, and the remedy for this line."""
+    frames = [one for one in traceback.extract_tb(error.__traceback__) if not one.filename.startswith("<")]
+    own = [one for one in frames if one.filename == file] or frames
     where = f"{own[-1].filename}:{own[-1].lineno}: " if own and own[-1].filename != __file__ else ""
-    cure = ": correct this line, or install the package that it needs" if where else ""
-    return f"{where}{type(error).__name__}: {error}{cure}"
+    return f"{where}{type(error).__name__}: {error}{cure if where else ''}"
 
 
 def _permitted_objects(path: Path) -> list[str]:

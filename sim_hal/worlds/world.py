@@ -23,7 +23,7 @@ from flight.link.telemetry.definitions import (
     TRUTH,
 )
 from flight.link.telemetry.packets import Packer
-from flight.schema.document import ConfigError, imported
+from flight.schema.document import ConfigError, call_named, imported
 from flight.schema.sections import Config
 from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.arrays import FloatArray
@@ -133,10 +133,7 @@ def make_world(inputs: WorldInputs) -> World:
     """
     named = inputs.section.world
     factory = imported("simulation.world", named, WORLDS, os.environ)
-    try:
-        world = factory(inputs) if callable(factory) else None
-    except TypeError as error:
-        raise ConfigError("simulation.world", f"is {named!r}: its factory fails: {error}") from error
+    world = call_named("simulation.world", named, factory, inputs) if callable(factory) else None
     if not isinstance(world, World):
         raise ConfigError(
             "simulation.world", f"is {named!r}: its factory returns no World (sim_hal.worlds.world)"

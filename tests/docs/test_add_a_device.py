@@ -130,6 +130,26 @@ def test_a_value_that_the_device_does_not_accept_is_refused(
     assert "`power_monitor.averages` is 65: must be 1 to 1024" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("return Ina226(rig.wires", "return Ina226(rig.wire", "`open_monitor` failed: LINE: Attr"),
+        ("return Ina226(rig.wires", "Ina226(rig.wires", "`open` returns None: return the device"),
+        ("if section.averages not", "if section.average not", "`check` failed: LINE: Attr"),
+        ("i2c(section.bus).attach(chip)", "i2c(section.bus).atach(chip)", "`emulate` failed: LINE: Attr"),
+    ],
+)
+def test_a_mistake_in_the_code_of_a_driver_is_named_with_its_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, problem: str
+) -> None:
+    text = (folder / "ina226.py").read_text(encoding="utf-8")
+    assert old in text
+    (folder / "ina226.py").write_text(text.replace(old, new), encoding="utf-8")
+    assert main(["run", "ina226.yaml", "--out", "run"]) == 2
+    error, problem = capsys.readouterr().err, problem.replace("LINE", r".*ina226\.py:\d+")
+    assert re.search(f"`power_monitor.driver` is 'ina226:INA226', whose function {problem}", error), error
+
+
 def test_a_board_imports_the_driver_only_if_root_permits_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

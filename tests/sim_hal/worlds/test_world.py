@@ -33,7 +33,7 @@ def test_a_third_partys_world_is_flown_and_its_motion_reaches_estimate_and_truth
         (f"{HERE}:missing", "cannot be imported"),
         (f"{HERE}:NO_FACTORY", "returns no World"),
         (f"{HERE}:make_nothing", "returns no World"),
-        ("os:system", "its factory fails"),
+        ("os:system", "whose function `system` failed: TypeError"),
     ],
 )
 def test_a_world_that_is_not_there_is_one_clear_line(name: str, complaint: str, tmp_path: Path) -> None:
