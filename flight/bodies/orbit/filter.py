@@ -685,7 +685,10 @@ class OrbitFilter:
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times, and call `applied` with flags of those that passed the gate."""
+        """Apply measurements of past times, and call `applied` with flags of those that passed the gate.
+
+        Measurements beyond the history are ignored.
+        """
         self._close()
         places = [self._replay.place(m.time_ns) for m in late]
         inside = [k for k in places if k is not None and self._steps[k].before is not None]
@@ -705,8 +708,8 @@ class OrbitFilter:
                     used = self._replay.make_room(m, self._placed_ns)
             taken = [id(m) in used for m in late]
         applied(taken)
-        for m, was in zip(late, taken, strict=True):
-            if not isinstance(m, AttitudeMeasurement):
+        for m, k, was in zip(late, places, taken, strict=True):
+            if k is None or not isinstance(m, AttitudeMeasurement):
                 continue
             self._refused_attitudes = 0 if was else self._refused_attitudes + 1
             if was:

@@ -254,6 +254,14 @@ def test_stars_older_than_the_history_are_refused() -> None:
     assert not flown.see(20 * SECOND_NS)
 
 
+def test_stars_older_than_the_history_do_not_contradict_the_estimate() -> None:
+    flown = acquired()
+    for _ in range(REFUSALS_TO_RESTART):
+        assert not flown.see(20 * SECOND_NS)
+    assert not flown.see(10 * PERIOD_NS, np.array([0.0, 0.1, 0.0]))
+    assert flown.filter.restarts == 0
+
+
 def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> None:
     flown = acquired()
     off = np.array([0.0, 0.1, 0.0])
