@@ -19,8 +19,9 @@ above 18 km or 515 m/s, so that a satellite needs a receiver with firmware witho
 A receiver with the driver `nmea` sends sentences by itself, about once a second. The sentence RMC contains
 date, time, ground speed and course, and the sentence GGA contains the position with altitude, quality and
 number of satellites. A pair of sentences RMC and GGA with the same time gives one reading. NMEA does not
-provide a vertical velocity; the driver computes it from the altitudes of two fixes. NMEA does not provide an
-accuracy; the driver reports the horizontal dilution of precision times an assumed range error.
+provide a vertical velocity; the driver computes it from the altitudes of two fixes. Until the second fix, the
+vertical velocity is reported as zero with a large standard deviation. NMEA does not provide an accuracy; the
+driver reports the horizontal dilution of precision times an assumed range error.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import math
 import re
 import struct
 from calendar import monthrange
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
@@ -574,6 +575,10 @@ _FIELDS = {"RMC": 10, "GGA": 12}
 """Minimum numbers of fields of the sentences from which a reading is made."""
 _VERTICAL_SPEED_S = 10.0
 """Longest time (s) between two fixes from which a vertical velocity is computed."""
+_VERTICAL_SPEED_SIGMA = 50.0
+"""Standard deviation (m/s) of an unknown vertical velocity, for low orbits of an eccentricity up to 0.007."""
+_NOT_MEASURED = {"", "0", "6", "7", "8"}
+"""GGA qualities of a position that was not measured: no fix, extrapolated, manual input, simulator."""
 _NO_FIX = "the receiver has no fix: check the antenna and the view of the sky"
 
 
@@ -587,7 +592,7 @@ class NmeaReceiver:
         """
         self._port, self._clock, self._earliest_ns = port, clock, earliest_ns
         self._buffer = b""
-        self._halves: dict[str, list[str]] = {}
+        self._halves: dict[str, tuple[int, list[str]]] = {}  # time (ns) of the begin, and fields
         self._height: tuple[float, float] | None = None  # seconds of the day and altitude (m) of the last fix
         self._bytes = self._sentences = self._bad = self._discarded = 0
         self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0
@@ -609,7 +614,9 @@ class NmeaReceiver:
                     self._bad += 1
                     continue
                 self._sentences += 1
-                readings.append(self._take(found[1].decode("ascii").split(","), arrival_ns, len(found[0])))
+                behind_ns = (len(self._buffer) - found.start()) * _BITS * SECOND_NS // self._port.baud_rate
+                fields = found[1].decode("ascii").split(",")
+                readings.append(self._take(fields, arrival_ns, arrival_ns - behind_ns))
             if len(self._buffer) - taken > _LONGEST:  # longer than any sentence
                 self._discarded += len(self._buffer) - taken
                 taken = len(self._buffer)
@@ -635,18 +642,21 @@ class NmeaReceiver:
         """Close the serial line."""
         self._port.close()
 
-    def _take(self, fields: list[str], arrival_ns: int, length: int) -> GpsReading | None:
-        """Return the reading that a sentence completes, or None if the other sentence is missing."""
+    def _take(self, fields: list[str], arrival_ns: int, begun_ns: int) -> GpsReading | None:
+        """Return the reading that a sentence completes, or None if the other sentence is missing.
+
+        The first byte of the sentence was sent at `begun_ns`.
+        """
         kind = fields[0].removeprefix("P")[2:]  # proprietary sentences, such as PGRMC, begin with P
         if len(fields) < _FIELDS.get(kind, math.inf):
             return None
         other = self._halves.get("GGA" if kind == "RMC" else "RMC")
-        self._halves[kind] = fields
-        if other is None or other[1] != fields[1]:
+        self._halves[kind] = begun_ns, fields
+        if other is None or other[1][1] != fields[1]:
             return None
         try:
-            pvt = self._pvt(self._halves["RMC"], self._halves["GGA"])
-            reading = reading_of(pvt, arrival_ns, self._port.baud_rate, self._earliest_ns, length)
+            pvt = self._pvt(self._halves["RMC"][1], self._halves["GGA"][1])
+            reading = reading_of(pvt, arrival_ns, self._port.baud_rate, self._earliest_ns)
         except (ValueError, OverflowError, OutOfRange) as error:
             self._out_of_range += 1
             self._condition = f"a sentence is implausible: {error}"
@@ -656,7 +666,7 @@ class NmeaReceiver:
         self._no_fix += not pvt.fix
         self._rolled_over += reading.rolled_over
         self._condition = "" if reading.valid else _NO_FIX
-        return reading
+        return replace(reading, time_ns=other[0])
 
     def _pvt(self, rmc: list[str], gga: list[str]) -> Pvt:
         """Return the content of the sentences RMC and GGA in the units of a NAV-PVT message.
@@ -664,7 +674,7 @@ class NmeaReceiver:
         Raises ValueError or OverflowError.
         """
         clock, date = rmc[1], rmc[9]
-        fix = gga[6] not in {"", "0"} and rmc[2] == "A"
+        fix = gga[6] not in _NOT_MEASURED and rmc[2] == "A"
         known = len(date) == 6 and len(clock) >= 6
         day, month, year = (int(date[n : n + 2]) for n in (0, 2, 4)) if known else (0, 0, 0)
         hour, minute = (int(clock[n : n + 2]) for n in (0, 2)) if known else (0, 0)
@@ -672,6 +682,9 @@ class NmeaReceiver:
         height = float(gga[9] or 0.0) + float(gga[11] or 0.0) if fix else 0.0
         speed, course = float(rmc[7] or 0.0) * KNOT, math.radians(float(rmc[8] or 0.0))
         accuracy = round(1e3 * RANGE_ERROR * float(gga[8] or 0.0)) if fix else 0
+        down = self._down(3600.0 * hour + 60.0 * minute + second, height) if fix else None
+        unknown = round(1e3 * math.sqrt(3.0) * _VERTICAL_SPEED_SIGMA) if fix else 0
+        speed_accuracy = accuracy if down is not None else unknown
         return Pvt(
             date=(2000 + year, month, day, hour, minute, int(second)),
             nano=round(second % 1.0 * SECOND_NS),
@@ -687,17 +700,18 @@ class NmeaReceiver:
             velocity=(
                 round(1e3 * speed * math.cos(course)),
                 round(1e3 * speed * math.sin(course)),
-                round(1e3 * self._down(3600.0 * hour + 60.0 * minute + second, height)) if fix else 0,
+                round(1e3 * (down or 0.0)),
             ),
-            speed_accuracy=accuracy or UNKNOWN_ACCURACY,
+            speed_accuracy=speed_accuracy or UNKNOWN_ACCURACY,
         )
 
-    def _down(self, seconds: float, height: float) -> float:
-        """Return the downward velocity (m/s) from the change of the altitude, or zero if it is unknown."""
+    def _down(self, seconds: float, height: float) -> float | None:
+        """Return the downward velocity (m/s) from the change of the altitude, or None if it is unknown."""
         before, self._height = self._height, (seconds, height)
-        if before is None or not 0.0 < seconds - before[0] < _VERTICAL_SPEED_S:
-            return 0.0
-        return (before[1] - height) / (seconds - before[0])
+        since = math.inf if before is None else (seconds - before[0]) % 86_400.0
+        if before is None or not 0.0 < since < _VERTICAL_SPEED_S:
+            return None
+        return (before[1] - height) / since
 
 
 def _degrees(text: str, hemisphere: str) -> float:

@@ -281,6 +281,36 @@ def test_the_vertical_velocity_is_the_change_of_the_altitude() -> None:
     assert readings[1].velocity @ up == pytest.approx(-7.0, abs=0.05)
 
 
+def test_the_vertical_velocity_is_uncertain_until_the_second_fix() -> None:
+    (first, second), _ = read(rmc(), gga(), rmc("120001.00"), gga("120001.00"))
+    assert first.velocity_sigma == pytest.approx(50.0, rel=1e-3)
+    assert second.velocity_sigma < 2.0
+
+
+def test_the_vertical_velocity_is_known_across_midnight() -> None:
+    later = rmc("000000.00", speed="0.0"), gga("000000.00", altitude="93.0")
+    readings, _ = read(rmc("235959.00"), gga("235959.00"), *later)
+    up = readings[1].position / np.linalg.norm(readings[1].position)
+    assert readings[1].velocity @ up == pytest.approx(-7.0, abs=0.05)
+
+
+@pytest.mark.parametrize("behind", [0, 50])
+def test_a_reading_has_the_time_at_which_its_first_sentence_began(behind: int) -> None:
+    others = sentence("GNGSA,A,3,80,71,73,79,69,,,,,,,,1.83,1.09,1.47") * 5
+    driver = NmeaReceiver(line := Line(), SimClock())
+    line.chunks.append((SECOND_NS, gga() + others + rmc() + others[:behind]))
+    (reading,) = driver.poll()
+    sent = len(gga() + others + rmc()) + behind
+    assert reading.time_ns == pytest.approx(SECOND_NS - sent * 10 * SECOND_NS // 9600, abs=1)
+
+
+@pytest.mark.parametrize("quality", ["6", "7", "8"])
+def test_a_position_that_was_not_measured_is_not_valid(quality: str) -> None:
+    (reading,), driver = read(rmc(), gga(quality=quality))
+    assert not reading.valid
+    assert driver.link().no_fix == 1
+
+
 def test_sentences_of_different_times_are_not_combined() -> None:
     readings, _ = read(rmc("120000.00"), gga("120001.00"))
     assert readings == []
