@@ -294,7 +294,13 @@ def step_wide(session: Session) -> Outcome:
         session.ask(f"Cover the lens of {key} only.")
         if session.hand is not None:
             session.hand.cover(True, 1 + number)
-        covered[key] = {name: session.frames(1, [], name)[0].pixels for name in open_frames}
+        covered[key] = {}
+        for name in list(open_frames):
+            try:
+                covered[key][name] = session.frames(1, [], name)[0].pixels
+            except StepSkipped as reason:
+                findings += [reason.finding] if reason.finding else []
+                del open_frames[name]
         if session.hand is not None:
             session.hand.cover(False, 1 + number)
     darkened = {

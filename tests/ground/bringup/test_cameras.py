@@ -17,6 +17,7 @@ from flight.schema.devices import Camera, WideCamera
 from ground.bringup import cameras
 from ground.bringup.bench import Outcome, Session, StepSkipped
 from ground.bringup.cameras import psf_width, step_dark, step_focus, step_light, step_wide
+from hal.interfaces.errors import NotResponding
 from knightcube.astro.arrays import Image
 from tests.support.bench_session import ScriptedCamera, bench_session, named
 
@@ -391,6 +392,24 @@ def test_a_fault_of_a_horizon_camera_is_named(
     assert all(says in one.text for one in found.findings)
     bright = {one.part for one in found.findings if one.kind == "too bright"}
     assert set(found.values["levels"]) == {f"wide_cameras[{n}]" for n in range(len(levels))} - bright
+
+
+def test_a_horizon_camera_that_fails_while_it_is_covered_hides_no_other_fault(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lit = LitCameras([(60.0, 60.0), (120.0, 10.0), (90.0, 8.0)])
+    pixels = lit.pixels
+
+    def taken(number: int) -> Image:
+        if number == 1 and 2 in lit.hand.covered:
+            raise NotResponding("camera", "the plug is loose")
+        return pixels(number)
+
+    monkeypatch.setattr(lit, "pixels", taken)
+    found = step_wide(lit.session)
+    assert named(found.findings) == ["wide_cameras[1] no frame", "wide_cameras[0] lens cap on"]
+    assert set(found.values["darkened"]) == {"wide_cameras[0]", "wide_cameras[2]"}
+    assert lit.hand.covered == set()
 
 
 def test_a_configuration_without_horizon_cameras_skips_the_step() -> None:
