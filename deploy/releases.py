@@ -25,6 +25,8 @@ from pathlib import Path
 
 UNCLEAN = 3
 """Number of starts after which an unproven release is no longer chosen."""
+TRIES = 3
+"""Number of attempts to read the record of starts."""
 MANIFEST, TRIALS = "manifest", "releases.json"
 INCOMPLETE = "does not point to a complete release"
 DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
@@ -123,10 +125,20 @@ class Trials:
         self.proven: list[str] = []
         # A damaged file is ignored, so that the flight software can start.
         with suppress(OSError, *DAMAGED):
-            kept = json.loads(_line_of(_text(self._path, LARGEST_RECORD)))
+            kept = json.loads(_line_of(self._persistently_read()))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
             self.proven = [str(name) for name in kept["proven"]]
             self.starts = starts
+
+    def _persistently_read(self) -> str:
+        """Return the text of the record. Raises OSError and ValueError.
+
+        A single failed disk access does not mean damage, and the next write would drop the proven releases.
+        """
+        for _ in range(TRIES - 1):
+            with suppress(OSError):
+                return _text(self._path, LARGEST_RECORD)
+        return _text(self._path, LARGEST_RECORD)
 
     def failed(self, release: Path) -> bool:
         """Return whether an unproven release has been started `UNCLEAN` times."""

@@ -303,7 +303,7 @@ class FlownRelease:
             stack.callback(clock.ticker("release", PROVEN_NS, self.prove).stop)
 
     def prove(self) -> None:
-        """Record this release as proven; a failed write is retried a minute later."""
+        """Record this release as proven; a failed read or write is retried a minute later."""
         if self._path is None or self._done:
             return
         with suppress(OSError):
@@ -312,7 +312,10 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Reset the count of starts of the release, because its flight ended normally."""
+        """Reset the count of starts of the release, because its flight ended normally.
+
+        If the record cannot be read or written, the record stays unchanged.
+        """
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))
@@ -324,9 +327,13 @@ class FlownRelease:
 
 
 def _proven(path: Path) -> list[str]:
-    """Return the proven releases, or an empty list if the file is missing or damaged."""
-    with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
-        kept: dict[str, Any] = json.loads(line_of(LinuxFiles().read(path) or b"") or b"")
+    """Return the proven releases, or an empty list if the file is missing or damaged.
+
+    Raises OSError for a file that cannot be read, whose releases must not be dropped by the next write.
+    """
+    data = LinuxFiles().read(path) or b""
+    with suppress(ValueError, TypeError, LookupError, RecursionError):
+        kept: dict[str, Any] = json.loads(line_of(data) or b"")
         return [str(name) for name in kept["proven"]]
     return []
 
@@ -511,13 +518,25 @@ class KeptConfig:
 
 def kept_configs(folder: Path) -> list[KeptConfig]:
     """Return the undamaged configurations stored in a state folder, newest first. Raises OSError."""
-    found = []
+    return _read_kept(folder)[0]
+
+
+def _read_kept(folder: Path) -> tuple[list[KeptConfig], list[Path]]:
+    """Return the undamaged stored configurations, newest first, and the damaged files. Raises OSError.
+
+    A file that cannot be read is in neither list, because a later attempt to read it may succeed.
+    """
+    found, damaged = list[KeptConfig](), list[Path]()
     for number, path, digest in _named(folder):
-        with suppress(OSError, UnicodeDecodeError):
-            data = LinuxFiles().read(path)
-            if data is not None and hashlib.sha256(data).hexdigest() == digest:
+        with suppress(OSError):
+            data = _persistently(LinuxFiles().read, path) or b""
+            try:
+                if hashlib.sha256(data).hexdigest() != digest:
+                    raise ValueError("its checksum is wrong")
                 found.append(KeptConfig(number, path, data.decode("utf-8")))
-    return sorted(found, key=lambda kept: kept.number, reverse=True)
+            except ValueError:
+                damaged.append(path)
+    return sorted(found, key=lambda kept: kept.number, reverse=True), damaged
 
 
 class FlownConfig:
@@ -540,18 +559,18 @@ class FlownConfig:
         with suppress(OSError):
             place = self._folder / FOLDER
             place.mkdir(exist_ok=True)
-            kept = kept_configs(self._folder)
+            kept, damaged = _read_kept(self._folder)
             if not kept or kept[0].text.encode() != self._data:
                 number = max((number for number, _, _ in _named(self._folder)), default=0) + 1
                 name = f"{number:06d}-{hashlib.sha256(self._data).hexdigest()}.yaml"
                 replace_file(LinuxFiles(), place / name, self._data)
-                kept = kept_configs(self._folder)
+                kept, damaged = _read_kept(self._folder)
             # Keep the newest copies of `KEPT` different texts, and delete damaged and older copies.
             texts: dict[str, Path] = {}
             for copy in kept:
                 texts.setdefault(copy.text, copy.path)
             staying = set(list(texts.values())[:KEPT])
-            for _, path, _ in _named(self._folder):
+            for path in (*damaged, *(copy.path for copy in kept)):
                 if path not in staying:
                     path.unlink(missing_ok=True)
             self._kept = True

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -188,3 +189,22 @@ def test_a_flight_without_a_release_has_nothing_to_prove(tmp_path: Path) -> None
     release.prove()
     release.end()
     assert not list(tmp_path.iterdir())
+
+
+def test_one_failed_read_keeps_the_record_of_the_releases(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = {"starts": {"c": 1}, "proven": ["a", "b"]}
+    (tmp_path / TRIALS).write_text(releases.record(json.dumps(record)), encoding="ascii")
+    text, failures = releases._text, [OSError(5, "Input/output error")] * 2
+
+    def read(path: Path, largest: int) -> str:
+        if failures:
+            raise failures.pop()
+        return cast(str, text(path, largest))
+
+    monkeypatch.setattr(releases, "_text", read)
+    releases.Trials(tmp_path).count(tmp_path / "c")
+    line = line_of((tmp_path / TRIALS).read_bytes())
+    assert line is not None
+    assert json.loads(line) == {"starts": {"c": 2}, "proven": ["a", "b"]}

@@ -239,3 +239,25 @@ def test_a_flight_of_a_kept_configuration_says_so_and_records_it_as_an_event(
     events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
     assert "no such file" in events["config-damaged"]
     assert "the configuration of an earlier flight is used" in capsys.readouterr().err
+
+
+def test_a_copy_that_cannot_be_read_now_is_not_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from flight.loop.state import LinuxFiles  # noqa: PLC0415
+
+    for text in (TEXT, TEXT + "# 2\n"):
+        FlownConfig(text, tmp_path).keep()
+    unread = kept_configs(tmp_path)[1].path
+    read = LinuxFiles.read
+
+    def failing(files: LinuxFiles, path: Path) -> bytes | None:
+        if path == unread:
+            raise OSError(5, "Input/output error")
+        return read(files, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LinuxFiles, "read", failing)
+        FlownConfig(TEXT + "# 3\n", tmp_path).keep()
+        assert texts_kept(tmp_path) == [TEXT + "# 3\n", TEXT + "# 2\n"]
+    assert texts_kept(tmp_path) == [TEXT + "# 3\n", TEXT + "# 2\n", TEXT]

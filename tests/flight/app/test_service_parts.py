@@ -207,3 +207,22 @@ def test_the_guardians_news_and_notes_of_the_start_become_events() -> None:
     bench.supervision.feed()
     assert len(bench.recorded) == 3, "each note is reported once"
     bench.supervision.close()
+
+
+def test_a_record_that_cannot_be_read_once_keeps_its_proven_releases(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = {"starts": {"e": 2}, "proven": ["a", "b"]}
+    keep(folder, record)
+    release = FlownRelease({"KNIGHTCUBE_RELEASE": "e"})
+
+    def fail(*_: object) -> bytes:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(service.LinuxFiles, "read", fail)
+        release.prove()
+        release.end()
+    assert kept(folder) == record
+    release.prove()
+    assert kept(folder) == {"starts": {}, "proven": ["a", "b", "e"]}
