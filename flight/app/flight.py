@@ -297,12 +297,13 @@ def _judge(request: RunRequest) -> _Judged:
 
 
 def _open(judged: _Judged, stack: ExitStack) -> _Opened:
-    """Open a flight. The run folder is removed from the archive if the opening fails."""
+    """Open a flight. A run folder that did not exist before is removed if the opening fails."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
-    request, earlier = _begin_folder(judged.request, judged.merged, config, stack)
+    new = judged.request.archive is not None or not judged.request.out.exists()
+    request, earlier = _begin_folder(judged.request, judged.merged, config, stack, new)
     unflown = stack.enter_context(ExitStack())
-    if request.archive is not None:
+    if new:
         unflown.callback(rmtree, request.out, ignore_errors=True)
     rig = _open_rig(request, text, config, stack)
     patient = request.archive is not None
@@ -657,15 +658,15 @@ _NEWEST = 4
 
 
 def _begin_folder(
-    request: RunRequest, text: str, config: Config, stack: ExitStack
+    request: RunRequest, text: str, config: Config, stack: ExitStack, new: bool
 ) -> tuple[RunRequest, list[Path]]:
     """Create the folder of the run, which is the next folder of the archive if there is an archive.
 
     Return the request with the path of the new folder, and the folders of the newest earlier runs.
 
     Raises UsageError for a folder that already contains a run or that another flight uses, and for a folder
-    that cannot be written. A flight computer with an archive flies despite disk errors, and its logs wait
-    until the disk works.
+    that cannot be written, which is removed if it is `new`. A flight computer with an archive flies despite
+    disk errors, and its logs wait until the disk works.
     """
     earlier: list[Path] = []
     if request.archive is not None:
@@ -686,6 +687,8 @@ def _begin_folder(
     except OSError as error:
         if request.archive is not None and error.errno in DISK_TROUBLE:
             return request, earlier
+        if new:
+            rmtree(out, ignore_errors=True)
         raise UsageError(f"{out}: cannot be written: {reason_of(error)}") from error
     return request, earlier
 

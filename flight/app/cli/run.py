@@ -40,8 +40,6 @@ from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 if TYPE_CHECKING:  # see `flight.app.run`
     from flight.loop.flight_loop import FlightEnding, FlightProgress
-if TYPE_CHECKING:  # see `flight.app.run`
-    from flight.loop.flight_loop import FlightEnding
 
 
 def summary_text(result: RunResult, elapsed: float) -> str:

@@ -108,6 +108,7 @@ def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_th
     """A board waits for a missing socket folder. A run that has no archive ends at once with an error."""
     bench = [*board[:2], "--out", str(tmp_path / "bench"), "--duration", "1"]
     assert main(bench) == 2
+    assert not (tmp_path / "bench").exists()
     timer = threading.Timer(0.3, (tmp_path / "later").mkdir)
     timer.start()
     assert main(board) == 0
