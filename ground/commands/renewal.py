@@ -9,8 +9,8 @@ import os
 import re
 import sys
 import tarfile
-from collections.abc import Iterable
-from contextlib import closing, suppress
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, TargetFile, 
 
 from flight.app.cli import PROGRAM
 from flight.app.run import utc_ns
+from flight.link.files.store import locked, make_lasting
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import KINDS, Activate, Confirm, Directive, Withdraw
@@ -105,18 +106,30 @@ def run(options: argparse.Namespace) -> int:
                 f"keys in {options.folder}; for the board: {root} as /etc/knightcube/root.json\n"
             )
         case "new-key":
-            version = replace_signing_key(options.folder, options.root)
+            with _alone(options.folder):
+                version = replace_signing_key(options.folder, options.root)
             sys.stdout.write(f"root metadata {version}; the next bundle carries them\n")
         case "sign":
             data = artefact(options.kind, options.path)
             if options.version is None:
                 options.version = _release_version(options.kind, options.path)
             _check_permanent(options)
-            bundle = sign(options, data)
+            with _alone(options.folder):
+                bundle = sign(options, data)
             sys.stdout.write(f"{bundle}: {bundle.stat().st_size} bytes\n")
         case _:
             return _command(options)
     return 0
+
+
+def _alone(folder: Path) -> AbstractContextManager[None]:
+    """Return a lock of the metadata, without which two commands could sign different metadata of one version.
+
+    A folder without metadata is not locked. A locked folder raises UsageError.
+    """
+    metadata = folder / "metadata"
+    problem = f"{folder}: another command signs with these keys: try again after its end"
+    return locked(metadata / ".lock", problem) if metadata.is_dir() else nullcontext()
 
 
 def make_signing_keys(folder: Path) -> Path:
@@ -176,7 +189,11 @@ def _check_permanent(options: argparse.Namespace) -> None:
 
 
 def sign(options: argparse.Namespace, data: bytes) -> Path:
-    """Sign the bytes of an artefact, and return the path of their bundle. Raises UsageError."""
+    """Sign the bytes of an artefact, and return the path of their bundle. Raises UsageError.
+
+    The bundle is written completely before the metadata, so that a failed write does not use up a version.
+    The bundle gets its name last, because the next bundle must not repeat the versions of its metadata.
+    """
     folder, kind = options.folder, options.kind
     signer = _read_key(folder / "signing.pem")
     if signer.public_key.keyid not in _newest_root(folder).roles["targets"].keyids:
@@ -197,11 +214,15 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
         one.version, one.expires = max(one.version + 1, options.least), expires
     snapshot.meta["targets.json"] = MetaFile(version=targets.version)
     timestamp.snapshot_meta = MetaFile(version=snapshot.version)
-    _write_signed(folder / "metadata/targets.json", targets, [signer])
-    _write_signed(folder / "metadata/snapshot.json", snapshot, [signer])
-    _write_signed(folder / "metadata/timestamp.json", timestamp, [signer])
+    files = {path.name: path.read_bytes() for path in (folder / "metadata").glob("*.root.json")}
+    new = {f"{one.type}.json": _signed_bytes(one, [signer]) for one in (targets, snapshot, timestamp)}
     bundle: Path = options.out / f"{kind}-{options.version}.renewal"
-    _write_bundle(bundle, folder / "metadata", kind, data)
+    unnamed = bundle.with_name(f"{bundle.name}.part")
+    replace_file(LinuxFiles(), unnamed, _bundle({**files, **new}, kind, data))
+    for name, content in new.items():
+        replace_file(LinuxFiles(), folder / "metadata" / name, content)
+    unnamed.replace(bundle)
+    make_lasting(options.out)
     return bundle
 
 
@@ -326,14 +347,14 @@ def _packed(source: Path) -> bytes:
     return data.getvalue()
 
 
-def _write_bundle(path: Path, metadata: Path, kind: str, data: bytes) -> None:
-    """Write a compressed tar archive of all root metadata, newest metadata of other roles, and artefact."""
+def _bundle(metadata: Mapping[str, bytes], kind: str, data: bytes) -> bytes:
+    """Return a compressed tar archive of the files of the metadata and of the artefact."""
     content = io.BytesIO()
     with tarfile.open(fileobj=content, mode="w:xz") as archive:
-        for file in sorted(metadata.glob("*.json")):
-            _add(archive, f"metadata/{file.name}", file.read_bytes())
+        for name, file in sorted(metadata.items()):
+            _add(archive, f"metadata/{name}", file)
         _add(archive, f"targets/{kind}", data)
-    path.write_bytes(content.getvalue())
+    return content.getvalue()
 
 
 def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
@@ -395,11 +416,16 @@ def _signed(path: Path, kind: type[T]) -> T:
 
 def _write_signed(path: Path, signed: T, signers: Iterable[CryptoSigner]) -> Path:
     """Sign metadata, and write the file atomically."""
+    replace_file(LinuxFiles(), path, _signed_bytes(signed, signers))
+    return path
+
+
+def _signed_bytes(signed: T, signers: Iterable[CryptoSigner]) -> bytes:
+    """Return the content of a file of metadata with their signatures."""
     metadata = Metadata(signed)
     for signer in signers:
         metadata.sign(signer, append=True)
-    replace_file(LinuxFiles(), path, metadata.to_bytes())
-    return path
+    return metadata.to_bytes()
 
 
 def _date(text: str) -> datetime:

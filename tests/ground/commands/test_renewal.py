@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import resource
 import tarfile
 from collections import Counter
 from pathlib import Path
+from random import Random
 from unittest.mock import Mock
 
 import pytest
+from tuf.api.metadata import Metadata, Timestamp
 
+from flight.link.files.store import locked
 from flight.link.process.commanding import Report, Stage
 from flight.schema.document import merged_text
 from tests.deploy.scripts import changed_testbed, script
@@ -258,3 +262,42 @@ def test_only_a_bundle_of_the_stated_kind_is_activated(
 def test_the_program_of_the_board_states_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
     assert script("open_bundle").main(["trusted", "root", "bundle"]) == 2
     assert "TRUSTED ROOT BUNDLE KIND FOLDER" in capsys.readouterr().err
+
+
+def test_a_bundle_that_cannot_be_written_does_not_use_up_a_version(signing: Path, tmp_path: Path) -> None:
+    source = _sources(tmp_path / "source", "0.2.0")
+    (source / "README.md").write_bytes(Random(1).randbytes(300_000))
+    words = ["renewal", "sign", signing, "release", source, "--out", tmp_path]
+    before = {path: path.read_bytes() for path in (signing / "metadata").glob("*.json")}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        done = command(*words)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert done.returncode != 0
+    assert {path: path.read_bytes() for path in (signing / "metadata").glob("*.json")} == before
+    assert not list(tmp_path.glob("*.renewal"))
+    assert command(*words).returncode == 0
+    assert (tmp_path / "release-200.renewal").exists()
+
+
+def test_metadata_are_signed_before_their_bundle_has_its_name(signing: Path, tmp_path: Path) -> None:
+    """If the end of the command is lost, the next bundle does not repeat the versions of the metadata."""
+    (tmp_path / "elements").write_text(LINES)
+    (tmp_path / "elements-1.renewal").mkdir()
+    words = ["renewal", "sign", signing, "elements", tmp_path / "elements", "--out", tmp_path, "--version"]
+    assert command(*words, "1").returncode != 0
+    assert command(*words, "2").returncode == 0
+    assert Metadata[Timestamp].from_file(str(signing / "metadata/timestamp.json")).signed.version == 3
+
+
+@pytest.mark.parametrize("words", [["sign", "elements", "--version", "1"], ["new-key"]])
+def test_two_commands_never_sign_at_the_same_time(signing: Path, tmp_path: Path, words: list[str]) -> None:
+    (tmp_path / "elements").write_text(LINES)
+    what, *rest = words
+    given = [*rest[:1], tmp_path / "elements", *rest[1:], "--out", tmp_path] if rest else []
+    with locked(signing / "metadata/.lock", ""):
+        done = command("renewal", what, signing, *given)
+    assert (done.returncode, "another command signs with these keys" in done.stderr) == (2, True)
+    assert command("renewal", what, signing, *given).returncode == 0
