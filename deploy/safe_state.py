@@ -18,6 +18,7 @@ import binascii
 import contextlib
 import os
 import select
+import signal
 import socket
 import stat
 import struct
@@ -30,7 +31,10 @@ FLEW_S = 600.0
 """Flight duration (s) after which the next restart has the shortest waiting time (`FIRST_S`) again."""
 
 COILS_S, RETRY_S = 30.0, 1.0
-"""Intervals (s) of setting the coils to zero: after an acknowledgement by the PWM chip, and without one."""
+"""Intervals (s) of setting the coils to zero: after an acknowledgement by the PWM chip, and without one.
+
+The script `coils-off` is killed after `COILS_S` as well, so that a hanging bus delays no answer for longer.
+"""
 
 # Tests compare these packet layouts with those of flight/link, which this program does not import.
 COMMANDS = {
@@ -63,7 +67,12 @@ class Tries:
         return min(FIRST_S * 2.0 ** (min(number, 20) - 1), LONGEST_S)
 
     def keep(self, now: float) -> None:
-        """Store the number and the time `now` (s) of this attempt to start the flight."""
+        """Store the number and the time `now` (s) of this attempt to start the flight.
+
+        Without a folder, and after a write error, nothing is stored.
+        """
+        if not self._path:
+            return
         with contextlib.suppress(OSError):
             with open(self._path + ".part", "w", encoding="ascii") as file:
                 file.write(f"{self.number} {now}\n")
@@ -149,7 +158,13 @@ def coils_off() -> bool:
     """Set the coils to zero by the script `coils-off`, and return whether the PWM chip acknowledged."""
     beside = os.path.join(os.path.dirname(os.path.abspath(__file__)), "coils-off")
     with contextlib.suppress(OSError):
-        return subprocess.run([beside], check=False).returncode == 0
+        script = subprocess.Popen([beside], start_new_session=True)
+        try:
+            return script.wait(COILS_S) == 0
+        except subprocess.TimeoutExpired:
+            say(f"coils-off is killed because it did not end in {COILS_S:.0f} s")
+            os.killpg(script.pid, signal.SIGKILL)  # the script and the programs that it waits for
+            script.wait()
     return False
 
 

@@ -111,3 +111,31 @@ def test_the_process_zeroes_the_coils_answers_and_ends_when_the_flight_is_to_be_
     assert "coils at zero" in said
     assert "the flight software is started again, start 1" in said
     assert (tmp_path / "tries").read_text(encoding="ascii").startswith("1 ")
+
+
+def test_a_hanging_script_is_killed_with_its_children(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    off, child = tmp_path / "coils-off", tmp_path / "child"
+    off.write_text(f'#!/bin/sh\nsleep 1000 &\necho $! >"{child}.part"\nmv "{child}.part" "{child}"\nwait\n')
+    off.chmod(0o755)
+    monkeypatch.setattr(safe_state, "__file__", str(tmp_path / "safe_state.py"))
+    wait = subprocess.Popen.wait
+
+    def wait_for_child(process: subprocess.Popen[bytes], timeout: float | None = None) -> int:
+        while not child.exists():
+            time.sleep(0.01)
+        return wait(process, None if timeout is None else 0.0)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", wait_for_child)
+    assert not safe_state.coils_off()
+    assert "did not end in 30 s" in capsys.readouterr().err
+    number = int(child.read_text(encoding="ascii"))
+    while (place := Path(f"/proc/{number}/stat")).exists() and place.read_text().split()[2] != "Z":
+        time.sleep(0.01)
+
+
+def test_without_a_folder_no_try_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    safe_state.Tries("", 0.0).keep(1.0)
+    assert list(tmp_path.iterdir()) == []
