@@ -215,7 +215,11 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
     snapshot.meta["targets.json"] = MetaFile(version=targets.version)
     timestamp.snapshot_meta = MetaFile(version=snapshot.version)
     files = {path.name: path.read_bytes() for path in (folder / "metadata").glob("*.root.json")}
-    new = {f"{one.type}.json": _signed_bytes(one, [signer]) for one in (targets, snapshot, timestamp)}
+    new = {
+        "targets.json": _signed_bytes(targets, [signer]),
+        "snapshot.json": _signed_bytes(snapshot, [signer]),
+        "timestamp.json": _signed_bytes(timestamp, [signer]),
+    }
     bundle: Path = options.out / f"{kind}-{options.version}.renewal"
     unnamed = bundle.with_name(f"{bundle.name}.part")
     replace_file(LinuxFiles(), unnamed, _bundle({**files, **new}, kind, data))

@@ -17,6 +17,7 @@ from flight.app import service
 from flight.app.service import Collector, EndingSignals, FlownRelease, Supervision
 from flight.link import events
 from flight.link.files.store import line_of, to_record
+from flight.loop.state import LinuxFiles
 from hal.interfaces.guardian import GuardianNews
 
 MS = 1_000_000
@@ -220,7 +221,7 @@ def test_a_record_that_cannot_be_read_once_keeps_its_proven_releases(
         raise OSError(5, "Input/output error")
 
     with monkeypatch.context() as patch:
-        patch.setattr(service.LinuxFiles, "read", fail)
+        patch.setattr(LinuxFiles, "read", fail)
         release.prove()
         release.end()
     assert kept(folder) == record

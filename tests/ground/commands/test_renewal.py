@@ -267,7 +267,7 @@ def test_the_program_of_the_board_states_its_arguments(capsys: pytest.CaptureFix
 def test_a_bundle_that_cannot_be_written_does_not_use_up_a_version(signing: Path, tmp_path: Path) -> None:
     source = _sources(tmp_path / "source", "0.2.0")
     (source / "README.md").write_bytes(Random(1).randbytes(300_000))
-    words = ["renewal", "sign", signing, "release", source, "--out", tmp_path]
+    words: list[str | Path] = ["renewal", "sign", signing, "release", source, "--out", tmp_path]
     before = {path: path.read_bytes() for path in (signing / "metadata").glob("*.json")}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
@@ -286,7 +286,8 @@ def test_metadata_are_signed_before_their_bundle_has_its_name(signing: Path, tmp
     """If the end of the command is lost, the next bundle does not repeat the versions of the metadata."""
     (tmp_path / "elements").write_text(LINES)
     (tmp_path / "elements-1.renewal").mkdir()
-    words = ["renewal", "sign", signing, "elements", tmp_path / "elements", "--out", tmp_path, "--version"]
+    words: list[str | Path] = ["renewal", "sign", signing, "elements", tmp_path / "elements"]
+    words += ["--out", tmp_path, "--version"]
     assert command(*words, "1").returncode != 0
     assert command(*words, "2").returncode == 0
     assert Metadata[Timestamp].from_file(str(signing / "metadata/timestamp.json")).signed.version == 3
@@ -296,7 +297,7 @@ def test_metadata_are_signed_before_their_bundle_has_its_name(signing: Path, tmp
 def test_two_commands_never_sign_at_the_same_time(signing: Path, tmp_path: Path, words: list[str]) -> None:
     (tmp_path / "elements").write_text(LINES)
     what, *rest = words
-    given = [*rest[:1], tmp_path / "elements", *rest[1:], "--out", tmp_path] if rest else []
+    given: list[str | Path] = [*rest[:1], tmp_path / "elements", *rest[1:], "--out", tmp_path] if rest else []
     with locked(signing / "metadata/.lock", ""):
         done = command("renewal", what, signing, *given)
     assert (done.returncode, "another command signs with these keys" in done.stderr) == (2, True)
