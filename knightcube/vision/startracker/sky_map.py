@@ -193,7 +193,8 @@ class Pointing:
         north, east = _north_and_east(float(right_ascension), float(declination))
         roll = np.arctan2(-y @ east, -y @ north)
         full = 2.0 * np.pi
-        return cls(float(right_ascension % full), float(declination), float(roll % full))
+        # The remainder of a tiny negative angle is rounded to 2 pi, whose remainder is 0.
+        return cls(float(right_ascension % full % full), float(declination), float(roll % full % full))
 
     def quaternion(self) -> FloatArray:
         """Return the attitude quaternion (4,) from ICRS to camera axes."""

@@ -55,6 +55,12 @@ def test_angles_to_attitude_and_back_is_the_identity(ra: float, dec: float, roll
 _ARCSECOND = np.radians(1.0 / 3600.0)
 
 
+def test_a_pointing_is_below_a_full_turn_for_a_tiny_negative_angle() -> None:
+    found = Pointing.of(Pointing(-1e-16, 0.0, -1e-16).quaternion())
+    assert 0.0 <= found.right_ascension < 2.0 * np.pi
+    assert 0.0 <= found.roll < 2.0 * np.pi
+
+
 def test_a_star_across_the_motion_is_displaced_by_the_constant_of_aberration() -> None:
     """A star normal to the motion is displaced by the constant of aberration.
 
