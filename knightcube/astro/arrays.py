@@ -48,7 +48,7 @@ def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> F
 
 def checked_number(name: str, value: float, unit: str) -> float:
     """Return the argument `name` in `unit`. Raises ArgumentError unless it is a positive, finite number."""
-    number = _real(value)
+    number = real_number(value)
     if not 0.0 < number < math.inf:
         raise ArgumentError(name, f"{value!r}: give a positive, finite number of {unit}")
     return number
@@ -59,13 +59,13 @@ def checked_deviation(name: str, value: float, unit: str) -> float:
 
     Raises ArgumentError unless the standard deviation is a number that is not negative.
     """
-    number = _real(value)
+    number = real_number(value)
     if not number >= 0.0:
         raise ArgumentError(name, f"{value!r}: give a standard deviation of 0 {unit} or more")
     return number
 
 
-def _real(value: npt.ArrayLike) -> float:
+def real_number(value: npt.ArrayLike) -> float:
     """Return an integer or a floating-point number as a float, and NaN for any other value."""
     return (
         float(np.asarray(value))

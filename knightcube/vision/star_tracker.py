@@ -24,6 +24,7 @@ from knightcube.astro.arrays import (
     checked_deviation,
     checked_number,
     finite_array,
+    real_number,
 )
 from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
@@ -147,10 +148,10 @@ class StarSolution:
         """Return one line of text: status, pointing, uncertainty and number of stars, or the reason."""
         if not self:
             return f"<StarSolution {self.status}: {self.reason}>"
-        roll = round(self.roll_deg, 3) % 360.0
+        right_ascension, roll = round(self.right_ascension_deg, 4) % 360.0, round(self.roll_deg, 3) % 360.0
         across = 3_600.0 * math.degrees(math.sqrt(max(self.covariance[0, 0], self.covariance[1, 1])))
         return (
-            f"<StarSolution {self.status}: right ascension {self.right_ascension_deg:.4f}, declination "
+            f"<StarSolution {self.status}: right ascension {right_ascension:.4f}, declination "
             f"{self.declination_deg:.4f}, roll {roll:.3f} deg, 1 sigma {across:.2g} arcsec, "
             f"{len(self.stars)} stars{', mirrored' if self.mirrored else ''}>"
         )
@@ -218,7 +219,7 @@ class StarTracker:
             check_camera(camera)
         _check_field_of_view(fov_deg, fov_error_deg)
         if fov_error_deg is not None and fov_deg is None and camera is None:
-            raise ArgumentError("fov_error_deg", f"{fov_error_deg:g}: give `fov_deg` or `camera` too")
+            raise ArgumentError("fov_error_deg", f"{fov_error_deg!r}: give `fov_deg` or `camera` too")
         self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
         self._settings = SolveSettings() if settings is None else settings
         check_type("settings", self._settings, SolveSettings)
@@ -235,6 +236,13 @@ class StarTracker:
             self._index = default_index()
         else:
             self._index = index if isinstance(index, SkyIndex) else load_once(Path(index))
+
+    def __repr__(self) -> str:
+        """Return the field of view or the camera, and whether the lens parameters are estimated."""
+        fov = f"{self._fov_deg:g} deg" if self._fov_deg is not None else "unknown"
+        lens = f"field of view {fov}" if self._camera is None else repr(self._camera)
+        error = "" if self._fov_error_deg is None else f" +- {self._fov_error_deg:g} deg"
+        return f"<StarTracker: {lens}{error}{', learns the lens' if self._learn else ''}>"
 
     def solve(
         self,
@@ -275,6 +283,8 @@ class StarTracker:
         if rates is not None and exposure is None:
             raise ArgumentError("exposure", "None: a predicted rate needs the exposure time in seconds")
         camera, scale = self._camera_for(image.shape)
+        if self.lens is not None:
+            _check_size(image.shape, self.lens.configured, "the earlier images have")
         sky, settings = self._index, self._settings
         if utc is not None:
             if not isinstance(utc, datetime):
@@ -331,17 +341,22 @@ class StarTracker:
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
-        if shape != (camera.rows, camera.columns):
-            raise ArgumentError(
-                "image",
-                f"{shape[1]} x {shape[0]} pixels, but the camera has {camera.columns} x {camera.rows}: give "
-                "images of this camera, or the camera of these images",
-            )
+        _check_size(shape, camera, "the camera has")
         if not self._fov_error_deg:
             return camera, (1.0, 1.0)
         middle, scale = camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)
         ratio = camera.focal_length / middle.focal_length
         return camera, (scale[0] * ratio, scale[1] * ratio)
+
+
+def _check_size(shape: tuple[int, ...], camera: CameraModel, owner: str) -> None:
+    """Raise ArgumentError unless an image of `shape` has the size of `camera`; `owner` begins its size."""
+    if shape != (camera.rows, camera.columns):
+        raise ArgumentError(
+            "image",
+            f"{shape[1]} x {shape[0]} pixels, but {owner} {camera.columns} x {camera.rows}: give images of "
+            "one camera, or make a StarTracker for the camera of these images",
+        )
 
 
 def field_of_view(camera: CameraModel) -> float:
@@ -389,11 +404,11 @@ def _priors(
 
 
 def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None:
-    """Raise InputError if the field of view is not from 1 to 120 deg or its error is negative."""
-    if fov_deg is not None and not 1.0 <= fov_deg <= 120.0:
-        raise InputError("field of view", f"{fov_deg:g}: give 1 to 120 degrees across the columns")
-    if error_deg is not None and not 0.0 <= error_deg < 120.0:
-        raise InputError("error of the field of view", f"{error_deg:g}: give 0 or more degrees")
+    """Raise InputError unless the field of view is 1 to 120 deg and its error is from 0 to below 120 deg."""
+    if fov_deg is not None and not 1.0 <= real_number(fov_deg) <= 120.0:
+        raise InputError("field of view", f"{fov_deg!r}: give 1 to 120 degrees across the columns")
+    if error_deg is not None and not 0.0 <= real_number(error_deg) < 120.0:
+        raise InputError("error of the field of view", f"{error_deg!r}: give 0 or more degrees, below 120")
 
 
 def _turned(solution: StarSolution, back: FloatArray) -> StarSolution:

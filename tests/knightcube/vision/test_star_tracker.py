@@ -78,6 +78,22 @@ def test_a_tracker_that_learns_its_lens_has_the_same_axes_in_all_images() -> Non
             assert solution.right_ascension == pytest.approx(pointing.right_ascension, abs=1e-12)
 
 
+def test_images_of_another_size_are_refused_while_the_lens_is_estimated() -> None:
+    tracker = StarTracker(fov_deg=12.0, learn=True, index=sky())
+    tracker.solve(np.zeros((48, 64)))
+    with pytest.raises(ArgumentError, match="64 x 32 pixels, but the earlier images have 64 x 48"):
+        tracker.solve(np.zeros((32, 64)))
+    tracker.solve(np.zeros((48, 64)))
+
+
+def test_a_star_tracker_shows_its_field_of_view_or_its_camera() -> None:
+    assert repr(StarTracker(index=sky())) == "<StarTracker: field of view unknown>"
+    known = StarTracker(fov_deg=11.4, fov_error_deg=0.5, learn=True, index=sky())
+    assert repr(known) == "<StarTracker: field of view 11.4 deg +- 0.5 deg, learns the lens>"
+    camera = Pinhole(64, 48, 300.0)
+    assert repr(StarTracker(camera=camera, index=sky())) == f"<StarTracker: {camera!r}>"
+
+
 _COMPILED = """
 import gc, sys
 import numpy as np
@@ -353,15 +369,20 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
     lens = Pinhole.from_field_of_view(64, 48, 0.2)
     with pytest.raises(InputError, match=r"field of view: 0\.5: give 1 to 120 degrees"):
         StarTracker(fov_deg=0.5)
-    with pytest.raises(InputError, match="-1: give 0 or more degrees"):
+    with pytest.raises(InputError, match=r"-1\.0: give 0 or more degrees"):
         StarTracker(fov_deg=10.0, fov_error_deg=-1.0)
+    for value in (True, "11", math.nan, [11.0]):
+        with pytest.raises(InputError, match=re.escape(f"field of view: {value!r}: give 1 to 120 degrees")):
+            StarTracker(fov_deg=value)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=re.escape(f"error of the field of view: {value!r}: give 0")):
+            StarTracker(camera=lens, fov_error_deg=value)  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match="not both"):
         StarTracker(fov_deg=10.0, camera=lens)
     with pytest.raises(ArgumentError, match="camera: 'lens': give a Pinhole or a Lens"):
         StarTracker(camera="lens")  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match=r"settings\.lens: .* as CameraKnowledge\(\*\*accuracy\)"):
         StarTracker(camera=lens, settings=SolveSettings(lens={"centre": 0.1}))  # type: ignore[arg-type]
-    with pytest.raises(ArgumentError, match="fov_error_deg: 2: give `fov_deg` or `camera` too"):
+    with pytest.raises(ArgumentError, match=r"fov_error_deg: 2\.0: give `fov_deg` or `camera` too"):
         StarTracker(fov_error_deg=2.0)
     with pytest.raises(InputError, match=r"none\.index"):
         StarTracker(index=tmp_path / "none.index")
