@@ -6,7 +6,9 @@ that is not part of this package.
 CircuitPython drivers of motion sensors have the properties `gyro` (rad/s), `magnetic` (microtesla) and
 `acceleration` (m/s^2), take an I2C bus with the methods of `busio.I2C`, and sleep while they start. All
 sensors are started before the control loop, and are read by a separate periodic job, never by the control
-loop. After a failure the job starts all sensors again, because a brown-out clears their settings.
+loop. After a failure the job starts all sensors again, because a brown-out clears their settings. A gyro or
+magnetometer that repeats the same value for three seconds counts as a failure, because after a brown-out many
+sensors sleep and answer with their last value or zero.
 
 `Adis16470` is the driver of an inertial sensor of Analog Devices on an SPI bus (data sheet, revision C). An
 SPI frame has 16 bits, and the answer to a read request comes in the next frame. The value of each axis has 32
@@ -18,6 +20,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,10 +36,13 @@ _FAILURES = 3
 """Number of consecutive failures after which the sensors are started again."""
 _ALIKE = 10
 """Largest accepted number of consecutive equal samples; a working sensor has noise."""
+_STUCK_S, _AGAIN_S = 3, 60
+"""Time (s) of equal values after which the sensors are started again, and time until the next start."""
 LARGEST_RATE = math.radians(2000.0)
 """Default of the largest accepted body rate per axis, rad/s: the range of common gyros."""
 _NORM_TOLERANCE = 1e-2
 """Largest accepted deviation of a quaternion's norm from 1."""
+_RANGED = "gyro", "magnetic"
 _SHAPES = {"quaternion": (4,), "rate": (3,), "field": (3,), "acceleration": (3,)}
 _NO_RATE = np.full(3, math.nan)
 _FREE_FALL = 1.0
@@ -144,7 +150,8 @@ class SensorUnit:
         self._drivers: list[Any] = []
         self._readings: list[ImuReading] = []
         self._lock = threading.Lock()
-        self._failures = self._samples = self._out_of_range = self._not_finite = self._alike = 0
+        self._failures = self._samples = self._out_of_range = self._not_finite = 0
+        self._alike = Counter[str]()  # number of equal consecutive values of each quantity
         self._error = self._rejection = ""
         self._last_ns = -1
         self._before: dict[str, FloatArray] = {}
@@ -198,6 +205,10 @@ class SensorUnit:
         self._last_ns = self._clock.now_ns()
         if self._accepts(values):
             self._readings.append(self._reading(values, (begun_ns + self._last_ns) // 2))
+        rate = self._settings.rate_hz
+        stuck = [name for name in _RANGED if self._alike[name] % (_AGAIN_S * rate) == _STUCK_S * rate]
+        if stuck:
+            self._error, self._failures = f"{stuck[0]} repeats the same value: started again", _FAILURES
 
     def _read(self) -> dict[str, FloatArray]:
         return {
@@ -207,24 +218,36 @@ class SensorUnit:
         }
 
     def _accepts(self, values: dict[str, FloatArray]) -> bool:
-        """Return whether a sample is finite, within the ranges and not stuck; count rejected samples."""
+        """Return whether a sample is finite, within the ranges and not stuck; count rejected samples.
+
+        If only the rate is stuck, the rate is removed from `values`.
+        """
         settings, before = self._settings, self._before
-        alike = bool(before) and all(np.array_equal(values[name], before[name]) for name in values)
-        self._alike, self._before = self._alike + 1 if alike else 0, values
+        for name, value in values.items():
+            alike = name in before and np.array_equal(value, before[name])
+            self._alike[name] = self._alike[name] + 1 if alike else 0
+        self._before = dict(values)
         for name, value in values.items():
             if not np.isfinite(value).all():
                 self._not_finite += 1
                 self._rejection = f"{name} = {value.tolist()}"
                 return False
-        largest = {"gyro": settings.rate_range, "magnetic": settings.field_range / TESLA_PER_UNIT}
-        for name, bound in largest.items():
-            if name not in values:
-                continue
-            if np.abs(values[name]).max() > bound or self._alike >= _ALIKE:
-                self._out_of_range += 1
-                self._rejection = f"{name} = {values[name].tolist()}"
-                return False
-        return True
+        largest = dict(
+            zip(_RANGED, (settings.rate_range, settings.field_range / TESLA_PER_UNIT), strict=True)
+        )
+        beyond = [name for name in largest if name in values and np.abs(values[name]).max() > largest[name]]
+        equal, equal_rates = min(self._alike[name] for name in values), self._alike["gyro"]
+        if beyond:
+            self._rejection = f"{beyond[0]} = {values[beyond[0]].tolist()}"
+        elif equal >= _ALIKE:
+            self._rejection = f"{equal + 1} samples in a row are identical"
+        elif equal_rates >= max(_ALIKE, settings.rate_hz // 2):
+            self._rejection = f"{equal_rates + 1} rates in a row are identical"
+            del values["gyro"]
+        else:
+            return True
+        self._out_of_range += 1
+        return not (beyond or equal >= _ALIKE)
 
     def _reading(self, values: dict[str, FloatArray], time_ns: int) -> ImuReading:
         mounting = self._settings.mounting

@@ -132,6 +132,58 @@ def test_implausible_samples_are_counted_and_not_returned(
     assert "magnetic" in bench.unit.link().rejection
 
 
+class SleepyChip:
+    """A sensor that answers with zero after a brown-out, until it is started again."""
+
+    def __init__(self) -> None:
+        self.asleep, self.sleeping, self.readings = set[str](), set[str](), 0
+
+    def make(self) -> SleepyChip:
+        self.asleep = set(self.sleeping)
+        return self
+
+    def _value(self, quantity: str) -> tuple[float, float, float]:
+        self.readings += 1
+        return (0.0, 0.0, 0.0 if quantity in self.asleep else 1.0 + 1e-6 * self.readings)
+
+    gyro = property(lambda self: self._value("gyro"))
+    magnetic = property(lambda self: self._value("magnetic"))
+
+
+def sleepy_unit() -> tuple[SleepyChip, SensorUnit, SimClock]:
+    chip, clock = SleepyChip(), SimClock()
+    part = SensorPart("chip", chip.make, {"gyro": np.eye(3), "magnetic": np.eye(3)})
+    unit = SensorUnit(clock, [part], SETTINGS)
+    unit.configure()
+    clock.sleep_until_ns(1_000_000_000)
+    assert len(unit.poll()) == 50
+    return chip, unit, clock
+
+
+@pytest.mark.parametrize("asleep", [{"gyro"}, {"magnetic"}, {"gyro", "magnetic"}])
+def test_a_sensor_that_sleeps_after_a_brown_out_is_started_again(asleep: set[str]) -> None:
+    chip, unit, clock = sleepy_unit()
+    chip.asleep = asleep
+    clock.sleep_until_ns(5_000_000_000)
+    unit.poll()
+    clock.sleep_until_ns(6_000_000_000)
+    readings = unit.poll()
+    assert len(readings) == 50
+    assert all(reading.rate[2] > 0.9 and reading.field[2] > 0.9e-6 for reading in readings)
+
+
+def test_a_gyro_that_stays_stuck_gives_no_rate_and_is_seldom_started() -> None:
+    chip, unit, clock = sleepy_unit()
+    chip.asleep = chip.sleeping = {"gyro"}
+    clock.sleep_until_ns(2_000_000_000)
+    unit.poll()
+    clock.sleep_until_ns(60_000_000_000)
+    readings = unit.poll()
+    assert len(readings) == 58 * 50
+    assert not any(reading.has_rate for reading in readings)
+    assert "rates in a row are identical" in unit.link().rejection
+
+
 class ForeignUnit:
     """An inertial unit that returns given readings."""
 
