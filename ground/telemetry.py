@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.definitions import EVENT
+from flight.link.telemetry.definitions import EVENT, States
 from flight.link.telemetry.log import find_runs, find_segments
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
@@ -41,6 +41,11 @@ from knightcube.errors import UsageError, reason_of, shown
 def text_of(value: bytes) -> str:
     """Return the text of a string field. Control characters, which could affect a terminal, are replaced."""
     return shown(to_text(value))
+
+
+def named(states: States, number: Any) -> str:
+    """Return the name of an enumerated value in a packet, or the number if it has no name."""
+    return dict(states).get(int(number), str(int(number)))
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,12 @@ from flight.link.telemetry.definitions import (
     STEERING,
     TRANSFER,
     VERIFICATION,
-    States,
 )
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
-from ground.telemetry import date_of, decode, flight_segments, is_first, scan
+from ground.telemetry import date_of, decode, flight_segments, is_first, named, scan
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import KnightCubeError, UsageError, reason_of
 
@@ -336,11 +335,6 @@ def _failed_commands(rows: Iterable[np.void]) -> list[LoggedEvent]:
     ]
 
 
-def named(states: States, number: Any) -> str:
-    """Return the name of an enumerated value in a packet, or the number if it has no name."""
-    return dict(states).get(int(number), str(int(number)))
-
-
 def printable(text: str) -> str:
     """Return a text without control characters, so that a damaged log cannot control the terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
@@ -460,8 +454,8 @@ def _panel_lines(state: FlightState) -> Iterator[tuple[str, _Line]]:
     yield "attitude", [(attitude_text(state) or "no estimate", "")]
     written, limit = state.value("control", "current_written"), state.value("run", "current_limit")
     for axis, current in zip("xyz", () if written is None else written, strict=False):
-        share = abs(current) / limit if limit and math.isfinite(current) else 0.0
-        filled = min(_BAR, round(_BAR * share)) if math.isfinite(share) else 0
+        share = abs(current) / limit if limit > 0.0 and math.isfinite(current) else 0.0
+        filled = round(_BAR * min(share, 1.0))
         bar = ("█" * filled, "red" if filled == _BAR else "blue")
         yield f"coil {axis}", [(f"{1e3 * current:+8.1f} mA ", ""), bar, ("░" * (_BAR - filled), "")]
     if (steering := state.value("control", "state")) is not None:

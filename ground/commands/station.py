@@ -25,6 +25,7 @@ from ground.commands.options import positive
 from ground.link.commanding import add_link_options, flight_address, ground_files_folder, terminal_of
 from ground.link.gateway import ADDRESS, Gateway, new_token, token_file, token_path
 from ground.link.terminal import make_keys
+from ground.telemetry import named
 from ground.watch import (
     SILENT_S,
     STREAMS,
@@ -35,7 +36,6 @@ from ground.watch import (
     answers,
     attitude_text,
     event_line,
-    named,
     panel,
     state_line,
 )

@@ -99,7 +99,8 @@ def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
         yield f"{kind}: frames", (part["frames"], "")
         yield f"{kind}: {found}", (part[found], "")
         yield f"{kind}: used by the estimator", (part["accepted"], "")
-        worst = max(part["rms_error"] or [], default=None)
+        errors = part["rms_error"] or []
+        worst = None if None in errors else max(errors, default=None)
         yield f"{kind}: worst axis, rms error", (_scaled(worst, scale), unit)
         yield f"{kind}: mean e' P^-1 e / 3", (part["normalised"], "")
     yield "frames without rate or attitude", (len(summary["failed_frames"]), "")

@@ -20,13 +20,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from flight.link import events
-from flight.link.events import Mode
-from flight.link.telemetry.definitions import SHED
+from flight.link.telemetry.definitions import MODES, SHED
 from flight.link.telemetry.packets import PacketArray
 from ground.report import orbit, panels
 from ground.report.panels import RunSignals
 from ground.report.signals import PowerHistory, seconds, true_quaternions
-from ground.telemetry import Run, text_of
+from ground.telemetry import Run, named, text_of
 from hal.interfaces.devices import COIL_NAMES
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
@@ -439,7 +438,7 @@ def _modes(ax: Axes, run: Run, end: float) -> None:
         used = sorted({int(mode) for mode in modes})
         levels = [used.index(int(mode)) for mode in modes]
         ax.step(np.append(times, end), [*levels, levels[-1]], where="post", color=panels.BLUE, linewidth=1.4)
-        ax.set_yticks(range(len(used)), [Mode(mode).label for mode in used])
+        ax.set_yticks(range(len(used)), [named(MODES, mode) for mode in used])
         ax.set_ylim(-0.5, len(used) - 0.2)
     happened = run["event"]
     for row in happened[happened["code"] == events.TARGET.code]:

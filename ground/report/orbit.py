@@ -40,11 +40,11 @@ SETTLED_AFTER_S = 600.0
 def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
     """Return start and end, s, of each period in mode detumble, and whether mode acquire or hold followed."""
     times = np.append(seconds(run["mode"]), end)
-    modes = [Mode(int(mode)) for mode in run["mode"]["mode"]]
+    modes = run["mode"]["mode"].tolist()
     return [
         (float(times[k]), float(times[k + 1]), modes[k + 1 : k + 2] in ([Mode.ACQUIRE], [Mode.HOLD]))
         for k, mode in enumerate(modes)
-        if mode is Mode.DETUMBLE
+        if mode == Mode.DETUMBLE
     ]
 
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
-from flight.link.events import Mode
-from flight.link.telemetry.definitions import SHED
+from flight.link.telemetry.definitions import MODES, SHED
 from flight.link.telemetry.packets import PacketArray
 from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
@@ -24,7 +23,7 @@ from ground.identification.orbit import learned_lens
 from ground.report import signals
 from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements, star_camera
 from ground.report.steps import against_thesis, judged_steps, step_row
-from ground.telemetry import Run, text_of
+from ground.telemetry import Run, named, text_of
 from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
@@ -227,7 +226,7 @@ def _planner(packets: PacketArray) -> Object:
 def _modes(packets: PacketArray) -> list[Object]:
     return [
         {
-            "mode": Mode(int(row["mode"])).label,
+            "mode": named(MODES, row["mode"]),
             "at_s": float(time),
             "trigger": text_of(row["trigger"]),
             "reason": text_of(row["reason"]),

@@ -149,8 +149,10 @@ def _knowledge(found: Object | None) -> list[str]:
         error, nees = number(camera["with_stars_error_rms_rad"], 4, DEGREES), number(camera["nees_per_axis"])
         own = [f"  error of the star camera's attitude {error} deg rms with stars, NEES per axis {nees}"]
     learned = [
-        f"  {one['name']}: error {one['first_error']:.2g} at the start, {one['error']:.2g} at the end, "
-        f"one sigma {one['sigma']:.2g}"
+        "  {}: error {} at the start, {} at the end, one sigma {}".format(
+            one["name"],
+            *("-" if one[key] is None else f"{one[key]:.2g}" for key in ("first_error", "error", "sigma")),
+        )
         for one in found["description"]
     ]
     if learned:
@@ -377,16 +379,16 @@ def _star_camera(found: Object | None) -> list[str]:
 def _lens(found: Object | None) -> list[str]:
     if found is None:
         return []
-    (focal, focal_sigma), (x, y), (x_sigma, y_sigma) = (
-        found[key] for key in ("focal_length_px", "centre_px", "centre_sigma_px")
+    axes = zip(found["centre_px"], found["centre_sigma_px"], strict=True)
+    focal, x, y, psf = (
+        " +- ".join(map(number, pair)) for pair in (found["focal_length_px"], *axes, found["psf_sigma_px"])
     )
-    (delay, delay_sigma), (psf, psf_sigma) = found["line_time_s"], found["psf_sigma_px"]
+    delay = " +- ".join(number(time, 2, 1e6) for time in found["line_time_s"])
     return [
-        f"Learned lens: focal length {focal:.2f} +- {focal_sigma:.2f} px, optical axis "
-        f"{x:.2f} +- {x_sigma:.2f}, {y:.2f} +- {y_sigma:.2f} px, distance of a corner from the centre "
-        f"+- {100.0 * found['corner_sigma']:.4f} %",
-        f"  line time {1e6 * delay:.2f} +- {1e6 * delay_sigma:.2f} us, point spread {psf:.2f} +- "
-        f"{psf_sigma:.2f} px; from {found['frames']} frames, {found['contradictions']} contradictions",
+        f"Learned lens: focal length {focal} px, optical axis {x}, {y} px, distance of a corner from the "
+        f"centre +- {number(found['corner_sigma'], 4, 100.0)} %",
+        f"  line time {delay} us, point spread {psf} px; from {found['frames']} frames, "
+        f"{found['contradictions']} contradictions",
     ]
 
 

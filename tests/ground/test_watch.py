@@ -21,12 +21,14 @@ from flight.link import events
 from flight.link.process.commanding import Stage
 from flight.link.telemetry.definitions import (
     ATTITUDE,
+    CONTROL,
     EVENT,
     FACTS,
     HEALTH,
     LINK,
     MODE,
     PACKETS,
+    RUN,
     VERIFICATION,
     Packet,
 )
@@ -236,6 +238,15 @@ def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same(
     console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
     console.print(panel(view, 0.0))
     assert "\x1b" not in console.export_text()
+
+
+def test_an_impossible_limit_of_the_current_does_not_lengthen_the_bars_of_the_panel() -> None:
+    console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
+    packer, view = Packer(), FlightState()
+    data = pack(packer, RUN, 0.0, current_limit=-1e-3) + pack(packer, CONTROL, 0.0, current_written=[1.0] * 3)
+    view.update(scan(data).packets)
+    console.print(panel(view, 0.0))
+    assert console.export_text().count("░") == 3 * 20
 
 
 def _wild(kind: str, count: int) -> object:

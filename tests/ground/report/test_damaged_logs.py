@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import binascii
 import json
+import struct
 from pathlib import Path
 from random import Random
 
 import pytest
 from hypothesis import given, settings
 
-from flight.link.telemetry.packets import LAYOUTS
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, UNSEGMENTED, crc16
 from ground import report
+from ground.report.comparison import compare, format_comparison
 from ground.telemetry import Run, scan
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.support.damaged import chances, damage
@@ -70,3 +72,21 @@ def test_a_damaged_log_invents_no_packet_and_is_reported(
     text = report.format_report(summary)
     assert text.endswith("\n")
     assert "Log integrity" in text
+
+
+@pytest.mark.parametrize("byte", [b"\0", b"\x7f", b"\xff"])
+def test_packets_in_which_each_byte_has_the_same_value_are_reported_and_compared(byte: bytes) -> None:
+    """The byte 0xff is NaN in every real number, and no known state in every integer."""
+    packets = []
+    for layout in LAYOUTS.values():
+        length = layout.length - HEADER_BYTES - 1
+        head = struct.pack(">HHH", layout.identifier, UNSEGMENTED, length) + bytes([layout.packet.version])
+        for second in range(3):
+            packet = (head + struct.pack(">q", second * 10**9)).ljust(layout.length - CRC_BYTES, byte)
+            packets.append(packet + crc16(packet).to_bytes(CRC_BYTES, "big"))
+    result = scan(b"".join(packets))
+    assert result.skipped_bytes == 0
+    summary = report.summarise(Run(Path("damaged"), result, scan(b""), scan(b"")))
+    json.dumps(summary, allow_nan=False)
+    assert "Log integrity" in report.format_report(summary)
+    assert "Figures" in format_comparison(compare(summary, summary))
