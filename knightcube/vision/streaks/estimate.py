@@ -223,6 +223,8 @@ def _rescanned(
         motion = CameraMotion.steady(frame[2] * angle)
         found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
         bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
+        if len(bright) < settings.least_stars:
+            continue
         x, y, z = frame @ pinhole.ideal.unit_vectors(found.stars[bright]).T
         circles = Circles(frame, z, np.arctan2(y, x))
         for best, stars, light in scan_angles(camera.frame, pinhole, circles, 1, angle):

@@ -262,7 +262,7 @@ def _refined_numpy(values: Float32Array, row: IntArray, column: IntArray) -> tup
         bend = left + right - 2.0 * values[row, column]
         offset = np.where(bend < 0.0, 0.5 * (left - right) / np.where(bend < 0.0, bend, -1.0), 0.0)
         found.append(place.astype(np.float64) + np.clip(offset, -0.5, 0.5))
-    return found[0], found[1]
+    return np.minimum(found[0], values.shape[0] - 1.0), found[1]
 
 
 @compiled_form_of(_refined_numpy)
@@ -272,7 +272,9 @@ def _refined(values: Float32Array, row: IntArray, column: IntArray) -> tuple[Flo
     for k in range(len(row)):
         r, c = row[k], column[k]
         own = values[r, c]
-        fine[0, k] = r + _vertex(values[max(r - 1, 0), c], own, values[min(r + 1, rows - 1), c])
+        below = r + _vertex(values[max(r - 1, 0), c], own, values[min(r + 1, rows - 1), c])
+        # A rounded row of a peak on the last circle would lie beyond the grid.
+        fine[0, k] = min(below, rows - 1.0)
         fine[1, k] = c + _vertex(values[r, max(c - 1, 0)], own, values[r, min(c + 1, columns - 1)])
     return fine[0], fine[1]
 

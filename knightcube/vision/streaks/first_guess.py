@@ -82,9 +82,14 @@ ScannedAngle = tuple[float, FloatArray, FloatArray]
 def scan_angles(
     frame: ReducedFrame, pinhole: Pinhole, circles: Circles, most: int, near: float | None = None
 ) -> Iterator[ScannedAngle]:
-    """Yield at most `most` likely rotation angles, sorted by distance from `near` (rad) if it is given."""
+    """Yield at most `most` likely rotation angles, sorted by distance from `near` (rad) if it is given.
+
+    Yields nothing if all circles are so close to the rotation axis that they have too few samples.
+    """
     boxes = _boxes(frame, pinhole, circles)
     longest = boxes.total.shape[1] - 2
+    if longest < _SHORTEST:
+        return
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
     gain = boxes.best(widths)[0]
@@ -174,7 +179,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
     half = pinhole.ideal.half_diagonal
     wide = np.pi if inside_field <= half else float(np.arcsin(np.sin(half) / np.sin(inside_field)))
-    count = int(2.0 * wide / step)
+    count = max(int(2.0 * wide / step), 1)
     azimuth = -wide + step * np.arange(count)
     around = circles.frame[:2].T @ np.stack([np.cos(azimuth), np.sin(azimuth)])
     x, y, z = (sine[:, None] * around[k] + circles.frame[2, k] * circles.height[:, None] for k in range(3))

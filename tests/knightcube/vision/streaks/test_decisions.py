@@ -371,6 +371,10 @@ def test_a_scan_confirms_the_angle_of_a_motion() -> None:
     assert not estimate._has_angle(rotation, [])
 
 
+def test_a_scan_of_a_frame_without_streaks_gives_no_fit() -> None:
+    assert list(estimate._rescanned(_problem(), _MOTION.rotation, [0.4, 0.2])) == []
+
+
 def _guessed(angle: float) -> Any:
     """Return a stand-in for a preliminary fit with the rotation angle `angle` about z."""
     motion = CameraMotion.steady(np.array([0.0, 0.0, angle]))

@@ -79,6 +79,10 @@ def test_peaks_are_refined_by_a_parabola() -> None:
     found = faint_stars._refined(values, *edge)
     assert found[0] == pytest.approx([0.0])
     assert found[1][0] <= 11.0
+    outside = (50.0 - 2.0 * (row - 9.3) ** 2).astype(np.float32)
+    last = np.array([8]), np.array([5])
+    assert faint_stars._refined(outside, *last)[0] == pytest.approx([8.0])
+    assert_forms_agree(faint_stars._refined, outside, *last, relative=1e-6, compiled=False)
     assert_forms_agree(faint_stars._refined, values, *at, relative=1e-6, compiled=False)
     assert_forms_agree(faint_stars._refined, values, *edge, relative=1e-6, compiled=False)
 

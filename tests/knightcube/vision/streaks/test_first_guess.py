@@ -344,3 +344,5 @@ def test_a_scan_finds_angle_position_and_flux_of_streaks() -> None:
     assert apart.min(axis=1).max() < 1.6
     assert light == pytest.approx(_FLUX[:6][apart.argmin(axis=1)], rel=0.12)
     assert len(list(scan_angles(frame, _SMALL, circles, 1))) == 1
+    at_axis = Circles(basis, np.ones(2) - 1e-7, np.zeros(2))
+    assert list(scan_angles(frame, _SMALL, at_axis, 1)) == []
