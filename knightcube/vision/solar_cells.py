@@ -31,7 +31,8 @@ from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.errors import UsageError
 
-_MOST_STEPS = 15
+_MOST_STEPS, _FULL_STEPS = 30, 8
+"""Maximum number of Gauss-Newton steps, and number of steps that may increase chi-square."""
 _SOFT = 0.05
 """Width of the range of the incidence angle's cosine in which the modelled current rises smoothly from zero.
 
@@ -122,11 +123,13 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     """Return the Sun direction in body axes from the currents (n,) of the solar strings, A.
 
     An error of ten degrees of the nadir direction (3,), body axes, has little effect. Raises ValueError if
-    the currents are not n finite numbers.
+    the currents are not n finite numbers, or if the nadir direction is not finite.
     """
     currents = np.asarray(currents, dtype=float)
     if currents.shape != strings.peaks.shape or not np.all(np.isfinite(currents)):
         raise ValueError(f"currents {currents}: give {len(strings.peaks)} finite numbers, A")
+    if nadir is not None and not np.all(np.isfinite(nadir)):
+        raise ValueError(f"nadir {nadir}: give a finite unit vector")
     shares = currents / strings.peaks
     if shares.max() < strings.dark:
         return CoarseSun(CoarseSunStatus.DARK, reason=f"no string has {strings.dark:g} of its peak current")
@@ -141,20 +144,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     length = float(np.linalg.norm(total))
     if not length > 0.5 * strings.dark:
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the currents of opposite strings cancel")
-    direction = total / length
-    for _ in range(_MOST_STEPS):
-        basis = tangent_basis(direction)
-        modelled, gradient = _sunlight(normals @ direction)
-        slopes = gradient[:, None] * (normals @ basis.T)
-        weighted = slopes.T @ information
-        inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
-        step = inverse @ (weighted @ (readings - modelled))
-        # Steps are limited to 0.5 rad, because the linearisation is inaccurate far from the solution.
-        step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
-        direction = direction + step @ basis
-        direction = direction / np.linalg.norm(direction)
-        if np.hypot(*step) < 1e-6:
-            break
+    direction, basis, inverse = _fitted_direction(total / length, readings, normals, information)
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
     # Correct currents exceed this limit of chi-square (Wilson and Hilferty 1931) with a probability of 0.001.
@@ -162,7 +152,38 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason=reason)
-    return CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.asarray(inverse))
+    return CoarseSun(CoarseSunStatus.FOUND, direction, basis, inverse)
+
+
+def _fitted_direction(
+    direction: FloatArray, readings: FloatArray, normals: FloatArray, information: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return direction (3,), tangent basis (2, 3) and covariance (2, 2) of the Sun with least chi-square.
+
+    The Gauss-Newton iteration starts from `direction` (3,). The `readings` (n,) without earthlight, fractions
+    of the peak currents, are from strings with `normals` (n, 3), and have the `information` (n, n).
+    """
+    best, share = math.inf, 1.0
+    for number in range(_MOST_STEPS):
+        modelled, gradient = _sunlight(normals @ direction)
+        left = readings - modelled
+        square = float(left @ information @ left)
+        if number < _FULL_STEPS or square <= best:
+            best, start, basis = square, direction, tangent_basis(direction)
+            slopes = gradient[:, None] * (normals @ basis.T)
+            weighted = slopes.T @ information
+            inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
+            step = inverse @ (weighted @ left)
+            # Steps are limited to 0.5 rad, because the linearisation is inaccurate far from the solution.
+            step *= min(share, 0.5 / max(float(np.hypot(*step)), 1e-12))
+        else:
+            # Without shorter steps, the search can alternate between two directions.
+            share, step = 0.5 * share, 0.5 * step
+        direction = start + step @ basis
+        direction = direction / np.linalg.norm(direction)
+        if np.hypot(*step) < 1e-6:
+            break
+    return direction, basis, np.asarray(inverse)
 
 
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:

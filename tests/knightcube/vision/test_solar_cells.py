@@ -145,11 +145,27 @@ def test_currents_that_no_sun_direction_explains_are_uncertain() -> None:
         assert coarse_sun(broken, STRINGS).status is CoarseSunStatus.UNCERTAIN
 
 
+def test_the_search_for_the_sun_never_alternates_between_two_directions() -> None:
+    """In 300 readings with light from the Earth, the basis is normal to the direction of the last step."""
+    rng, off = np.random.default_rng(2), []
+    for number in range(300):
+        towards, nadir = random_direction(rng), random_direction(rng)
+        earthlight = 0.5 * max(0.15 + 0.15 * rng.standard_normal(), 0.0) * (1.0 + STRINGS.normals @ nadir)
+        currents = np.maximum(STRINGS.normals @ towards, 0.0) + earthlight + 0.025 * rng.standard_normal(6)
+        found = coarse_sun(currents, STRINGS, nadir if number % 2 else None)
+        if found.direction is not None and found.basis is not None:
+            off.append(float(np.abs(found.basis @ found.direction).max()))
+    assert len(off) > 250
+    assert max(off) < 0.02
+
+
 def test_wrong_currents_and_strings_are_refused() -> None:
     with pytest.raises(ValueError, match="6 finite"):
         coarse_sun(np.array([1.0, 2.0]), STRINGS)
     with pytest.raises(ValueError, match="finite"):
         coarse_sun(np.full(6, np.nan), STRINGS)
+    with pytest.raises(ValueError, match="nadir"):
+        coarse_sun(np.eye(6)[0], STRINGS, np.full(3, np.nan))
     with pytest.raises(UsageError, match="normals"):
         SolarStringModel(normals=np.eye(3))
     with pytest.raises(UsageError, match="peaks"):
