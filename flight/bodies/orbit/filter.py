@@ -774,12 +774,20 @@ class OrbitFilter:
         begin_ns, end_ns = gathered.begin_ns, gathered.end_ns
         self._open = OpenStep(end_ns, self._acts())
         around = self._around((begin_ns + end_ns) // 2)
+        is_known = around is not None
         if around is None:
-            return
-        doubt = self._settings.dipole_limit if self._dipoles.unknown_ns >= begin_ns else self._shifted
+            if not self._steps:
+                return
+            # While the orbit is unknown, the gyro continues the estimate. The last field is used, and the
+            # dipole counts as unknown. A missing step would make the attitude wrong.
+            around = self._steps[-1].around
+        is_doubted = self._dipoles.unknown_ns >= begin_ns or not is_known
+        doubt = self._settings.dipole_limit if is_doubted else self._shifted
         self._shifted = 0.0
         dipole = self._dipoles.mean(begin_ns, end_ns)
         unknown = RateByField(np.zeros(3), self._unknown_rate)
         step = gathered.close(dipole, doubt, around, self.rate_by_field() or unknown)
+        if not is_known:
+            step.field = None
         self._replay.add(step)
         self._replay.follow_gyro()

@@ -400,6 +400,23 @@ def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim
     assert flown.filter.restarts == 0
 
 
+def test_the_attitude_stays_within_its_claim_while_the_orbit_is_unknown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The GPS receiver of a satellite without elements gives no fix for a minute."""
+    flown = acquired()
+    known = flown.filter._around
+    monkeypatch.setattr(flown.filter, "_around", lambda _: None)
+    for _ in range(4):
+        flown.fly(15.0)
+        claim = flown.filter.at(flown.time_ns).covariance[:3, :3]
+        assert flown.error() < 3.0 * np.sqrt(np.linalg.eigvalsh(claim)[-1]) < 0.15
+    monkeypatch.setattr(flown.filter, "_around", known)
+    flown.fly(3.0)
+    assert flown.error() < 0.01
+    assert flown.see(20 * PERIOD_NS)
+
+
 def test_commands_that_were_doubted_are_tried_again_after_a_rest() -> None:
     """After 5 to 13 s without a dipole, the filter trusts the commands again.
 
