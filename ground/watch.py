@@ -62,10 +62,6 @@ class PacketSource(Protocol):
     """A source of the packets of a flight, such as its log or its link."""
 
     @property
-    def restarts(self) -> int:
-        """Number of restarts of the flight, at each of which the mission time began again."""
-
-    @property
     def silence(self) -> float:
         """Time (s) since the last packet."""
 

@@ -22,7 +22,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
@@ -68,6 +68,14 @@ _HEADERS = {
 }
 
 
+class ConsoleFeed(PacketSource, Protocol):
+    """Source of the packets that the console shows."""
+
+    @property
+    def restarts(self) -> int:
+        """Number of restarts of the flight, at each of which the mission time began again."""
+
+
 @dataclass(slots=True)
 class Console:
     """One flight on the page.
@@ -92,7 +100,7 @@ class Console:
     """
 
     name: str
-    feed: PacketSource
+    feed: ConsoleFeed
     history: History
     surroundings: FlightSurroundings
     forms: CommandForms

@@ -85,7 +85,7 @@ def test_after_a_restart_of_the_flight_the_console_shows_the_new_flight_only(sat
         def show() -> dict[str, Any]:
             for _ in range(12):
                 console.read()
-            return page.at(history.span_ns[1], ("mode",))
+            return page.at(history.span_ns[1], LAYOUTS)
 
         ends.record(run(10**18, 0), mode(100), mode(101))
         assert show()["newest"]["mode"]["time_ns"] == 101 * SECOND_NS
