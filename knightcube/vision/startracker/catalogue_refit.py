@@ -101,7 +101,7 @@ def refit_motion(
 ) -> MotionResult | None:
     """Return `motion` fitted again with all catalogue stars, or None if the fit fails or changes the rate."""
     # With a rolling shutter, an ambiguous rate is the mean of two possible rates: not a valid initial value.
-    between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
+    between = likelihood.delay_per_row != 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = streak_camera(solution.camera), motion.exposure

@@ -680,9 +680,8 @@ def estimate_rate(
     prior = None if prior_rate is None else finite_array("prior_rate", prior_rate, (3,))
     found = estimate_motion(pixels, streak_camera(camera), exposure, settings, prior, prior_sigma)
     found = replace(found, flux=unit * found.flux, faint_flux=unit * found.faint_flux)
-    if found.rate is not None or found.reason:
-        return found
-    return replace(found, reason=REASONS[found.status])
+    explained = found.rate is not None or found.reason
+    return found if explained else replace(found, reason=REASONS[found.status])
 
 
 def estimate_motion(
@@ -773,20 +772,28 @@ def _in_direction(
             return None
 
         def fit_along(sense: FloatArray) -> _Candidate | None:
-            return _best_motion(replace(camera, sense=sense, work=WorkBudget()), seen, regions, near)
+            along = replace(camera, sense=sense, work=WorkBudget())
+            return _motion_of_course(along, seen, regions, near, course)
 
         return _rolling_result(fit_along, axis[0], prior_rate, prior_sigma, sigmas)
+    found = _motion_of_course(camera, seen, regions, near, course)
+    return None if found is None else in_time(found.result, prior_rate, prior_sigma, sigmas)
+
+
+def _motion_of_course(
+    camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None, course: Course | None
+) -> _Candidate | None:
+    """Return the best motion that follows the navigation filter's motion, unless the pixels contradict it."""
     if course is not None and camera.course is not None:
-        # The motion estimated by the navigation filter is used unless the pixels contradict it.
         found = _best_motion(camera, seen, regions, near)
         if found is not None and found.result.status is not StreakStatus.FAILED:
-            result = found.result
-            if result.covariance is not None:
-                covariance = result.covariance + course.covariance(seen.exposure)
-                result = replace(result, covariance=covariance, course=course)
-            return in_time(result, prior_rate, prior_sigma, sigmas)
-    found = _best_motion(replace(camera, course=None, work=WorkBudget()), seen, regions, near)
-    return None if found is None else in_time(found.result, prior_rate, prior_sigma, sigmas)
+            if found.result.covariance is None:
+                return found
+            covariance = found.result.covariance + course.covariance(seen.exposure)
+            ahead = camera.sense is None or float(camera.sense @ course.terms[0]) > 0.0
+            result = replace(found.result, covariance=covariance, course=course if ahead else None)
+            return replace(found, result=result)
+    return _best_motion(replace(camera, course=None, work=WorkBudget()), seen, regions, near)
 
 
 def _best_motion(

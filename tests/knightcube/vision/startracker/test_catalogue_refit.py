@@ -168,6 +168,15 @@ def test_unsolved_uncalibrated_and_unstreaked_frames_are_not_fitted_again() -> N
         assert refit_with_catalogue(frame.pixels, other, sky(), _SETTINGS, _LIKELIHOOD) is other
 
 
+@pytest.mark.parametrize("line_time", [1e-9, -1e-9])
+def test_a_rate_of_unknown_sign_under_a_rolling_shutter_is_not_fitted_again(line_time: float) -> None:
+    frame, first = _first(_SEEDS[0])
+    assert first.motion is not None
+    unclear = replace(first, motion=replace(first.motion, status=StreakStatus.AMBIGUOUS))
+    rolling = replace(_LIKELIHOOD, line_time=line_time)
+    assert refit_with_catalogue(frame.pixels, unclear, sky(), _SETTINGS, rolling) is unclear
+
+
 _PINHOLE = Pinhole(200, 160, 900.0)
 _COURSE = CameraMotion.steady(np.array([0.0, 0.04, 0.0]))
 """A rotation that moves stars by 36 px to the left."""

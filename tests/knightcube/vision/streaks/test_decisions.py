@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from knightcube.vision.streaks.estimate import StreakVerdict, alike, check_strea
 from knightcube.vision.streaks.faint_stars import FaintStars
 from knightcube.vision.streaks.first_guess import MotionGuess
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import Shutter, StreakScene, path_lengths, positions
+from knightcube.vision.streaks.geometry import Course, Shutter, StreakScene, path_lengths, positions
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
@@ -186,6 +186,35 @@ def test_a_prior_rate_decides_on_the_sign_of_the_rotation() -> None:
     assert found is not None
     assert (found.status, found.rate, found.covariance) == (StreakStatus.FAILED, None, None)
     assert _rolling(None, None)[0] is None
+
+
+@pytest.mark.parametrize("delay", [1e-3, -1e-3, 0.0])
+def test_the_error_of_the_motion_from_navigation_is_in_the_covariance(
+    monkeypatch: pytest.MonkeyPatch, delay: float
+) -> None:
+    """A motion that follows the navigation filter states its course, unless the pixels contradict it."""
+    turn = np.array([0.1, 0.0, 0.0])
+    course = Course(np.stack([turn, 0.0 * turn, turn]), 1e-4)
+    camera = replace(_problem(), shutter=Shutter(delay, 70.0), course=_MOTION)
+    monkeypatch.setattr(estimate, "guess_axis", lambda *_: (turn / 0.1, None))
+    follows = [True]
+
+    def best(problem: FitProblem, *_: object) -> estimate._Candidate:
+        lost = problem.course is not None and not follows[0]
+        return _candidate(None if lost else [0.5, 0.0, 0.0], [0.0])
+
+    monkeypatch.setattr(estimate, "_best_motion", best)
+    seen: Any = MotionResult(StreakStatus.FAILED, 1, 0.2)
+    found = estimate._in_direction(camera, seen, cast(Any, None), turn / 0.2, 1e-3, course)
+    assert found is not None
+    assert found.status is StreakStatus.RATE
+    assert found.course is course
+    assert found.covariance == pytest.approx(1e-8 * np.eye(3) + course.covariance(0.2))
+    follows[0] = False
+    found = estimate._in_direction(camera, seen, cast(Any, None), turn / 0.2, 1e-3, course)
+    assert found is not None
+    assert found.course is None
+    assert found.covariance == pytest.approx(1e-8 * np.eye(3))
 
 
 _STARS = np.array([[60.0, 60.0], [80.0, 75.0], [95.0, 50.0], [95.9, 50.3], [40.0, 100.0]])
