@@ -90,13 +90,12 @@ _MODULE_OF = {
     "sun_direction": "knightcube.astro.almanac",
     "sunlit_fraction": "knightcube.astro.almanac",
 }
-__all__ = list(_MODULE_OF)
 
 _EXTRA_OF = {"erfa": "orbit", "nlopt": "vmc", "pygeomag": "orbit", "sgp4": "orbit"}
 """Names of optional packages, and for each the optional dependency group of KnightCube that installs it."""
 
 
-def __getattr__(name: str) -> Any:
+def _public(name: str) -> Any:
     """Import and return the public object called `name`.
 
     Raises AttributeError for an unknown name. Raises ImportError, with the command that installs the package,
@@ -115,6 +114,12 @@ def __getattr__(name: str) -> Any:
         ) from None
     value = globals()[name] = getattr(module, name)
     return value
+
+
+if not TYPE_CHECKING:
+    # A type checker would accept every name, and export none by `import *`: it cannot evaluate `__all__`.
+    __all__ = list(_MODULE_OF)
+    __getattr__ = _public
 
 
 def __dir__() -> list[str]:

@@ -40,6 +40,9 @@ from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from knightcube.vision.sun import SunMeasurement, SunSolution, SunStatus
 
+# Without types, so that arguments of other types can be tested.
+LIB: Any = knightcube
+
 
 def _names_for_type_checkers() -> set[tuple[str, str]]:
     """Return (module, name) of the imports that only type checkers evaluate."""
@@ -55,13 +58,27 @@ def _names_for_type_checkers() -> set[tuple[str, str]]:
 
 
 def test_type_checkers_and_the_interpreter_know_the_same_names() -> None:
-    at_run_time = {(inspect.getmodule(getattr(knightcube, name)), name) for name in knightcube.__all__}
+    at_run_time = {(inspect.getmodule(getattr(knightcube, name)), name) for name in LIB.__all__}
     assert at_run_time == {
         (importlib.import_module(module), name) for module, name in _names_for_type_checkers()
     }
 
 
-@pytest.mark.parametrize("name", knightcube.__all__)
+def test_a_type_checker_knows_all_public_names_and_no_other_name(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from knightcube import *\n" + "\n".join(LIB.__all__) + "\nfrom knightcube import StarTrackr\n",
+        encoding="utf-8",
+    )
+    options = "--strict", "--follow-imports=skip", "--cache-dir", tmp_path / "cache"
+    command = [sys.executable, "-m", "mypy", *options, program, knightcube.__file__]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    errors = re.findall(': error: (Module "knightcube" has no attribute "StarTrackr")?', done.stdout)
+    assert len(errors) == 1, done.stdout + done.stderr
+    assert errors[0]
+
+
+@pytest.mark.parametrize("name", LIB.__all__)
 def test_every_public_name_is_documented_with_its_public_methods(name: str) -> None:
     value = getattr(knightcube, name)
     assert name in dir(knightcube)
@@ -71,7 +88,7 @@ def test_every_public_name_is_documented_with_its_public_methods(name: str) -> N
             assert inspect.getdoc(method)
 
 
-@pytest.mark.parametrize("name", knightcube.__all__)
+@pytest.mark.parametrize("name", LIB.__all__)
 def test_every_error_in_a_public_docstring_can_be_caught_by_its_public_name(name: str) -> None:
     """Each error that a public docstring names is exported, and the base class catches all of them."""
     value, parts = getattr(knightcube, name), [getattr(knightcube, name)]
@@ -79,7 +96,7 @@ def test_every_error_in_a_public_docstring_can_be_caught_by_its_public_name(name
         parts += [part for member, part in vars(value).items() if callable(part) and member[0] != "_"]
     texts = [inspect.getdoc(part) or "" for part in parts]
     named = {error for text in texts for error in re.findall(r"\b[A-Z]\w*Error\b", text)}
-    assert named <= {*knightcube.__all__, *dir(builtins)}
+    assert named <= {*LIB.__all__, *dir(builtins)}
     if inspect.isclass(value) and issubclass(value, Exception):
         assert issubclass(value, knightcube.KnightCubeError)
 
@@ -147,7 +164,7 @@ def test_a_result_is_shown_in_one_line(result: Callable[[], object], shown: str)
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'StarTrackr'"):
-        knightcube.StarTrackr  # noqa: B018 - the access is the test
+        LIB.StarTrackr  # noqa: B018 - the access is the test
 
 
 def test_importing_the_library_imports_none_of_its_modules() -> None:
@@ -160,8 +177,6 @@ def test_importing_the_library_imports_none_of_its_modules() -> None:
     assert done.stdout.strip() == "[]"
 
 
-# Without types, so that arguments of other types can be tested.
-LIB: Any = knightcube
 RoughAttitude: Any = settings.RoughAttitude
 SensedDirection: Any = settings.SensedDirection
 NAN = float("nan")
