@@ -200,7 +200,7 @@ SLEW: dict[str, Any] = {
         (lambda: LIB.StarTracker(settings=5), "settings: 5: give an object of the class SolveSettings"),
         (
             lambda: LIB.StarTracker(camera=CAMERA).solve(IMAGE[1:]),
-            "64 x 63 pixels, .*: give images of this",
+            "64 x 63 pixels, .*: give images of one camera",
         ),
         (lambda: LIB.estimate_rate(IMAGE, CAMERA, 1.0, settings=0), "settings: 0: .* LikelihoodSettings"),
         (
