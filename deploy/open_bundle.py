@@ -6,14 +6,15 @@ target path of the artefact states its kind. Python-tuf checks the metadata agai
 TRUSTED, whose versions never decrease, and against the first root metadata in the file ROOT. Python-tuf reads
 the unpacked bundle instead of downloading files.
 
-The program writes the artefact to FOLDER/artefact. For a configuration, the program also writes FOLDER/set
-with the configuration and the drop-ins of its units. For orbital elements or a star catalogue, the
-configuration in FOLDER/set is a copy of the configuration PRESENT, which must match its checksum file, with
-one value replaced. KEPT is the folder in which the star catalogue is installed later. UTC is the mission time
-(s since 1970) with which expiry dates are compared. With an empty UTC the mission time is unknown, and expiry
-dates are not checked, because the system clock of a board may be wrong. PRESENT, KEPT and UTC may be omitted
-for a release. The program prints the version, the permission to replace a newer version, and the SHA-256 as
-one JSON object. For a refused bundle, the program prints one line and exits with status 1.
+The program writes the artefact to FOLDER/artefact, and the sources of a release to FOLDER/source. For a
+configuration, the program also writes FOLDER/set with the configuration and the drop-ins of its units. For
+orbital elements or a star catalogue, the configuration in FOLDER/set is a copy of the configuration PRESENT,
+which must match its checksum file, with one value replaced. KEPT is the folder in which the star catalogue is
+installed later. UTC is the mission time (s since 1970) with which expiry dates are compared. With an empty
+UTC the mission time is unknown, and expiry dates are not checked, because the system clock of a board may be
+wrong. PRESENT, KEPT and UTC may be omitted for a release. The program prints the version, the permission to
+replace a newer version, and the SHA-256 as one JSON object. For a refused bundle, the program prints one line
+and exits with status 1.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import hashlib
 import json
 import lzma
 import re
+import shutil
 import sys
 import tarfile
 from collections.abc import Iterator, Sequence
@@ -84,6 +86,35 @@ def unpack(bundle: Path, kind: str, folder: Path) -> None:
                         file.write(data)
     except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
         raise Refused(f"the bundle is damaged: {error}") from error
+
+
+def unpack_sources(archive: Path, folder: Path) -> None:
+    """Unpack the regular files and folders of a release.
+
+    Raises Refused for members of any other type, and OSError.
+    """
+    folder.mkdir()
+    try:
+        with tarfile.open(archive, "r:*") as files:
+            for member in files:
+                path = folder / member.name
+                if member.name.startswith("/") or ".." in Path(member.name).parts:
+                    raise Refused(f"the release contains {member.name!r}")
+                if member.isdir():
+                    path.mkdir(parents=True, exist_ok=True)
+                elif member.isreg():
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    content = files.extractfile(member)
+                    assert content is not None
+                    with path.open("wb") as file:
+                        shutil.copyfileobj(content, file)
+                    path.chmod(0o755 if member.mode & 0o100 else 0o644)
+                else:
+                    raise Refused(
+                        f"the release contains {member.name!r}, which is neither a file nor a folder"
+                    )
+    except (tarfile.TarError, EOFError, ValueError) as error:
+        raise Refused(f"the release is damaged: {error}") from error
 
 
 def verified(
@@ -203,7 +234,9 @@ def main(words: Sequence[str]) -> int:
         facts = verified(Path(trusted), Path(root).read_bytes(), place / "unpacked", kind, artefact, now)
         with artefact.open("rb") as file:
             facts["sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
-        if kind != "release":
+        if kind == "release":
+            unpack_sources(artefact, place / "source")
+        else:
             before = accepted_text(Path(present)) if kind in _VALUES else ""
             write_set(renewed_text(kind, artefact, before, kept, facts["sha256"]), place / "set")
     except (Refused, OSError) as error:

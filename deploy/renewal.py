@@ -29,11 +29,11 @@ import shutil
 import stat
 import subprocess
 import sys
-import tarfile
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -45,6 +45,10 @@ MOST_TRIES = 3
 """Maximum number of attempts to build a release. A killed process or a power loss ends an attempt early."""
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
+LONGEST_TEXT = 120
+"""Maximum length of a text from the link or in a report, so that the state stays below `LARGEST_RECORD`."""
+READS = 3
+"""Number of attempts to read a stored file, because a single failed disk access does not mean damage."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
 """Numbers of stored reports, and of stored names of executed requests."""
 MOST_HOURS, MOST_DIGITS = 2400.0, 11
@@ -192,6 +196,14 @@ def open_beneath(folder: Path, parts: Sequence[str], most: int) -> BinaryIO:
     return file
 
 
+def read_file(path: Path) -> bytes:
+    """Return the content of a file, after at most `READS` attempts. Raises OSError."""
+    for _ in range(READS - 1):
+        with suppress(OSError):
+            return path.read_bytes()
+    return path.read_bytes()
+
+
 def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
     """Replace a file atomically and sync it to disk. Raises OSError."""
     beside = path.with_name(f".{path.name}.part")
@@ -253,52 +265,63 @@ class Board:
         }
 
     def keep(self, name: str, folder: Path | None = None) -> str:
-        """Store a copy of the installed configuration, or of the configuration in `folder`. Raises OSError.
+        """Store a copy of the installed configuration, or of the configuration in `folder`.
 
-        Returns the name of the copy: `name` or, if it is empty, the SHA-256 of the configuration.
+        Returns the name of the copy: `name` or, if it is empty, the SHA-256 of the configuration. Returns an
+        empty text for a configuration that cannot be read. Raises OSError if the copy cannot be stored.
         """
         files = {one: (path if folder is None else folder / one) for one, path in self._set().items()}
-        contents = {one: path.read_bytes() for one, path in files.items() if path.is_file()}
-        name = name or hashlib.sha256(contents[CONFIGURATION]).hexdigest()
+        try:
+            contents = {one: read_file(path) for one, path in files.items() if path.is_file()}
+            name = name or hashlib.sha256(contents[CONFIGURATION]).hexdigest()
+        except (OSError, KeyError):
+            return ""
         place, beside = self.kept / name, self.kept / f".{name}.part"
-        if self._read_set(place) != contents:
-            for old in (beside, place):
-                shutil.rmtree(old, ignore_errors=True)
+        if self.stored(name) != contents:
+            shutil.rmtree(beside, ignore_errors=True)
             beside.mkdir(parents=True)
             for one, data in contents.items():
                 replace_file(beside / one, data)
             sums = {one: hashlib.sha256(data).hexdigest() for one, data in contents.items()}
             replace_file(beside / "sums", encoded(sums))
+            shutil.rmtree(place, ignore_errors=True)
             beside.replace(place)
             sync_folder(self.kept)
         return name
 
-    @staticmethod
-    def _read_set(place: Path) -> dict[str, bytes] | None:
+    def stored(self, name: str) -> dict[str, bytes] | None:
         """Return the files of a stored configuration, or None if a file is missing or damaged."""
         with suppress(OSError, *_DAMAGED):
-            sums = decoded((place / "sums").read_bytes())
-            contents = {one: (place / one).read_bytes() for one in sums}
+            sums = decoded(read_file(self.kept / name / "sums"))
+            contents = {one: read_file(self.kept / name / one) for one in sums}
             if all(hashlib.sha256(data).hexdigest() == sums[one] for one, data in contents.items()):
                 return contents
         return None
 
     def install(self, name: str) -> None:
         """Install a stored configuration. Raises OSError, and Refused if the stored copy is damaged."""
-        contents = self._read_set(self.kept / name)
+        contents = self.stored(name)
         if contents is None:
             raise Refused(f"the kept configuration {name[:12]} is missing or damaged")
         for one, path in self._set().items():
             if one in contents:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                if not path.is_file() or path.read_bytes() != contents[one]:
-                    replace_file(path, contents[one])
+                with suppress(OSError):  # a file that cannot be read is replaced
+                    if path.read_bytes() == contents[one]:
+                        continue
+                replace_file(path, contents[one])
+
+    def linked(self, link: str) -> str:
+        """Return the name to which a symbolic link points, or an empty text for no link. Raises OSError."""
+        with suppress(FileNotFoundError):
+            return Path(os.readlink(self.prefix / link)).name
+        return ""
 
     def release(self, link: str) -> str:
         """Return the name of the release to which the symbolic link `link` points, or an empty text."""
         with suppress(OSError):
-            name = Path(os.readlink(self.prefix / link)).name
-            if (self.prefix / "releases" / name / "manifest").is_file():
+            name = self.linked(link)
+            if name and (self.prefix / "releases" / name / "manifest").is_file():
                 return name
         return ""
 
@@ -335,8 +358,11 @@ class Board:
             return subprocess.CompletedProcess(command, 127, "", f"{type(error).__name__}: {error}")
 
     def restart(self, *parts: str) -> None:
-        """Request restarts after this run; the default parts are flight and link. Raises OSError."""
-        replace_file(self.own / RESTART, " ".join(parts or ("flight", "link")).encode())
+        """Add restarts after this run; the default parts are flight and link. Raises OSError."""
+        path, wanted = self.own / RESTART, parts or ("flight", "link")
+        with suppress(FileNotFoundError):
+            wanted += tuple(path.read_text(encoding="ascii", errors="replace").split())
+        replace_file(path, " ".join(dict.fromkeys(wanted)).encode())
 
     def restart_parts(self) -> None:
         """Restart the requested parts (flight, link, board); a damaged request restarts flight and link.
@@ -377,9 +403,9 @@ class Board:
 class Renewal:
     """One run of the renewal program: requests, trial and command-loss timer."""
 
-    def __init__(self, board: Board, now: float, boot: str) -> None:
-        """Read the state of `board` at `now` (s since boot); `boot` is the kernel's boot identifier."""
-        self._board = board
+    def __init__(self, board: Board, clock: Callable[[], float], boot: str) -> None:
+        """Read the state of `board`. `clock` returns the time (s) since boot; `boot` identifies the boot."""
+        self._board, self._clock, now = board, clock, clock()
         self._state = self._read()
         state = self._state
         self._elapsed = now - state.at if state.boot == boot and now >= state.at else now
@@ -389,7 +415,7 @@ class Renewal:
     def _read(self) -> State:
         """Return the newest undamaged copy of the state, or an empty state."""
         found = []
-        for copy in ("a", "b"):
+        for copy in ("a", "b") * READS:
             with (
                 suppress(OSError, *_DAMAGED),
                 open_beneath(self._board.own, [f"state.{copy}"], LARGEST_RECORD) as file,
@@ -420,9 +446,8 @@ class Renewal:
     def _report(self, request: str, result: str, name: str, text: str) -> None:
         """Add a report for the link, and a line in the journal."""
         number = 1 + (self._state.reports[-1][0] if self._state.reports else 0)
-        self._state.reports = [*self._state.reports, [number, request, result, name, text[:120]]][
-            -KEPT_REPORTS:
-        ]
+        report = [number, request, result, name[:LONGEST_TEXT], text[:LONGEST_TEXT]]
+        self._state.reports = [*self._state.reports, report][-KEPT_REPORTS:]
         sys.stderr.write(f"renewal: {name} {result}: {text}\n")
 
     def _read_contact(self) -> dict[str, Any]:
@@ -432,12 +457,8 @@ class Renewal:
             open_beneath(self._board.link, ["renewal", "contact"], LARGEST_RECORD) as file,
         ):
             contact = decoded(file.read())
-            return {
-                "session": str(contact["session"]),
-                "frames": str(contact["frames"]),
-                "limit_s": float(contact["limit_s"]),
-                "fault": str(contact["fault"]),
-            }
+            texts = {name: str(contact[name])[:LONGEST_TEXT] for name in ("session", "frames", "fault")}
+            return {**texts, "limit_s": float(contact["limit_s"])}
         return {}
 
     def step(self) -> None:
@@ -510,6 +531,8 @@ class Renewal:
     def _activate(self, name: str, kind: str, request: dict[str, Any]) -> None:
         """Check a bundle and begin its trial. Raises Refused for an invalid bundle, and OSError."""
         state, board = self._state, self._board
+        if state.returning:
+            raise Refused("the return to an earlier version is not finished")
         if state.trial is not None:
             raise Refused(
                 f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw this trial first"
@@ -535,6 +558,7 @@ class Renewal:
         before, session = board.release("previous"), str(self._contact.get("session", ""))
         if kind == "release":
             old, new, what = board.release("current"), "", "release"
+            os.sync()  # the sources are on disk before the trial is stored
         else:
             old, what = board.keep(""), "configuration"
             if kind == "catalogue":
@@ -572,7 +596,7 @@ class Renewal:
         # One copy of the root metadata and one release may be damaged, so all combinations are tried.
         releases = filter(None, (board.release("current"), board.release("previous")))
         for release, root in itertools.product(releases, board.roots()):
-            for left in ("unpacked", "set"):
+            for left in ("unpacked", "set", "source"):
                 shutil.rmtree(staging / left, ignore_errors=True)
             words = [program, board.own / "trusted", root, staging / "bundle", kind, staging]
             words += [board.configuration(), kept, utc]
@@ -649,17 +673,16 @@ class Renewal:
             board.point("previous", trial.old)
             board.point("current", trial.new)
         board.restart()  # if killed before the state is stored, this step is repeated
-        trial.stage = "fly"
+        trial.stage, now = "fly", self._clock()
+        # Flight and link are not down during a build, which takes up to half an hour.
+        self._state.silent_s, self._state.at = self._state.silent_s + now - self._state.at, now
         text = f"{trial.kind} {trial.version} is installed, trial of {trial.left_s / 3600.0:g} h"
         self._report(trial.request, "started", "activate", text)
         self._save()
 
     def _built(self) -> str:
         """Build the release of the bundle, and return its name. Raises Refused if it fails, and OSError."""
-        board, staging = self._board, self._board.own / "staging"
-        source = staging / "source"
-        shutil.rmtree(source, ignore_errors=True)
-        extract(staging / "artefact", source)
+        board, source = self._board, self._board.own / "staging/source"
         old = board.release("current")
         wheels = ["--wheels", source / "wheels"] if (source / "wheels").is_dir() else ["--reuse", old]
         words = [board.builder(old), "-I", source / "deploy/build_release.py", board.prefix, "build"]
@@ -677,18 +700,20 @@ class Renewal:
         """Return to the version before the trial."""
         trial = self._state.trial
         assert trial is not None
-        trial.stage, trial.problem = "revert", problem
+        trial.stage, trial.problem = "revert", problem[: 4 * LONGEST_TEXT]
         self._save()
         self._continue()
 
     def _revert(self, trial: Trial) -> None:
-        """Install the trial's old version, request a restart and end the trial. Raises Refused or OSError."""
-        state, board = self._state, self._board
+        """Install the trial's old version, request a restart and end the trial. Raises OSError."""
+        state, board, end = self._state, self._board, "the previous version is in use"
         if trial.what == "configuration":
-            try:
-                board.install(trial.old)
-            except Refused:
-                board.install(GROUND)
+            for name in (trial.old, GROUND):
+                with suppress(Refused):
+                    board.install(name)
+                    break
+            else:
+                end = "it stays, because no stored configuration is intact"
         else:
             if trial.new and trial.new != trial.old:
                 state.bad = [*(name for name in state.bad if name != trial.new), trial.new][-KEPT_REPORTS:]
@@ -696,7 +721,7 @@ class Renewal:
                 board.point("current", trial.old)
             if trial.before:
                 board.point("previous", trial.before)
-        text = f"{trial.kind} {trial.version}: {trial.problem}; the previous version is in use"
+        text = f"{trial.kind} {trial.version}: {trial.problem}; {end}"
         self._note(text)
         state.trial = None
         self._report(trial.request, "failed", "activate", text)
@@ -737,8 +762,8 @@ class Renewal:
                 return False
         else:
             name = GROUND if what == GROUND else state.previous
-            current = board.keep("")
-            if not name or self._same(name):
+            current, stored = board.keep(""), board.stored(name) if name else None
+            if stored is None or hashlib.sha256(stored[CONFIGURATION]).hexdigest() == current:
                 return False
         state.returning = [what, name, current, request, word, text]
         self._save()
@@ -757,20 +782,16 @@ class Renewal:
             else:
                 board.install(name)
                 state.previous = current
+            board.restart()
         except Refused as error:
             self._report(request, "failed", word, str(error))
+        except OSError as error:  # a later run tries again
+            sys.stderr.write(f"renewal: cannot return yet: {error}\n")
+            return
         else:
-            board.restart()
             self._report(request, "completed", word, text)
             self._note(text)
         state.returning = []
-
-    def _same(self, name: str) -> bool:
-        """Return whether a stored configuration is missing or equals the installed configuration."""
-        with suppress(OSError):
-            stored = (self._board.kept / name / CONFIGURATION).read_bytes()
-            return stored == self._board.configuration().read_bytes()
-        return True
 
     def _count_silence(self) -> None:
         """Count the time without an authentic frame, and return to an earlier version after each interval."""
@@ -812,9 +833,9 @@ class Renewal:
         """Remove releases and configurations that are no longer needed."""
         state, board = self._state, self._board
         with suppress(OSError):
-            current, previous = board.release("current"), board.release("previous")
+            named_releases = {board.linked("current"), board.linked("previous")}
             for path in (board.prefix / "releases").iterdir():
-                if path.name not in {current, previous}:
+                if path.name not in named_releases:
                     (path / "manifest").unlink(missing_ok=True)
                     shutil.rmtree(path)
             texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
@@ -825,31 +846,6 @@ class Renewal:
                         path.unlink()
                 elif path.name not in {state.previous, GROUND}:
                     shutil.rmtree(path)
-
-
-def extract(archive: Path, folder: Path) -> None:
-    """Unpack the regular files and folders of a release.
-
-    Raises Refused for members of any other type, and OSError.
-    """
-    folder.mkdir()
-    try:
-        with tarfile.open(archive, "r:*") as files:
-            for member in files:
-                path = folder / member.name
-                if member.name.startswith("/") or ".." in Path(member.name).parts:
-                    raise Refused(f"the release contains {member.name!r}")
-                if member.isdir():
-                    path.mkdir(parents=True, exist_ok=True)
-                elif member.isreg():
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    content = files.extractfile(member)
-                    assert content is not None
-                    with path.open("wb") as file:
-                        shutil.copyfileobj(content, file)
-                    path.chmod(0o755 if member.mode & 0o100 else 0o644)
-    except (tarfile.TarError, EOFError, ValueError) as error:
-        raise Refused(f"the release is damaged: {error}") from error
 
 
 def boot_id() -> str:
@@ -878,14 +874,15 @@ def main(words: Sequence[str]) -> int:
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
         except OSError:
             return 0  # an earlier run is still building a release
-        now = time.clock_gettime(time.CLOCK_BOOTTIME) if options.now is None else options.now
+        clock = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
         try:
             if options.restart:
                 board.restart_parts()
             elif options.accepted:
-                board.keep(GROUND)
+                if not board.keep(GROUND):
+                    raise OSError(f"{board.configuration()} cannot be read")
             else:
-                Renewal(board, now, boot_id()).step()
+                Renewal(board, clock if options.now is None else lambda: options.now, boot_id()).step()
         except OSError as error:
             sys.stderr.write(f"renewal: {error}\n")
             return 1

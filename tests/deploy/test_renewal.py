@@ -6,19 +6,20 @@ import contextlib
 import json
 import shutil
 import subprocess
+import tarfile
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import pytest
 
 from flight.link.process.filing import decoded, encoded
 from ground.commands.renewal import replace_signing_key
 from tests.deploy.boards import FIRST
-from tests.deploy.renewed_board import RenewedBoard
+from tests.deploy.renewed_board import RenewedBoard, renewal
 from tests.deploy.scripts import script
-
-renewal = script("renewal")
 
 pytestmark = pytest.mark.skipif(
     shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"
@@ -530,6 +531,181 @@ def test_a_damaged_copy_of_the_state_costs_nothing(board: RenewedBoard, copies: 
         path.write_bytes(data)
     board.step(4000.0)
     assert board.flown() == (before if len(copies) == 1 else "second"), "without any record the trial is lost"
+
+
+def test_one_failed_read_costs_no_state(board: RenewedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = board.flown()
+    activated(board)
+    _fail_once(monkeypatch, renewal, "open_beneath", ["state.a"], ["state.b"])
+    board.step(4000.0)
+    assert board.flown() == before
+
+
+def test_one_failed_read_of_the_old_configuration_does_not_lead_to_that_of_the_ground(
+    board: RenewedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    activated(board, "first")
+    board.request("confirm")
+    board.step()
+    activated(board, "second", 2)
+    kept = decoded((board.own / "state.a").read_bytes())["trial"]["old"]
+    _fail_once(monkeypatch, Path, "read_bytes", board.own / "kept" / kept / "sums")
+    board.step(4000.0)
+    assert board.flown() == "first"
+
+
+def test_one_failed_read_deletes_no_release(board: RenewedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    request = board.request("confirm", "release")
+    _fail_once(monkeypatch, renewal.os, "readlink", board.files.prefix / "previous")
+    board.step()
+    assert board.reports(request)[-1][0] == "completed"
+    assert len(list((board.files.prefix / "releases").iterdir())) == 2
+
+
+def _fail_once(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, *wanted: object) -> None:
+    """Let the first call of a function with each of the arguments `wanted` fail."""
+    call, left = getattr(owner, name), list(wanted)
+
+    def fail(*arguments: Any) -> Any:
+        for one in arguments:
+            if one in left:
+                left.remove(one)
+                raise OSError(5, "Input/output error")
+        return call(*arguments)
+
+    monkeypatch.setattr(owner, name, fail)
+
+
+@pytest.mark.parametrize("damage", ["missing", "bad sector"])
+def test_silence_leads_back_from_a_configuration_that_cannot_be_read(
+    board: RenewedBoard, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ground = board.flown()
+    activated(board)
+    board.request("confirm")
+    board.contact(7, limit_s=1000.0)
+    board.step()
+    read, damaged = Path.read_bytes, board.config.stat().st_ino
+
+    def fail(path: Path) -> bytes:
+        if path == board.config and path.stat().st_ino == damaged:
+            raise OSError(5, "Input/output error")
+        return read(path)
+
+    if damage == "missing":
+        board.config.unlink()
+    else:
+        monkeypatch.setattr(Path, "read_bytes", fail)
+    for _ in range(3):
+        board.step(1100.0)
+    assert board.flown() == ground
+
+
+def test_a_configuration_that_cannot_be_read_can_be_replaced(board: RenewedBoard) -> None:
+    ground, path = board.flown(), board.changed("second")
+    board.config.unlink()
+    request = board.activate(board.bundle("configuration", path, 1))
+    board.step()
+    assert board.flown() == "second", board.reports(request)
+    board.step(4000.0)
+    assert board.flown() == ground
+
+
+def test_a_return_that_fails_is_tried_again_and_blocks_no_request(board: RenewedBoard) -> None:
+    ground = board.flown()
+    activated(board)
+    board.request("confirm")
+    board.step()
+    board.config.unlink()
+    board.config.mkdir()
+    (board.config / "file").touch()
+    withdrawn = board.request("withdraw")
+    board.step()
+    refused = board.activate(board.bundle("configuration", board.place / "second.yaml", 2))
+    assert "cannot return yet" in board.step()
+    assert board.reports(refused) == [("failed", "the return to an earlier version is not finished")]
+    shutil.rmtree(board.config)
+    board.step()
+    assert board.flown() == ground
+    assert board.reports(withdrawn)[-1][0] == "completed"
+
+
+def test_a_trial_ends_although_no_stored_configuration_is_intact(board: RenewedBoard) -> None:
+    request = activated(board)
+    shutil.rmtree(board.own / "kept")
+    board.step(4000.0)
+    assert board.reports(request)[-1][0] == "failed"
+    assert board.flown() == "second"
+    activated(board, "third", 2)
+
+
+def test_the_time_of_a_build_does_not_end_the_trial(board: RenewedBoard) -> None:
+    """Flight and link restart after the build, and do not run yet at the next step."""
+    before = board.flown()
+    board.activate(board.bundle("configuration", board.changed("second"), 1))
+    times = [board.now + 10.0, board.now + 1800.0]
+    monotonic = renewal.Renewal.__init__
+
+    def begin(step: Any, place: Any, _: object, boot: str) -> None:
+        monotonic(step, place, lambda: times.pop(0), boot)
+
+    with patch.object(renewal.Renewal, "__init__", begin):
+        board.step()
+    assert (board.flown(), times) == ("second", [])
+    board.set_active("knightcube.service", False)
+    board.now += 1800.0
+    board.step(10.0)
+    assert board.flown() == "second"
+    board.step(200.0)
+    assert board.flown() == before
+
+
+def test_restarts_of_one_step_are_all_executed(board: RenewedBoard) -> None:
+    activated(board)
+    board.request("restart", part="link")
+    board.step()
+    board.run("--restart")
+    calls = (board.place / "calls").read_text(encoding="ascii").splitlines()
+    assert [call for call in calls if "--no-block" in call] == [
+        "--no-block restart knightcube-link.service",
+        "--no-block restart knightcube.service",
+    ]
+
+
+def test_long_texts_of_the_link_cost_no_state(board: RenewedBoard) -> None:
+    before, request = board.flown(), activated(board)
+    board.request("x" * 60_000)
+    board.contact(0, "s" * 20_000, fault="f" * 40_000)
+    board.step()
+    board.step()
+    assert board.flown() == before
+    assert "the flight reported a fault: fff" in board.reports(request)[-1][1]
+
+
+def test_a_copy_that_cannot_be_stored_leaves_the_earlier_copy(
+    board: RenewedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = renewal.Board(board.root)
+    before = place.stored("ground")
+    board.config.write_text(board.changed("second").read_text(encoding="utf-8"), encoding="utf-8")
+    _fail_once(monkeypatch, renewal.os, "fsync", *range(3, 100))
+    with pytest.raises(OSError, match="Input/output"):
+        place.keep("ground")
+    assert before is not None
+    assert place.stored("ground") == before
+
+
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE])
+def test_sources_of_a_release_are_files_and_folders(tmp_path: Path, kind: bytes) -> None:
+    open_bundle = script("open_bundle")
+    member = tarfile.TarInfo("member")
+    member.type, member.linkname = kind, "/etc/passwd"
+    with tarfile.open(tmp_path / "artefact", "w") as archive:
+        archive.addfile(member)
+    with pytest.raises(open_bundle.Refused, match="'member', which is neither a file nor a folder"):
+        open_bundle.unpack_sources(tmp_path / "artefact", tmp_path / "source")
 
 
 def test_records_have_the_same_form_at_both_ends() -> None:
