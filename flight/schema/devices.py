@@ -41,6 +41,7 @@ from flight.schema.document import (
     call_named,
     imported,
 )
+from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Rig
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import UsageError
@@ -782,17 +783,16 @@ def _named(kind: str, named: str, key: str) -> Driver:
 
 
 def _explained(driver: Driver, named: str, key: str) -> Driver:
-    """Return a driver of another package, whose functions raise ConfigError for mistakes in their code."""
+    """Return a driver of another package, whose functions explain mistakes in their code (`call_named`)."""
 
     def explained(word: str) -> Any:
-        function = getattr(driver, word)
+        function, device = getattr(driver, word), word in {"open", "probe", "off"}
 
         def run(*arguments: Any) -> Any:
-            made = call_named(key, named, function, *arguments)
+            made = call_named(key, named, function, *arguments, device=device)
             if made is None and word in {"open", "emulate"}:
-                raise ConfigError(
-                    key, f"is {named!r}, whose function `{word}` returns None: return the device"
-                )
+                problem = f"is {named!r}, whose function `{word}` returns None: return the device"
+                raise NotResponding(f"`{key}`", problem) if device else ConfigError(key, problem)
             return made
 
         return None if function is None else run

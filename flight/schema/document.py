@@ -29,6 +29,7 @@ import numpy as np
 import yaml
 from msgspec import Meta, inspect
 
+from hal.interfaces.errors import DeviceError, NotResponding
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import InputError, KnightCubeError
 from knightcube.gnc.guidance.plant import Q2_LIMIT
@@ -134,20 +135,27 @@ def _import_problem(module: str, name: str, error: Exception, on_board: bool) ->
     return _mistake(error, None, ": correct this line, or install the package that it needs")
 
 
-def call_named(key: str, named: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def call_named(
+    key: str, named: str, function: Callable[..., Any], *arguments: Any, device: bool = False
+) -> Any:
     """Return the result of a function of the object `named` (`module:object`), which the key `key` gives.
 
-    Raises ConfigError, with the file and line, if the function fails because of a mistake in its code.
+    Raises ConfigError, with the file and line, if the function fails because of a mistake in its code. If the
+    function uses a `device`, NotResponding is raised instead, because a fault of the device may also be the
+    cause, and a service does not start again after a ConfigError.
     """
     try:
         return function(*arguments)
-    except KnightCubeError:
+    except (KnightCubeError, DeviceError):
         raise
     except _MISTAKES as error:
         file = getattr(sys.modules.get(named.partition(":")[0]), "__file__", None)
         name = getattr(function, "__name__", type(function).__name__)
-        problem = _mistake(error, file, ": correct this line")
-        raise ConfigError(key, f"is {named!r}, whose function `{name}` failed: {problem}") from error
+        problem = f"is {named!r}, whose function `{name}` failed: "
+        if device:
+            cure = ": check the device, or correct this line"
+            raise NotResponding(f"`{key}`", problem + _mistake(error, file, cure)) from error
+        raise ConfigError(key, problem + _mistake(error, file, ": correct this line")) from error
 
 
 def _mistake(error: Exception, file: str | None, cure: str) -> str:
