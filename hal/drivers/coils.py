@@ -618,6 +618,8 @@ CLEAR, OFF, BRAKE = 0x80, 0x00, 0b11
 FORWARD, REVERSE = 0b01, 0b10
 STEP_V = 4.0 * 1.285 / 64
 FIRST_STEP, LAST_STEP = 0x06, 0x3F
+_LARGEST_ERROR = 0.5 * FIRST_STEP * STEP_V
+"""Largest difference (V) between a voltage and the nearest step."""
 PERIOD_NS = 10_000_000
 
 
@@ -712,7 +714,8 @@ class Drv8830Bridges:
                 control = control_of(wanted)
                 if a == b:
                     control, wanted = (BRAKE, 0.0) if a else (OFF, 0.0)
-                self._error[index] = wanted - volts_of(control)
+                # The limit acts if the supply voltage exceeds the highest voltage of a bridge by rounding.
+                self._error[index] = min(max(wanted - volts_of(control), -_LARGEST_ERROR), _LARGEST_ERROR)
                 if control != self._written[index]:
                     self._write(index, CONTROL, control)
 

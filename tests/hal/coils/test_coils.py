@@ -523,6 +523,17 @@ def test_a_stale_command_and_the_end_leave_all_bridges_off() -> None:
     assert not bench.circuit.currents().any()
 
 
+def test_a_bridge_at_its_highest_voltage_follows_the_next_command_at_once() -> None:
+    clock, given = SimClock(), replace(SETTINGS, supply_voltage=5.06)
+    circuit = BridgeCircuit(0x60, given, np.random.default_rng(1), 0.0, 5.0)
+    bridges = Drv8830Bridges(EmulatedI2cBus(circuit.parts), 0x60, clock, given)
+    bridges.configure()
+    bridges.write_channels(0, [FULL_ON, FULL_OFF])
+    clock.sleep_until_ns(300_000_000_000)
+    bridges.write_channels(0, [(0, 2048), FULL_OFF])
+    assert volts_of(circuit.parts[0].registers[0]) < 3.0
+
+
 @pytest.mark.parametrize("volts", [0.5, -1.0, 3.4, -5.06])
 def test_a_voltage_is_within_half_a_step(volts: float) -> None:
     assert volts_of(control_of(volts)) == pytest.approx(volts, abs=0.0402)
