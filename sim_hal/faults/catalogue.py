@@ -666,7 +666,7 @@ def _dead(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
 
 def _monitor_off(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
     power = bench.hardware.power
-    rail = None if power is None else power.rails[_RAILS.index(fault.device)]
+    rail = None if power is None else power.rails[RAILS.index(fault.device)]
     if rail is None or rail.bus is None:
         return no_removal
     bus, monitor = rail.bus, rail.monitor
@@ -699,7 +699,7 @@ def _worker_faults(device: str) -> tuple[FaultKind, ...]:
     )
 
 
-_RAILS = ("battery-monitor", "bus-monitor")
+RAILS = ("battery-monitor", "bus-monitor")
 """Monitors of the power system, in the order of `EmulatedPower.rails`."""
 _EACH_BIT = "each bit flips with this probability"
 _EACH_FIELD = f", {FIELD_BITS} to each of its fields"
@@ -793,7 +793,7 @@ _ALL = (
     *_frame_faults("wide", "torn", "slow", camera=_count(0.0, 0.0, 6.0)),
     *(
         fault
-        for device in _RAILS
+        for device in RAILS
         for fault in (
             _fault(f"{device}: off", "no power: the chip does not acknowledge", _monitor_off),
             _fault(f"{device}: stuck", "always the same values", _held("stuck", lambda *_: True, False)),

@@ -18,7 +18,7 @@ from functools import partial
 from flight.schema.sections import Config
 from hal.interfaces.devices import COIL_NAMES
 from knightcube.errors import UsageError
-from sim_hal.faults.catalogue import CATALOGUE, Bench, FaultKind, Removal, Where
+from sim_hal.faults.catalogue import CATALOGUE, RAILS, Bench, FaultKind, Removal, Where
 from sim_hal.settings import FaultEntry
 
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
@@ -186,10 +186,18 @@ _EMULATED = {
 """Section and driver that a device's faults need in the configuration, by first word of the device name."""
 
 
+def _rail_key(device: str) -> str:
+    """Return the dotted key of a monitor of the power system."""
+    return f"power.{device.replace('-', '_')}"
+
+
 def other_driver(device: str, config: Config) -> str:
     """Return the reason why a fault cannot act on a device with a different driver, or an empty text."""
     kind, driver = _EMULATED.get(device.partition("-")[0], ("", ""))
     section = getattr(config, kind, None)
+    if device in RAILS and config.power is not None:
+        kind, driver = _rail_key(device), "ina219"
+        section = config.power.monitors().get(kind)
     if section is None or section.driver == driver:
         return ""
     return f"faults act on the emulated device of `{kind}.driver: {driver}`, not on {section.driver!r}"
@@ -201,6 +209,8 @@ def fitted(device: str, config: Config) -> bool:
         return config.replan_period() is not None
     if device.startswith(("coil-", "bridge-")):
         return COIL_NAMES.index(device[-1]) < len(config.coils.slots)
+    if device in RAILS:
+        return config.power is not None and _rail_key(device) in config.power.monitors()
     section = _SECTIONS.get(device)
     return section is None or getattr(config, section) not in (None, ())
 
@@ -217,6 +227,8 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
         device = fault.kind.device
         if not fitted(device, config):
             section = _SECTIONS.get(device)
+            if device in RAILS and config.power is not None:
+                section = _rail_key(device)
             cure = f"the configuration needs a `{section}` section" if section else "the body plans no paths"
             if device.startswith(("coil-", "bridge-")):
                 cure = f"the configuration has {len(config.coils.windings)} coils"

@@ -232,6 +232,26 @@ def test_a_fault_that_could_do_nothing_is_refused_with_the_cure(
 
 
 @pytest.mark.parametrize(
+    ("fault", "monitors", "complaint"),
+    [
+        (
+            "battery-monitor: off",
+            "battery_monitor: {driver: 'ina226:INA226', address: 0x46}",
+            "not on 'ina226:INA226'",
+        ),
+        ("bus-monitor: off", "bus_monitor: null", "needs a `power.bus_monitor` section"),
+    ],
+)
+def test_a_fault_of_a_power_monitor_that_is_missing_or_foreign_is_refused(
+    fault: str, monitors: str, complaint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(CONFIG.parents[1] / "docs" / "examples"))
+    config = configuration.parse(f"extends: orbit\npower: {{battery: {{capacity: 2.0}}, {monitors}}}\n")
+    with pytest.raises(UsageError, match=complaint):
+        check((FaultEntry(fault=fault),), config, realtime=False)
+
+
+@pytest.mark.parametrize(
     ("first", "second"),
     [
         ("camera: black @ 1 for 3", "camera: frozen @ 2"),
