@@ -742,7 +742,9 @@ class Imaging:
     def _keep_lens(self, frame: Frame, lens: LensKnowledge | None, now_ns: int) -> None:
         """Use the lens parameters after a frame for the next frames; a frame without stars has no effect."""
         before = self._lens
-        if lens is None or before is None or lens.frames == before.frames:
+        if lens is None or before is None:
+            return
+        if (lens.frames, lens.contradictions) == (before.frames, before.contradictions):
             return
         self._lens, self._lens_ns = lens, frame.exposure_start_ns
         self._report.lens(frame, before, lens, now_ns)

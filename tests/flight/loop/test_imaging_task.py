@@ -601,6 +601,13 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     again = replace(begun, frames=1, contradictions=1)
     bench.finish(FrameFound(motion(), None, lens=again), 37 * S)
     assert bench.reports.count(events.LENS_CHANGED) == 1
+    bench.take(4, 40 * S, 41 * S)
+    # After a contradiction the estimate also has one frame, as the estimate of an earlier boot has.
+    third = replace(again, contradictions=2)
+    bench.finish(FrameFound(motion(), None, lens=third), 42 * S)
+    assert bench.reports.count(events.LENS_CHANGED) == 2
+    bench.take(5, 45 * S, 46 * S)
+    assert bench.jobs[-1].lens == (third, 5.0)
 
 
 def test_a_camera_whose_lens_is_not_learned_has_jobs_without_a_lens() -> None:
