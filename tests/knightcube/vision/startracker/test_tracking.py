@@ -37,6 +37,15 @@ def test_a_prior_within_its_uncertainty_is_followed(sigma_deg: float) -> None:
         assert np.mean(found.star[matched] == drawn.star[matched]) > 0.8
 
 
+def test_a_prior_more_accurate_than_the_stars_does_not_make_a_match_more_certain() -> None:
+    """The bound on chance matches is that of a prior as accurate as the star positions."""
+    drawn = _drawn(ListKind(noise_px=0.3), 4)
+    field = drawn.field()
+    exact, alike = (track(field, SKY, drawn.attitude, sigma) for sigma in (0.0, float(field.sigma.min())))
+    assert exact.status is alike.status is MatchStatus.IDENTIFIED
+    assert exact.log10_false_alarm == pytest.approx(alike.log10_false_alarm)
+
+
 def test_a_prior_of_another_direction_is_refused() -> None:
     for seed in range(60):
         drawn = _drawn(ListKind(noise_px=0.5, false_stars=5), seed)
