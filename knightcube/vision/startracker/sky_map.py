@@ -121,10 +121,15 @@ def _bent_one(x: float, y: float, z: float, bend: FloatArray) -> tuple[float, fl
 # Maximum number of iterations that invert the lens errors, and step (rad) below which they end.
 # Each iteration reduces the error to a few per cent.
 _BEND_STEPS, _LEAST_STEP = 8, 1e-11
+# Step (rad) of the last iteration above which a direction, far outside the image, has no inverse.
+_DIVERGED = 1e-4
 
 
 def _unbent_numpy(direction: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return the unit vectors (n, 3) that `bent` transforms into `direction` (n, 3); NaN for z <= 0."""
+    """Return the unit vectors (n, 3) that `bent` transforms into `direction` (n, 3).
+
+    The result is NaN for z <= 0, and for directions so far outside the image that the iteration diverges.
+    """
     wanted = np.where(direction[:, 2:] > 0.0, direction, np.nan)
     found = wanted
     for _ in range(_BEND_STEPS):
@@ -133,7 +138,7 @@ def _unbent_numpy(direction: FloatArray, bend: FloatArray) -> FloatArray:
         found = found / np.linalg.norm(found, axis=1, keepdims=True)
         if not np.any(np.abs(step) > _LEAST_STEP):
             break
-    return found
+    return np.where(np.all(np.abs(step) < _DIVERGED, axis=1, keepdims=True), found, np.nan)
 
 
 @compiled_form_of(_unbent_numpy)
@@ -142,16 +147,17 @@ def _unbent(direction: FloatArray, bend: FloatArray) -> FloatArray:
     out = np.full(direction.shape, np.nan)
     for k in range(len(direction)):
         wx, wy, wz = direction[k]
-        x, y, z = wx, wy, wz
+        x, y, z, step = wx, wy, wz, math.inf
         for _ in range(_BEND_STEPS if wz > 0.0 else 0):
             bx, by, bz = _bent_one(x, y, z, bend)
             step = max(abs(wx - bx), abs(wy - by), abs(wz - bz))
             x, y, z = x + wx - bx, y + wy - by, z + wz - bz
             size = math.sqrt(x * x + y * y + z * z)
             x, y, z = x / size, y / size, z / size
-            out[k, 0], out[k, 1], out[k, 2] = x, y, z
             if not step > _LEAST_STEP:
                 break
+        if step < _DIVERGED:
+            out[k, 0], out[k, 1], out[k, 2] = x, y, z
     return out
 
 

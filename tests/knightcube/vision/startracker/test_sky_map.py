@@ -132,6 +132,22 @@ def test_the_compiled_lens_errors_equal_those_in_numpy() -> None:
     assert_forms_agree(_unbent, seen * np.where(np.arange(len(seen)) == 3, -1.0, 1.0)[:, None], bend)
 
 
+def test_a_direction_far_outside_the_image_has_no_pixel() -> None:
+    """A star beside the camera appears nowhere in the image of a lens with a large distortion.
+
+    The inversion of the lens errors diverges for these stars, and gave pixels inside the image.
+    """
+    camera = Pinhole.from_field_of_view(1024, 768, np.radians(12.0))
+    bend = 2.0 * usual_bend(camera) ** -0.5 * np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+    stars = np.random.default_rng(5).normal(size=(20_000, 3))
+    stars /= np.linalg.norm(stars, axis=1, keepdims=True)
+    inside = camera.contains(SkyMap(camera, IDENTITY, bend).pixels(stars))
+    assert inside.any()
+    assert stars[inside, 2].min() > np.cos(1.2 * camera.half_diagonal)
+    seen = stars[stars[:, 2] > 0.1]
+    assert_forms_agree(_unbent, seen[np.isfinite(_unbent.numpy_form(seen, bend)[:, 0])], bend)
+
+
 _BEND = np.array([0.02, -0.03, 0.004, 0.006, 0.05, -0.03, 0.01, -0.02])
 
 
