@@ -34,7 +34,9 @@ import math
 import mmap
 import os
 import struct
+import threading
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import combinations
@@ -94,10 +96,16 @@ def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> N
     body = bytearray(table)
     for column in little.values():
         body += column.tobytes() + b"\0" * (-column.nbytes % _ALIGNMENT)
-    # Two processes may write at the same time. Each process therefore writes a separate file and renames it.
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
-    temporary.write_bytes(_HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table)) + bytes(body))
-    temporary.replace(path)
+    # Two threads or processes may write at the same time. Each writes a separate file and renames it.
+    temporary = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.new")
+    header = _HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table))
+    try:
+        temporary.write_bytes(header + bytes(body))
+        temporary.replace(path)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
 
 
 def load_table(path: Path, kind: TableKind) -> tuple[Columns, Facts]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,6 +167,31 @@ def test_an_index_file_round_trips_and_is_deterministic(stored: Path, tmp_path: 
     assert np.array_equal(back.triangles.corners, sky.triangles.corners)
     assert np.abs(back.stars.direction - sky.stars.direction).max() < 1e-7
     assert np.abs(back.stars.magnitude - sky.stars.magnitude).max() < 1e-3
+
+
+def test_two_threads_write_the_same_index_file(
+    stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both, replaced, sky = threading.Barrier(2), Path.replace, index_build.build(SMALL)
+
+    def replace_together(self: Path, target: Path) -> Path:
+        both.wait(60.0)
+        return replaced(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace_together)
+    copy = tmp_path / "copy.index"
+    with ThreadPoolExecutor(2) as pool:
+        for done in [pool.submit(save, sky, copy) for _ in range(2)]:
+            done.result()
+    assert copy.read_bytes() == stored.read_bytes()
+    assert list(tmp_path.iterdir()) == [copy]
+
+
+def test_an_index_that_cannot_be_stored_leaves_no_file(stored: Path, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        save(load(stored), tmp_path / "folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
 def test_a_star_tracker_uses_an_index_that_was_built_saved_and_loaded(stored: Path) -> None:
