@@ -449,7 +449,10 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
         raise ArgumentError(
             "image", f"{masked} masked pixels: fill them, such as image.filled(np.ma.median(image))"
         )
-    image = np.asarray(pixels)
+    try:
+        image = np.asarray(pixels)
+    except ValueError as error:
+        raise ArgumentError("image", f"{error}: give an array (rows, columns)") from None
     if image.dtype.kind == "f" and image.itemsize not in (4, 8):
         # The noise of a float16 image overflows its type, and compiled code knows no long double.
         image = image.astype(np.float32 if image.itemsize < 4 else np.float64)
@@ -666,7 +669,9 @@ class Bins:
 
     def sums(self, image: Image) -> Image:
         """Return the binned image (rows, columns), the sums of the pixels in the bins."""
-        total = np.float32 if image.dtype.kind == "f" else np.int64 if image.dtype.kind == "i" else np.uint32
+        total: npt.DTypeLike = np.uint32 if image.itemsize <= 2 else np.uint64
+        if image.dtype.kind != "u":
+            total = np.int64 if image.dtype.kind == "i" else image.dtype
         return np.asarray(self.blocks(image).sum(axis=(1, 3), dtype=total))
 
 

@@ -473,16 +473,23 @@ def _may_be_defocused(solution: FrameSolution, motion: FrameMotion, tracker: Tra
     return _direction_sigma(solution.fix) * solution.camera.focal_length > _UNCERTAIN_PX
 
 
+def binned_settings(settings: SolveSettings, size: int) -> SolveSettings:
+    """Return the settings for a frame that is binned by `size` px.
+
+    Point spread, gain and saturation of the binned frame are measured.
+    """
+    detection = replace(settings.detection, psf_sigma=None, gain=None, saturation=None)
+    lens = None if settings.lens is None else settings.lens.binned(size)
+    return replace(settings, detection=detection, lens=lens)
+
+
 def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, bins: Bins) -> FrameSolution:
     """Return the attitude from a frame after binning.
 
     Because the shape of a defocused star is unknown, all stars may have a common error, which is a fraction
     of the bin size.
     """
-    solve, estimator, size = tracker.solve, job.estimator, bins.size
-    detection = replace(solve.detection, psf_sigma=None, gain=None, saturation=None)
-    lens = None if solve.lens is None else solve.lens.binned(size)
-    solve = replace(solve, detection=detection, lens=lens)
+    estimator, size, solve = job.estimator, bins.size, binned_settings(tracker.solve, bins.size)
     if isinstance(estimator, LikelihoodSettings):
         estimator = estimator.binned(size)
     camera = job.camera.binned(bins.columns, bins.rows, size)
@@ -492,7 +499,7 @@ def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, 
         trails = _short_trails(binned)
         solution = solve_near(binned.pixels, binned.camera, tracker.scale, sky, solve, prior, trails)
     if solution is None:
-        solution = _from_points(binned, tracker, sky, survey(binned.pixels, detection))
+        solution = _from_points(binned, tracker, sky, survey(binned.pixels, solve.detection))
     doubt = SHAPE_DOUBT / camera.focal_length
     return in_whole_image(solution.wider(np.diag([doubt**2, doubt**2, 0.0])), bins, job.pixels.shape)
 

@@ -31,7 +31,7 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import ArgumentError, InputError
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole, check_camera
 from knightcube.vision.frame import Bins, grey_image
-from knightcube.vision.frame_job import BIN_SIZES, found_in_image, in_whole_image
+from knightcube.vision.frame_job import BIN_SIZES, binned_settings, found_in_image, in_whole_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index import SkyIndex, load_once
 from knightcube.vision.startracker.index.build import default_index
@@ -320,7 +320,8 @@ class StarTracker:
                 return None
             coarse = bins.sums(image)
             camera, scale = camera_of_field(self._fov_deg, self._fov_error_deg, coarse.shape)
-            found = found_in_image(coarse, camera, scale, 1.0, sky, settings).solution
+            binned = binned_settings(settings, size)
+            found = found_in_image(coarse, camera, scale, 1.0, sky, binned).solution
             if found is not None and found.fix is not None and found.kind is FrameKind.POINTS:
                 return in_whole_image(found, bins, image.shape)
         return None

@@ -34,6 +34,7 @@ from knightcube.vision.frame import (
     HOT_SIGMAS,
     check_pixels,
     count_of_floats,
+    gain_in_counts,
     hot_among,
     label_pixels,
     moments,
@@ -397,6 +398,8 @@ CENTROIDS: tuple[Method, ...] = get_args(Method)
 
 PSF_SIGMAS = 0.3, 6.0
 """Range of the standard deviation of the PSF, px, that star detection accepts."""
+GAINS, SATURATIONS = (1e-6, 1e6), (1e-6, 1e9)
+"""Ranges of the gain, electrons per count, and of the saturation, counts, that star detection accepts."""
 
 
 def accepted_psf(psf_sigma: float) -> float:
@@ -439,8 +442,8 @@ class DetectionSettings:
             ("threshold_sigmas", 1.0, 100.0),
             ("most_stars", 1, 10_000),
             ("psf_sigma", *PSF_SIGMAS),
-            ("gain", 1e-6, 1e6),
-            ("saturation", 1e-6, 1e9),
+            ("gain", *GAINS),
+            ("saturation", *SATURATIONS),
             ("search_radius", 1.0, 50.0),
         ):
             value = getattr(self, name)
@@ -453,8 +456,12 @@ class DetectionSettings:
         """Return the settings for a frame from which `zero` was subtracted and that was divided by `unit`."""
         if unit == 1.0 and zero == 0.0:
             return self
-        saturation = None if self.saturation is None else (self.saturation - zero) / unit
-        return replace(self, saturation=saturation, gain=None if self.gain is None else self.gain * unit)
+        gain, saturation = self.gain, self.saturation
+        if gain is not None:
+            gain = min(max(gain_in_counts(gain, unit), GAINS[0]), GAINS[1])
+        if saturation is not None:
+            saturation = min(max((saturation - zero) / unit, SATURATIONS[0]), SATURATIONS[1])
+        return replace(self, saturation=saturation, gain=gain)
 
 
 _BLOCK = 32

@@ -97,6 +97,7 @@ def test_other_numbers_become_sixteenths_of_their_noise() -> None:
         (np.zeros((20, 20, 3), complex), "pixels of complex128"),
         (np.full((20, 20), np.inf), "400 pixels are not finite: replace them"),
         (np.zeros((20, 20, 5)), "an array of shape (20, 20, 5): give (rows, columns), or (rows, columns, 3)"),
+        ([[1, 2], [3]], "setting an array element"),
     ],
 )
 def test_an_array_that_cannot_be_an_image_is_refused(image: Image, message: str) -> None:
@@ -390,3 +391,12 @@ def test_pixels_of_a_bin_are_summed_without_overflow(dtype: type[np.generic]) ->
     ]
     assert found.tolist() == expected
     assert found[0, 0] == 9 * 120
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.uint32, np.int32, np.float64])
+def test_bright_pixels_of_a_bin_are_summed_exactly(dtype: type[np.number[Any]]) -> None:
+    highest = 2**40 + 1 if dtype is np.float64 else np.iinfo(dtype).max
+    image = np.full((9, 9), highest, dtype)
+    bins = Bins.centred(image.shape, 3)
+    assert bins is not None
+    assert bins.sums(image)[0, 0].item() == 9 * highest

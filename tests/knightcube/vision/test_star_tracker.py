@@ -29,6 +29,7 @@ from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
 from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 ARCSECOND = math.radians(1.0 / 3600.0)
@@ -322,8 +323,10 @@ def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(monkeypatch: p
     """
     resting = sky_frame(np.random.default_rng(5), 0.0, 0.1)
     spread = gaussian_filter(np.kron(resting.pixels.astype(float), np.ones((3, 3))), 3.0)
-    image = np.rint(spread[1:-1, 1:-1]).astype(np.uint16)
-    tracker = StarTracker(fov_deg=12.0)
+    image = np.rint(spread[1:-1, 1:-1] + 20_000.0).astype(np.uint16)
+    # The stated values are those of the image, and not of the sums of its pixels.
+    stated = DetectionSettings(saturation=65_535.0, psf_sigma=4.0)
+    tracker = StarTracker(fov_deg=12.0, settings=SolveSettings(detection=stated))
     solution = tracker.solve(image)
     assert solution, "the sums of 3 x 3 px leave two pixels at each side"
     error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))

@@ -434,6 +434,12 @@ def test_settings_are_converted_to_the_unit_of_a_frame() -> None:
     """Counts are divided by the unit, and electrons per count are multiplied by the unit."""
     stated = DetectionSettings(gain=2.0, saturation=60.0, psf_sigma=1.1).in_units_of(0.5)
     assert (stated.gain, stated.saturation, stated.psf_sigma) == (1.0, 120.0, 1.1)
+    scaled = DetectionSettings(gain=1.0, saturation=65_535.0).in_units_of(1e-7)
+    assert scaled.gain == 1.0, "pixel values that were divided by their maximum are not counts"
+    assert scaled.saturation == 1e9, "no pixel of a usual image has that many counts"
+    covered = DetectionSettings(saturation=10.0).in_units_of(1.0, 20.0)
+    assert covered.saturation is not None
+    assert covered.saturation < 1.0, "all pixels are saturated"
     unknown = DetectionSettings().in_units_of(0.5)
     assert (unknown.gain, unknown.saturation) == (None, None)
 
