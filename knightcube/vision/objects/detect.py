@@ -49,7 +49,7 @@ from knightcube.compiled import compiled_form_of
 from knightcube.errors import KnightCubeError
 from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
-from knightcube.vision.frame import gain_in_counts, line_of, positions, raw_counts
+from knightcube.vision.frame import gain_in_counts, line_of, positions, raw_counts, saturation_level
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     PATHS_PER_LENGTH,
@@ -696,6 +696,7 @@ def detect(
     The camera rotates by `rotation` (3,), rad, during the `exposure`, s. If the sign of the rotation is
     unknown, the directions of motion of all objects may have the wrong sign.
     """
+    settings = replace(settings, saturation=saturation_level(pixels, settings.saturation))
     segmented = segment_frame(pixels, replace(settings, most_streaks=objects.most_streaks))
     streaks = measure_streaks(segmented, settings)
     if len(streaks) < settings.least_streaks:

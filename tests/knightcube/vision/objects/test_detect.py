@@ -367,6 +367,20 @@ def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: f
     np.testing.assert_allclose(found.endpoints, [place, place], atol=0.3)
 
 
+def test_an_object_that_saturates_8_bits_is_found_without_a_stated_saturation() -> None:
+    motion = motion_across(_PLACE, 25.0 / _FOCAL, 0.3)
+    path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 6, [(path, 2.0)], _FAINTEST)
+    clipped = np.clip(np.rint(pixels / 8.0), 0, 255).astype(np.uint8)
+    assert np.count_nonzero(clipped == 255) > 100
+    for saturation in (None, 255.0):
+        settings = ObjectSettings(gain=8.0, saturation=saturation)
+        found = detect_objects(clipped, _FRAME_CAMERA.pinhole, _ROTATION, 1.0, settings)
+        assert len(found.objects) == 1
+        missed = np.linalg.norm(found.objects[0].endpoints[:, None] - path[[0, -1]], axis=2).min(axis=1)
+        assert missed.max() < 0.5
+
+
 def test_a_bright_star_whose_core_is_saturated_is_not_reported_as_an_object() -> None:
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
     directions = np.concatenate([directions, _PLACE[None]])
