@@ -108,8 +108,8 @@ class RemoteI2cBus:
             except TimeoutError as error:
                 raise TimeoutError(errno.ETIMEDOUT, "the emulated bus does not answer") from error
         _, kind, result, text = answer
-        if kind == "error":
-            raise OSError(result, text)
+        if kind != "done":
+            raise OSError(result or errno.EIO, text)
         return result
 
     def write_byte(self, address: int, value: int) -> None:

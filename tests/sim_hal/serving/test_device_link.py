@@ -73,6 +73,12 @@ def test_an_error_on_the_emulated_bus_is_the_errno_of_the_kernel(serve: Serve) -
     assert caught.value.errno == errno.EREMOTEIO
 
 
+def test_a_request_that_the_server_refuses_is_an_error_of_the_bus(serve: Serve) -> None:
+    bus = serve(lambda request: [[request[0], "refused", 0, "no emulated device is connected"]])
+    with pytest.raises(OSError, match="no emulated device is connected"):
+        bus.read_byte_data(0x40, 0)
+
+
 def test_an_answer_that_came_too_late_is_not_accepted_for_the_next_request(serve: Serve) -> None:
     def answer(request: list[Any]) -> list[Any]:
         if request[0] == 1:
