@@ -38,7 +38,7 @@ from flight.schema.devices import (
     driver_of,
     fitted_devices,
 )
-from flight.schema.document import ConfigError, imported
+from flight.schema.document import ConfigError, call_named, imported
 from flight.schema.sections import Config
 from hal.buses.linux_wires import LinuxWires, device_file
 from hal.buses.system import SystemClock
@@ -173,13 +173,14 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
     Raises DeviceError for a device that does not answer, unless the flight is `patient` and retries.
     """
     coils: TorqueCoils = opened("coils", config, rig, stack)
-    coils.start(patient=patient)
+    _called("coils.driver", config.coils, coils.start, patient)
     power: PowerMonitor | None = opened("power_monitor", config, rig, stack)
     unit: InertialUnit = opened("inertial_unit", config, rig, stack)
     magnetometer: InertialUnit | None = opened("magnetometer", config, rig, stack)
-    for one in filter(None, (unit, magnetometer)):
+    for kind, one in (("inertial_unit", unit), ("magnetometer", magnetometer)):
         with suppress(DeviceError) if patient else nullcontext():
-            one.configure()
+            if one is not None:
+                _called(f"{kind}.driver", getattr(config, kind), one.configure)
     cameras = [config.camera, *config.wide_cameras]
     if rig.cameras is None:
         frames = [open_camera(one, rig, stack, patient) if one is not None else None for one in cameras]
@@ -193,6 +194,15 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
     monitors = tuple(_opened("power_monitor", one, rig, stack, key) for key, one in supply)
     wide = tuple(filter(None, frames[1:]))
     return Devices(unit, magnetometer, coils, power, frames[0], gps, strings, wide, monitors)
+
+
+def _called(key: str, section: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of a device; a mistake in a driver of another package is reported as ConfigError.
+
+    The key `key` of `section` names the driver.
+    """
+    named = getattr(section, "driver", None) or section.__struct_config__.tag
+    return call_named(key, named, function, *arguments) if ":" in named else function(*arguments)
 
 
 def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
@@ -281,8 +291,9 @@ def open_camera(
     """
     if camera.device is None:
         raise ConfigError("camera.device", NO_CAMERA)
-    device: CameraDevice = driver_of("camera", camera.device, "camera.device.driver").open(rig, camera)
-    source = ServedCamera(device, rig.clock, patient=patient)
+    key = "camera.device.driver"
+    device: CameraDevice = driver_of("camera", camera.device, key).open(rig, camera)
+    source: ServedCamera = _called(key, camera.device, ServedCamera, device, rig.clock, patient)
     stack.callback(source.close)
     return source
 

@@ -66,3 +66,30 @@ def test_a_voltage_that_no_drv8830_has_is_refused() -> None:
     assert devices.check_drv8830(cast(Any, SimpleNamespace(**section))).supply_voltage == 5.0
     with pytest.raises(OutOfRange, match="supply voltage of DRV8830 bridges"):
         devices.check_drv8830(cast(Any, SimpleNamespace(**section | {"supply_voltage": 6.0})))
+
+
+@pytest.mark.parametrize(("driver", "error"), [("mine:UNIT", ConfigError), ("vn100", AttributeError)])
+def test_a_mistake_in_the_configuration_of_a_foreign_unit_is_named(
+    driver: str, error: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def configure() -> None:
+        raise AttributeError("'Rig' object has no attribute 'wire'")
+
+    found: dict[str, Any] = {"coils": Mock(), "inertial_unit": SimpleNamespace(configure=configure)}
+    monkeypatch.setattr(devices, "opened", lambda kind, *_: found.get(kind))
+    sections = {name: SimpleNamespace(driver="pca9685") for name in ("coils", "magnetometer")}
+    config = SimpleNamespace(**sections, inertial_unit=SimpleNamespace(driver=driver))
+    with pytest.raises(error, match=r"no attribute 'wire'") as caught:
+        devices.open_devices(cast(Any, config), Mock(), Mock(), patient=False)
+    if error is ConfigError:
+        assert "'mine:UNIT', whose function `configure` failed" in str(caught.value)
+    found["coils"].start.assert_called_once_with(False)
+
+
+def test_a_mistake_in_a_foreign_camera_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Mock()
+    device.open.side_effect = ImportError("no module `sdk`")
+    monkeypatch.setattr(devices, "driver_of", lambda *_: Mock(open=lambda *_: device))
+    camera = SimpleNamespace(device=SimpleNamespace(driver="mine:CAMERA"))
+    with pytest.raises(ConfigError, match=r"'mine:CAMERA'.*no module `sdk`"):
+        devices.open_camera(cast(Any, camera), Mock(), Mock())
