@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -196,7 +197,10 @@ def _damaged_package(release: Path) -> str:
 
 
 def switch(prefix: Path, name: str) -> None:
-    """Make a release current, make the former current release previous, and remove all other releases."""
+    """Make a release current, make the former current release previous, and remove all other releases.
+
+    If the former current release is incomplete or cannot be read, the previous release stays.
+    """
     release, current = prefix / "releases" / name, linked(prefix, "current")
     if current == release:
         return
@@ -206,8 +210,11 @@ def switch(prefix: Path, name: str) -> None:
     if current is not None:
         _link(prefix / "previous", current)
     _link(prefix / "current", release)
+    kept = {name}
+    with suppress(FileNotFoundError):
+        kept.add(Path(os.readlink(prefix / "previous")).name)
     for other in (prefix / "releases").iterdir():
-        if other not in {release, current}:
+        if other.name not in kept:
             _remove(other)
 
 

@@ -326,6 +326,7 @@ roll_back() {
 
 say_next() {
     if [ -z "$dry" ]; then
+        sync # the board may lose its power at once
         verb=start
         if systemd_runs && systemctl is-active --quiet knightcube.service; then
             verb=restart # the previous version is flying

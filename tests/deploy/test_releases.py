@@ -170,6 +170,26 @@ def test_an_update_keeps_two_releases_and_a_second_run_of_it_none_more(board: Fa
     assert not list((board.prefix / "current").glob("venv/lib/python3/site-packages/ground"))
 
 
+def test_an_update_of_an_incomplete_release_keeps_the_previous_one(board: FakeBoard) -> None:
+    (board.prefix / "releases" / SECOND / "manifest").unlink()
+    board.install("newest")
+    assert (board.prefix / "releases" / FIRST / "manifest").is_file()
+    assert (board.prefix / "previous").resolve().name == FIRST
+
+
+@pytest.mark.parametrize("option", ["", "--accept", "--rollback"])
+def test_the_installed_files_are_on_disk_when_the_installer_ends(board: FakeBoard, option: str) -> None:
+    program = board.root / "programs/sync"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\necho synced >>"{board.root}/calls"\n', encoding="ascii")
+    program.chmod(0o755)
+    environment = board.environment()
+    environment["PATH"] = f"{program.parent}:{environment['PATH']}"
+    words = [*board.words("new")[:2], option] if option else board.words("new")
+    subprocess.run(words, env=environment, capture_output=True, check=True)
+    assert (board.root / "calls").read_text(encoding="ascii") == "synced\n"
+
+
 def test_a_release_that_fails_its_self_test_changes_nothing(board: FakeBoard) -> None:
     (board.python("").parents[1] / "label").write_text("", encoding="ascii")
     done = subprocess.run(
