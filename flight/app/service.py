@@ -169,7 +169,7 @@ def pauses() -> Iterator[float]:
         pause = min(2.0 * pause, LONGEST_PAUSE_S)
 
 
-_POWERED, _LARGEST_POWERED = "powered", 64
+_POWERED = "powered"
 
 
 class InhibitedError(KnightCubeError):
@@ -216,7 +216,7 @@ class SeparationInhibit:
 def _powered(path: Path) -> float:
     """Return the stored time with power, s, or 0 if the file is missing or damaged."""
     with suppress(OSError, ValueError):
-        return float(line_of(read_regular(path, _LARGEST_POWERED) or b"") or b"0")
+        return float(line_of(_persistently(LinuxFiles().read, path) or b"") or b"0")
     return 0.0
 
 

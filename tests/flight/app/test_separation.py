@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+import pytest
 
 from flight.app.service import InhibitedError, SeparationInhibit
 from tests.manual_clock import ManualClock
@@ -54,3 +57,21 @@ def test_a_disk_that_cannot_be_written_does_not_prolong_a_boot(tmp_path: Path) -
     for expected in (50.0, 0.0):
         clock.advance(50 * SECOND)
         assert left(inhibit, tmp_path / "file" / "state") == expected
+
+
+def test_one_failed_read_does_not_begin_the_inhibit_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = ManualClock()
+    inhibit = SeparationInhibit(clock)
+    clock.advance(60 * SECOND)
+    assert left(inhibit, tmp_path) == 40.0
+    read, failures = os.read, [OSError(5, "Input/output error")]
+
+    def fail(file: int, size: int) -> bytes:
+        if failures:
+            raise failures.pop()
+        return read(file, size)
+
+    monkeypatch.setattr(os, "read", fail)
+    assert left(SeparationInhibit(clock), tmp_path) == 40.0
