@@ -105,6 +105,18 @@ def test_a_saved_table_is_loaded_again_as_a_whole(
     assert "modes.hold_error is missing: give all parameters of the table" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("number", ["1" + 400 * "0", ".inf", ".nan"])
+def test_a_table_with_an_infinite_number_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], number: str
+) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text(f"modes:\n  tumble_rate: {number}\n", encoding="ascii")
+    assert main(["parameters", "--to", str(tmp_path / "s"), "--load", str(table)]) == 2
+    error = capsys.readouterr().err
+    assert "table.yaml:2: `modes.tumble_rate` " in error
+    assert "must be a finite number" in error
+
+
 @pytest.mark.parametrize(
     ("word", "complaint"),
     [
