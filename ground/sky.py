@@ -197,7 +197,8 @@ def _place_facts(sky: SkyMap, point: tuple[float, float]) -> dict[str, Any]:
 
 
 def _coordinates(direction: FloatArray) -> dict[str, float]:
-    right_ascension = math.degrees(math.atan2(direction[1], direction[0])) % 360.0
+    # The remainder of a tiny negative angle is rounded to 360 deg, whose remainder is 0.
+    right_ascension = math.degrees(math.atan2(direction[1], direction[0])) % 360.0 % 360.0
     declination = math.degrees(math.atan2(direction[2], math.hypot(direction[0], direction[1])))
     return {"right_ascension_deg": right_ascension, "declination_deg": declination}
 

@@ -230,9 +230,9 @@ def _text(solution: StarSolution, seconds: float, axis_sigma: float | None = Non
     rms = float(np.sqrt(np.mean(stars.residuals**2)))
     per_pixel = ARCSECONDS / frame.camera.focal_length
     lines += [
-        f"right ascension:  {solution.right_ascension_deg:.4f} deg",
+        f"right ascension:  {round(solution.right_ascension_deg, 4) % 360.0:.4f} deg",
         f"declination:      {solution.declination_deg:+.4f} deg",
-        f"roll:             {solution.roll_deg:.3f} deg",
+        f"roll:             {round(solution.roll_deg, 3) % 360.0:.3f} deg",
         f'1 sigma:          {sigma[0]:.2f}" x, {sigma[1]:.2f}" y, {sigma[2]:.1f}" about the boresight',
         f'field of view:    {solution.field_of_view_deg:.4f} deg across, {per_pixel:.2f}" per pixel',
         f"stars:            {len(stars)} of {len(frame.points)} {frame.kind.value} matched,"

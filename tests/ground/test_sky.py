@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from ground.sky import bodies_in, directions_of_bodies, header_text
+from ground.sky import _coordinates, bodies_in, directions_of_bodies, header_text
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.lens import Lens, Pinhole
@@ -28,6 +28,10 @@ def _apart_deg(one: FloatArray, other: FloatArray) -> float:
 def test_jupiter_and_saturn_meet_on_the_day_of_the_great_conjunction() -> None:
     found = directions_of_bodies(_CONJUNCTION)
     assert _apart_deg(found["Jupiter"], found["Saturn"]) == pytest.approx(6.1 / 60.0, abs=1.5 / 60.0)
+
+
+def test_a_right_ascension_is_below_360_deg() -> None:
+    assert _coordinates(np.array([1.0, -1e-17, 0.0]))["right_ascension_deg"] == 0.0
 
 
 def test_the_moon_is_before_the_sun_at_an_eclipse() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
+from ground.commands.solve import _text  # noqa: E402
 from knightcube.astro.attitude.solvers import SOLVERS  # noqa: E402
 from knightcube.astro.quaternion import (  # noqa: E402
     angle_between,
@@ -18,6 +20,7 @@ from knightcube.astro.quaternion import (  # noqa: E402
     multiply,
     to_rotation_vector,
 )
+from knightcube.vision.star_tracker import StarTracker  # noqa: E402
 from knightcube.vision.startracker.sky_map import Pointing  # noqa: E402
 from knightcube.vision.startracker.survey import CENTROIDS  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
@@ -54,6 +57,14 @@ def test_a_picture_of_an_unknown_field_is_solved(resting: SkyFrame, picture: Pat
     assert len(residuals) > 10
     assert np.sqrt(np.mean(residuals**2)) < 0.5
     assert facts["motion"] is None
+
+
+def test_angles_just_below_a_full_turn_are_printed_as_zero(resting: SkyFrame) -> None:
+    solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
+    full = 2.0 * math.pi - 1e-9
+    lines = _text(replace(solution, right_ascension=full, roll=full), 0.1).splitlines()
+    assert "right ascension:  0.0000 deg" in lines
+    assert "roll:             0.000 deg" in lines
 
 
 def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> None:
