@@ -316,7 +316,9 @@ def stated_exposure(path: Path) -> float | None:
             value = facts_of(kept).get("exposure_s")
         elif content := _fits_content(path):
             header = _first_image(content, str(path))[0]
-            value = next((header[key] for key in ("EXPTIME", "EXPOSURE") if key in header), None)
+            stated = next((header[key] for key in ("EXPTIME", "EXPOSURE") if key in header), None)
+            # FITS allows a D before the exponent of a double.
+            value = None if stated is None else stated.replace("D", "E")
         else:
             from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for files
 

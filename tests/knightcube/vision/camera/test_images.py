@@ -483,7 +483,11 @@ def test_the_exposure_time_is_that_of_the_metadata(tmp_path: Path) -> None:
     write_picture(tmp_path / "b.png", pixels)
     (tmp_path / "a.fits").write_bytes(fits_file(pixels, 8, EXPTIME=1.5))
     (tmp_path / "b.fits").write_bytes(fits_file(pixels, 8, EXPTIME=0.0))
+    double = f"{'EXPTIME':8}= {'2.5D-1':>20}".encode().ljust(80)
+    content = fits_file(pixels, 8, EXPTIME=0.25)
+    begin = content.index(b"EXPTIME")
+    (tmp_path / "d.fits").write_bytes(content[:begin] + double + content[begin + 80 :])
     (tmp_path / "a.bin").write_bytes(b"no image")
     found = {path.name: stated_exposure(path) for path in tmp_path.iterdir()}
-    expected = {"a.jpg": 0.25, "a.png": 0.3, "a.fits": 1.5}
+    expected = {"a.jpg": 0.25, "a.png": 0.3, "a.fits": 1.5, "d.fits": 0.25}
     assert found == expected | dict.fromkeys(["plain.png", "b.png", "b.fits", "a.bin"])
