@@ -56,6 +56,9 @@ _LEAST_FOV_ERROR = 0.001
 """Minimum uncertainty of a field of view without a calibrated lens, as a fraction of the field of view."""
 _UNIT_TOLERANCE = 1e-3
 """Largest deviation of the length of a predicted quaternion from 1."""
+_DEVIATIONS = {"focal_length": "(relative)", "centre": "px", "distortion": "(relative)"}
+_DEVIATIONS |= {"line_time": "s", "psf_sigma": "px"}
+"""Units of the standard deviations in `CameraKnowledge`, by the name of the attribute."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,6 +231,9 @@ class StarTracker:
                 "settings.lens",
                 f"{self._settings.lens!r}: give a CameraKnowledge, as CameraKnowledge(**accuracy)",
             )
+        for name, unit in _DEVIATIONS.items():
+            if (value := getattr(self._settings.lens, name, None)) is not None:
+                checked_deviation(f"settings.lens.{name}", value, unit)
         self._learn = learn
         self.lens: LensKnowledge | None = None
         if not isinstance(index, SkyIndex | Path | str | None):

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import ArgumentError, InputError
-from knightcube.vision.camera.lens import Lens, Pinhole
+from knightcube.vision.camera.lens import CameraKnowledge, Lens, Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
 from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solve import SolveSettings
@@ -55,6 +56,9 @@ def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) ->
     assert solution.field_of_view_deg == pytest.approx(12.0, abs=0.01)
     assert not solution.mirrored
     assert solution.rate is None
+    nearly_full = replace(solution, right_ascension=2.0 * math.pi - 1e-9, roll=2.0 * math.pi - 1e-9)
+    assert "right ascension 0.0000, " in repr(nearly_full)
+    assert "roll 0.000 deg" in repr(nearly_full)
 
 
 def test_a_tracker_that_learns_its_lens_has_the_same_axes_in_all_images() -> None:
@@ -385,6 +389,12 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
         StarTracker(camera="lens")  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match=r"settings\.lens: .* as CameraKnowledge\(\*\*accuracy\)"):
         StarTracker(camera=lens, settings=SolveSettings(lens={"centre": 0.1}))  # type: ignore[arg-type]
+    for name in ("focal_length", "centre", "distortion", "line_time", "psf_sigma"):
+        for value in (-1.0, math.nan, "0.1"):
+            text = re.escape(f"settings.lens.{name}: {value!r}: give a standard deviation of 0")
+            knowledge = replace(CameraKnowledge(), **{name: value})
+            with pytest.raises(ArgumentError, match=text):
+                StarTracker(camera=lens, settings=SolveSettings(lens=knowledge))
     with pytest.raises(ArgumentError, match=r"fov_error_deg: 2\.0: give `fov_deg` or `camera` too"):
         StarTracker(fov_error_deg=2.0)
     with pytest.raises(InputError, match=r"none\.index"):
