@@ -289,6 +289,8 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
 
 # Number of time bins for the fit of a vibration, and half of their total duration, in exposure times.
 _FINE_BINS, _RANGE = 512, 0.56
+# Highest frequency (cycles per exposure) that the time bins resolve, with two bins per cycle.
+_HIGHEST = _FINE_BINS / (4.0 * _RANGE)
 # Prior standard deviation (px) of a vibration, and of the errors of position, rate and acceleration.
 _USUAL, _LOOSE = 1.0, 10.0
 # Lowest frequency of a vibration, and step between trial frequencies, in cycles per exposure.
@@ -573,7 +575,7 @@ def _precisions(focal_length: float, sinusoids: int) -> FloatArray:
 
 def _strongest_frequency(sums: _RotationSums, known: Vibration, highest: float) -> float | None:
     """Return the frequency of the sinusoid that decreases chi-square most, or None if none is significant."""
-    grid = np.arange(_LOWEST, highest, _GRID)
+    grid = np.arange(_LOWEST, min(highest, _HIGHEST), _GRID)
     grid = grid[(np.abs(grid[:, None] - known.frequency) >= _LEAST_APART).all(axis=1)]
     if not len(grid):
         return None

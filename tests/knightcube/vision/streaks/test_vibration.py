@@ -298,6 +298,20 @@ def test_the_strongest_frequency_is_that_of_the_vibration() -> None:
     assert vibration._strongest_frequency(nothing, Vibration(), 9.0) is None
 
 
+def test_no_frequency_is_tried_that_the_time_bins_do_not_resolve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if the paths of the stars are extremely long, each cycle has at least two bins."""
+    tried: list[float] = []
+
+    def waves(frequency: FloatArray, time: FloatArray) -> FloatArray:
+        tried.extend(frequency.tolist())
+        return np.zeros((2 * len(frequency), len(time), 4))
+
+    monkeypatch.setattr(vibration, "_waves", waves)
+    sums = _sums(np.zeros((3, 20, 4)), 20)
+    assert vibration._strongest_frequency(sums, Vibration(), 1_000.0) is None
+    assert max(tried) == pytest.approx(vibration._FINE_BINS / (4.0 * vibration._RANGE), abs=vibration._GRID)
+
+
 def test_values_are_summed_from_one_index_to_the_next() -> None:
     values = np.arange(12.0).reshape(6, 2)
     found = vibration._sums_from(values, np.array([0, 2, 2, 5]))
