@@ -197,12 +197,14 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
 
 
 def _called(key: str, section: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function of a device; a mistake in a driver of another package is reported as ConfigError.
+    """Call a function of a device; an error in a driver of another package is raised as NotResponding.
 
     The key `key` of `section` names the driver.
     """
     named = getattr(section, "driver", None) or section.__struct_config__.tag
-    return call_named(key, named, function, *arguments) if ":" in named else function(*arguments)
+    if ":" in named:
+        return call_named(key, named, function, *arguments, device=True)
+    return function(*arguments)
 
 
 def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:

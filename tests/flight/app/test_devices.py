@@ -68,7 +68,7 @@ def test_a_voltage_that_no_drv8830_has_is_refused() -> None:
         devices.check_drv8830(cast(Any, SimpleNamespace(**section | {"supply_voltage": 6.0})))
 
 
-@pytest.mark.parametrize(("driver", "error"), [("mine:UNIT", ConfigError), ("vn100", AttributeError)])
+@pytest.mark.parametrize(("driver", "error"), [("mine:UNIT", NotResponding), ("vn100", AttributeError)])
 def test_a_mistake_in_the_configuration_of_a_foreign_unit_is_named(
     driver: str, error: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -78,12 +78,15 @@ def test_a_mistake_in_the_configuration_of_a_foreign_unit_is_named(
     found: dict[str, Any] = {"coils": Mock(), "inertial_unit": SimpleNamespace(configure=configure)}
     monkeypatch.setattr(devices, "opened", lambda kind, *_: found.get(kind))
     sections = {name: SimpleNamespace(driver="pca9685") for name in ("coils", "magnetometer")}
-    config = SimpleNamespace(**sections, inertial_unit=SimpleNamespace(driver=driver))
+    config = SimpleNamespace(
+        **sections, inertial_unit=SimpleNamespace(driver=driver), camera=None, power=None, wide_cameras=()
+    )
     with pytest.raises(error, match=r"no attribute 'wire'") as caught:
         devices.open_devices(cast(Any, config), Mock(), Mock(), patient=False)
-    if error is ConfigError:
+    if error is NotResponding:
         assert "'mine:UNIT', whose function `configure` failed" in str(caught.value)
-    found["coils"].start.assert_called_once_with(False)
+        devices.open_devices(cast(Any, config), Mock(cameras=[None]), Mock(), patient=True)
+    found["coils"].start.assert_any_call(False)
 
 
 def test_a_mistake_in_a_foreign_camera_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,5 +94,5 @@ def test_a_mistake_in_a_foreign_camera_is_named(monkeypatch: pytest.MonkeyPatch)
     device.open.side_effect = ImportError("no module `sdk`")
     monkeypatch.setattr(devices, "driver_of", lambda *_: Mock(open=lambda *_: device))
     camera = SimpleNamespace(device=SimpleNamespace(driver="mine:CAMERA"))
-    with pytest.raises(ConfigError, match=r"'mine:CAMERA'.*no module `sdk`"):
+    with pytest.raises(NotResponding, match=r"'mine:CAMERA'.*no module `sdk`"):
         devices.open_camera(cast(Any, camera), Mock(), Mock())
