@@ -297,9 +297,10 @@ class FieldRate:
             return
         (_, first), (span_a, middle), (span_b, last) = self._waiting
         self._waiting.pop(0)
-        if min(span_a, span_b) <= 0.0:
+        square = float(last @ last)
+        if min(span_a, span_b) <= 0.0 or square == 0.0:  # a field of zero is that of a failed sensor
             return
-        strength = math.sqrt(float(last @ last))
+        strength = math.sqrt(square)
         noise = settings.gate_sigma * math.sqrt(2.0) * settings.field_sigma
         if max(abs(math.sqrt(float(b @ b)) - strength) for b in (first, middle)) > noise:
             return
@@ -309,7 +310,6 @@ class FieldRate:
             return
         span = span_a + span_b
         rate = 0.5 * (rates[0] + rates[1])
-        square = float(last @ last)
         self._rate, self._field, self._change = _floats(rate), _floats(last), _NONE
         along = np.outer(last, last) / square
         across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span

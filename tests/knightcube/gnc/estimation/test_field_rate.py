@@ -135,6 +135,16 @@ def test_two_samples_too_far_apart_start_nothing() -> None:
     assert not found.started
 
 
+def test_a_sensor_that_measures_zero_starts_nothing_until_it_measures_a_field() -> None:
+    found = FieldRate(settings())
+    for field in (np.zeros(3), FIELD):
+        assert not found.started
+        for _ in range(5):
+            found.advance(np.zeros(3), 0.2)
+            assert found.measure(field)
+    assert found.started
+
+
 def test_the_compiled_step_equals_the_plain_step() -> None:
     inertia = ((1.1e-3, 1e-5, 0.0), (1e-5, 1.05e-3, 2e-5), (0.0, 2e-5, 0.99e-3))
     inverse = ((910.0, -9.0, 0.2), (-9.0, 950.0, -19.0), (0.2, -19.0, 1010.0))

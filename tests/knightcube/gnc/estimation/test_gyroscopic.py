@@ -11,6 +11,7 @@ from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
     gyroscopic_coefficients,
+    inertia_covariance,
     rate_products,
 )
 
@@ -62,3 +63,11 @@ def test_the_modes_of_a_better_known_body_are_smaller() -> None:
         for size in (0.08, 0.008)
     )
     assert wide == pytest.approx(10.0 * narrow, rel=0.2)
+
+
+def test_a_flat_body_with_known_moments_has_a_finite_prior() -> None:
+    """The largest moment of a flat plate is the sum of the other two."""
+    plate = np.diag([1.0e-3, 1.3e-3, 2.3e-3])
+    found = inertia_covariance(plate, BodyErrors(moments=0.0))
+    assert np.isfinite(found).all()
+    assert np.abs(inertia_covariance(plate, BodyErrors(moments=0.0, axes=0.0))).max() < 1e-12
