@@ -193,6 +193,10 @@ def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
         ({"across_axis": (0.0, NAN, 0.0)}, "across_axis: .*nan.* give finite numbers"),
         ({"across_axis": (0.0, 0.0, 3.0)}, "across_axis: .* must not be parallel to pointing_axis"),
         ({"camera_axis": (0.0, 1.0)}, r"camera_axis: an array of shape \(2,\)"),
+        (
+            {"inertia": [11.0, 10.5, 9.9]},
+            r"600 s needs 249 times the dipole limit: check that inertia is in kg m\^2 and the dipole",
+        ),
         ({"elements": SLEW["elements"][0]}, "elements: '1 99999U.* give the two lines"),
         ({"time": "2026-03-20"}, "time: '2026-03-20': give a datetime"),
     ],

@@ -190,7 +190,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     If `near`, the path of a similar task with the same duration, is given, the search starts from this path.
     """
     check(task)
-    tried = 0
+    tried, least = 0, math.inf
     if near is not None:
         plan = plan_near(task, near)
         if plan is not None:
@@ -200,8 +200,8 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
         plan = _first(task, search, search.paths())
         if plan is not None:
             return plan
-        tried += search.tried
-    raise PlanningError(refusal(task, tried))
+        tried, least = tried + search.tried, min(least, search.least)
+    raise PlanningError(refusal(task, tried, least))
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
@@ -259,8 +259,11 @@ def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
     return plan.peak <= _OVER and not _depths(task, plan.path).any()
 
 
-def refusal(task: SlewTask, tried: int) -> str:
-    """Return the error message for a task without a path, with possible remedies."""
+def refusal(task: SlewTask, tried: int, least: float = math.inf) -> str:
+    """Return the error message for a task without a path, with possible remedies.
+
+    The argument `least` is the attribute of the search with this name.
+    """
     text = f"no slew within the dipole limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
     ends = np.linspace(task.horizon, task.longest, _ENDS)
@@ -271,6 +274,12 @@ def refusal(task: SlewTask, tried: int) -> str:
         text += f"; {share} of these, from {first:.0f} s on, end in the exclusion cone of the {cone.name}"
         if share == "all":
             return f"{text}: choose another goal or time, or a smaller cone"
+    # The dipole of a slew is about inversely proportional to the squared duration.
+    if 1.0 < least * (task.horizon / task.longest) ** 2 < math.inf:
+        return (
+            f"{text}: without the limit, a slew of {task.horizon:g} s needs {least:.3g} times the dipole "
+            "limit: check that inertia is in kg m^2 and the dipole limit in A m^2, or allow a longer time"
+        )
     return f"{text}: allow a longer time or another start"
 
 

@@ -586,7 +586,12 @@ _WIDENED = 4
 
 
 class SlewSearch:
-    """The search for the path of one slew task. The attribute `tried` counts the initial guesses."""
+    """The search for the path of one slew task.
+
+    The attribute `tried` counts the initial guesses. The attribute `least` is the smallest ratio of the peak
+    dipole to the dipole limit among the paths of the requested duration that were found without the dipole
+    limit, or infinity without such a path.
+    """
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
         """Create a search with guesses on `coarse` intervals that ends when the work exceeds `budget`."""
@@ -597,7 +602,7 @@ class SlewSearch:
         self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
         self._known: list[float] = []  # heats (J) of the tried paths without the dipole limit
-        self.tried = 0
+        self.tried, self.least = 0, math.inf
 
     def paths(self) -> Iterator[SolvedPath]:
         """Yield paths that satisfy all limits at nodes and midpoints, the best path first."""
@@ -606,6 +611,8 @@ class SlewSearch:
             relaxed: list[SolvedPath] = []
             for batch in batches:
                 relaxed += batch
+                asked = [found for found in batch if found.horizon == self._task.horizon]
+                self.least = min([self.least, *map(self.solver.peak, asked)])
                 if time_cost is None:
                     yield from self._tried(self._cheapest(batch))
                 elif (found := self._walker.shortened(batch, HORIZON_RANGE[0], time_cost)) is not None:
