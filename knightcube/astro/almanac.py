@@ -323,10 +323,13 @@ def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> 
         times: times in UTC, or with a time zone.
 
     Raises:
+        ArgumentError: if `times` is a single time or contains anything but times.
         UsageError: if the lines are not a two-line element set or do not describe an orbit.
         OrbitError: if a time is too far from the epoch of the elements, or if SGP4 fails at a time, for
             example because the orbit has decayed.
     """
+    if isinstance(times, datetime):
+        raise ArgumentError("times", f"{times!r}: give a sequence of times, such as [time]")
     satellite = elements_of(elements)
     states = [satellite.known_at(julian_date(time)) for time in times]
     position = np.array([state.position for state in states]).reshape(-1, 3)

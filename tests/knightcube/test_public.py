@@ -221,6 +221,7 @@ SLEW: dict[str, Any] = {
             lambda: LIB.find_nadir(IMAGE, CAMERA, hidden=0.5 * IMAGE),
             "hidden: pixels of float64: give",
         ),
+        (lambda: LIB.HorizonKnowledge(position=[7e6, None, 0]), "position: .*: give finite numbers"),
         (lambda: LIB.HorizonKnowledge(sun=[0, 0, 0]), "sun: .* whose length is not zero"),
         (lambda: LIB.HorizonKnowledge(pole=[0, 0, 0]), "pole: .* whose length is not zero"),
         (lambda: LIB.HorizonKnowledge(attitude=[0, 0, 0, 1]), "attitude: .* RoughAttitude"),
@@ -234,6 +235,7 @@ SLEW: dict[str, Any] = {
             lambda: LIB.plan_step(None, start_angle=0, end_angle=1, horizon=9),
             "plant: None: .*AxisPlant",
         ),
+        (lambda: LIB.propagate_elements(("", ""), datetime(2026, 3, 20)), "times: .* such as"),
         (lambda: LIB.plan_slew(**SLEW, cones=["sun"]), r"cones: \['sun'\]: .* Mapping"),
         (lambda: LIB.calibrate_lens([]), "images: no image"),
         (
@@ -272,10 +274,23 @@ def test_vectors_can_be_lists_for_type_checkers_too() -> None:
     assert not detect_objects(IMAGE, CAMERA, [0, 0, 0.1], 1.0)
 
 
+def test_numbers_of_a_target_and_times_of_a_path_can_be_lists() -> None:
+    """A target with a list equals the target with a tuple, and does not change with the list."""
+    numbers = [0.0, 0.0, 0.0, 1.0]
+    target = LIB.PointingTarget(Goal.INERTIAL, numbers)
+    numbers[0] = 9.0
+    assert target == PointingTarget(Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0))
+    path = LIB.plan_step(PLANT, start_angle=0.0, end_angle=0.5, horizon=15.0).path
+    np.testing.assert_array_equal(path.motion([0.0, 20.0]), path.motion(np.array([0.0, 20.0])))
+    assert path.motion([0.0, 20.0])[0] == pytest.approx([0.0, 0.5])
+
+
 def test_prior_directions_can_be_lists() -> None:
     sensed = SensedDirection([1, 0, 0], (0, 1, 0), 0.1)
     known = LIB.HorizonKnowledge(altitude=5e5, attitude=RoughAttitude([0, 0, 0, 1], 0.1), sensed=(sensed,))
     assert not find_nadir(IMAGE, CAMERA, known)
+    located = LIB.HorizonKnowledge(position=[7e6, 0, 0], sun=(0, 1, 0), pole=[0, 0, 1])
+    assert all(isinstance(vector, np.ndarray) for vector in (located.position, located.sun, located.pole))
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.int64])

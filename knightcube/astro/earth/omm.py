@@ -232,13 +232,14 @@ def _epoch(text: str, where: str) -> datetime:
                 raise ValueError(day)
         else:
             found = datetime.fromisoformat(plain)
+        utc = found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
     except (ValueError, OverflowError) as error:
         raise UsageError(
             f"{where}: EPOCH is {text!r}, but must have the form 2026-11-16T12:25:40.104192"
         ) from error
-    if not _YEARS[0] <= found.year <= _YEARS[1]:
+    if not _YEARS[0] <= utc.year <= _YEARS[1]:
         raise UsageError(f"{where}: EPOCH {text!r} must be in the years {_YEARS[0]} to {_YEARS[1]}")
-    return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+    return utc
 
 
 def _text(message: Mapping[str, object], key: str) -> str:

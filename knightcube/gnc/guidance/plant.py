@@ -391,6 +391,7 @@ class PolynomialPath:
 
     def motion(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return angle, rate and acceleration (n,) at `times` (n,), s after the start; NaN where |q2| > 1."""
+        times = np.asarray(times, dtype=float)
         coasted = self.end_angle + self.end_rate * (times - self.horizon)
         farthest = max(FARTHEST, abs(self.end_angle))
         angle = np.clip(coasted, -farthest, farthest)

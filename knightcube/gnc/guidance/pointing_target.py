@@ -89,6 +89,10 @@ class PointingTarget:
                 f"the goal of a pointing target is {self.goal!r}: give one of "
                 + ", ".join(f"Goal.{goal.name}" for goal in Goal)
             )
+        try:  # a list or an array could be changed later
+            object.__setattr__(self, "numbers", tuple(map(float, self.numbers)))
+        except (TypeError, ValueError):
+            raise UsageError(f"{self.goal.label}: {self.numbers!r} are not a sequence of numbers") from None
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))

@@ -373,6 +373,6 @@ def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: Fl
     dark = beyond | (within & (sine < -math.sin(_TWILIGHT + _MARGIN)))
     if mostly(~look.bright[lit]):
         return "the image is dark where the sunlit Earth should be"
-    if float((look.rays @ sun).max()) < math.cos(_STRAY_LIGHT) and mostly(look.bright[dark]):
+    if mostly(look.bright[dark]) and float((look.rays @ sun).max()) < math.cos(_STRAY_LIGHT):
         return "the image is bright where only sky or night should be"
     return ""

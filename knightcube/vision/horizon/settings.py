@@ -104,9 +104,8 @@ class HorizonKnowledge:
 
     def __post_init__(self) -> None:
         for name in ("position", "sun", "pole"):
-            value = getattr(self, name)
-            if value is not None and (np.shape(value) != (3,) or not np.all(np.isfinite(value))):
-                raise ArgumentError(name, f"{value}: give (3,) finite numbers")
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, finite_array(name, value, (3,)))
         for name in ("sun", "pole"):
             if (value := getattr(self, name)) is not None:
                 unit_vector(name, value)

@@ -160,6 +160,7 @@ def test_one_number_may_be_padded_by_blanks_and_by_zeros() -> None:
         ("MEAN_ELEMENT_THEORY", "SGP4-XP", "MEAN_ELEMENT_THEORY is 'SGP4-XP', but must be SGP4"),
         ("EPOCH", "2026-02-30T00:00:00", "EPOCH is '2026-02-30T00:00:00', but must have the form"),
         ("EPOCH", "2025-366T00:00:00", "EPOCH is '2025-366T00:00:00', but must have the form"),
+        ("EPOCH", "2056-12-31T23:00:00-05:00", "must be in the years 1957 to 2056"),
         ("EPOCH", "2126-02-20T00:00:00", "EPOCH '2126-02-20T00:00:00' must be in the years 1957 to 2056"),
     ],
 )

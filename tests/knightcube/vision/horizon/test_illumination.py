@@ -286,3 +286,9 @@ def test_space_is_dark_and_has_no_texture_beyond_the_noise(
     found = why_not_space(assumed, None, samples, 1e-4)
     assert (found == "") == (complaint == "")
     assert complaint in found
+
+
+def test_an_image_that_the_structure_hides_contradicts_nothing() -> None:
+    hidden = np.ones((CAMERA.lens.rows, CAMERA.lens.columns), dtype=bool)
+    look = image_brightness(np.full(hidden.shape, 200), CAMERA, SUNLIT_COUNTS, hidden)
+    assert why_false(look, DOWN, ALTITUDE, -DOWN) == ""
