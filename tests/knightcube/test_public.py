@@ -70,8 +70,8 @@ def test_a_type_checker_knows_all_public_names_and_no_other_name(tmp_path: Path)
         "from knightcube import *\n" + "\n".join(LIB.__all__) + "\nfrom knightcube import StarTrackr\n",
         encoding="utf-8",
     )
-    options = "--strict", "--follow-imports=skip", "--cache-dir", tmp_path / "cache"
-    command = [sys.executable, "-m", "mypy", *options, program, knightcube.__file__]
+    options = "--strict", "--follow-imports=skip", f"--cache-dir={tmp_path}"
+    command = [sys.executable, "-m", "mypy", *options, str(program), knightcube.__file__]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     errors = re.findall(': error: (Module "knightcube" has no attribute "StarTrackr")?', done.stdout)
     assert len(errors) == 1, done.stdout + done.stderr

@@ -339,6 +339,9 @@ class Guesses:
     def energy(self, found: Any) -> float:
         return {"a": 1.0, "b": 2.0, "c": 3.0, "late": 0.5}[found.guess]
 
+    def peak(self, found: Any) -> float:
+        return 10.0 * self.energy(found)
+
 
 def searched(
     solver: Guesses, names: list[str], monkeypatch: pytest.MonkeyPatch, **changes: Any
@@ -386,6 +389,7 @@ def test_of_three_paths_the_cheapest_is_tried_and_the_next_ones_later(
     search, found = searched(solver, ["c", "a", "b", "b"], monkeypatch)
     assert found == [("a", 240.0), ("b", 240.0)]
     assert search.tried == 4
+    assert search.least == 10.0
 
 
 def test_after_many_steps_without_a_path_the_remaining_guesses_are_deferred(
