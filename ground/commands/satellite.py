@@ -390,7 +390,7 @@ def _ask_by_link(
                 table = ParameterTable.of(row)
             elif kind is VERIFICATION:
                 report = report_of(data)
-                if (report.counter, report.spi) == (counter, options.spi):
+                if report is not None and (report.counter, report.spi) == (counter, options.spi):
                     if report.stage.final or (report.stage is Stage.REPEATED and not reported):
                         refused = "" if report.stage is Stage.COMPLETED else explained(report)
                     reported = True

@@ -245,7 +245,7 @@ class LinkFeed:
             self._received = time.monotonic()
         for row in scan(b"".join(live)).packets[VERIFICATION.name]:
             report = report_of(row.tobytes())
-            if report.spi == _SPI:
+            if report is not None and report.spi == _SPI:
                 earlier = self._reports.setdefault(report.counter, [])
                 if report.stage is not Stage.REPEATED or not earlier:
                     earlier.append(report)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.link.events import Severity
-from flight.link.telemetry.packets import PacketArray, to_text
-from ground.telemetry import Run
+from flight.link.telemetry.packets import PacketArray
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -133,7 +133,7 @@ def reported_problems(run: Run) -> list[str]:
     events = events[events["severity"] >= Severity.WARNING]
     names, first, counts = np.unique(events["name"], return_index=True, return_counts=True)
     return [
-        f"{to_text(names[k])} ({counts[k]}): {to_text(events['text'][first[k]])}"
+        f"{text_of(names[k])} ({counts[k]}): {text_of(events['text'][first[k]])}"
         for k in np.argsort(first).tolist()
     ]
 

@@ -37,7 +37,7 @@ from flight.link.security import (
 )
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.log import SUFFIX
-from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
+from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, row_of
 from flight.schema.document import config_path
 from flight.schema.reader import load
 from flight.schema.sections import Link
@@ -63,7 +63,7 @@ _REPEAT_NS = 5_000_000_000  # time (ns) after which an unanswered command is sen
 _HIGHEST_PORT = 65535
 _BURST_S = 0.05  # longest time (s) over which unused transmission capacity accumulates
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
-_TRANSFER = LAYOUTS[TRANSFER.name]
+_TRANSFER = LAYOUTS[TRANSFER.name].identifier.to_bytes(2, "big")
 
 
 def flight_address(to: str) -> str | tuple[str, int]:
@@ -378,14 +378,16 @@ class FileSession:
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
                 # If a counter was used before, the command is sent again with a higher counter.
-                own = report.spi == self._spi and report.counter in self._counters
-                if own and report.stage is not Stage.REPEATED:
+                if report is None or report.spi != self._spi or report.counter not in self._counters:
+                    continue
+                if report.stage is not Stage.REPEATED:
                     if report.stage is not Stage.ACCEPTED:
                         self._asked = None
                     self._reports.append(report)
-            elif packet[:2] == _TRANSFER.identifier.to_bytes(2, "big"):
-                (row,) = _TRANSFER.array(packet)
-                self._texts[int(row["source"]), int(row["number"])] = text_of(row["text"])
+            elif packet[:2] == _TRANSFER:
+                row = row_of(TRANSFER, packet)
+                if row is not None:
+                    self._texts[int(row["source"]), int(row["number"])] = text_of(row["text"])
 
     def transmit(self, now_ns: int) -> None:
         """Send the commands and PDUs that are due, within the rate limit. Raises KnightCubeError."""

@@ -269,7 +269,7 @@ class Gateway:
     def _hand_over(self, packet: bytes) -> None:
         if packet[:2] == _VERIFIED:
             report = report_of(packet)
-            if report.spi == _SPI and report.counter in self._own:
+            if report is not None and report.spi == _SPI and report.counter in self._own:
                 return  # a report on one of the gateway's own pings
         self.down += 1
         for line, connection in list(self._connections.items()):

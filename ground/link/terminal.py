@@ -23,7 +23,7 @@ from flight.link.process.directives import portions
 from flight.link.process.downlink import LIVE
 from flight.link.process.station import host_port
 from flight.link.telemetry.definitions import LINK, VERIFICATION
-from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, row_of
 from flight.schema.sections import Link, LinkCoding
 from ground.telemetry import text_of
 from knightcube.errors import KnightCubeError, UsageError, reason_of
@@ -213,6 +213,8 @@ class Terminal:
             if packet[:2] != _VERIFICATION:
                 continue
             found = report_of(packet)
+            if found is None:
+                continue
             repeated = found.stage is Stage.REPEATED
             if (found.counter, found.spi) == (counter, spi) and not (repeated and reported):
                 yield found
@@ -246,8 +248,10 @@ class Terminal:
 
         The stored counters are behind if the folder of keys is an older copy.
         """
+        row = row_of(LINK, packet)
+        if row is None:  # the counters in a packet of another version are not known
+            return
         self._learned = True
-        (row,) = LAYOUTS[LINK.name].array(packet)
         self.lost_spis = tuple(
             spi
             for spi, highest in zip(security.COMMAND_SPIS, row["highest"], strict=False)
@@ -265,10 +269,15 @@ class Terminal:
         return header, protected
 
 
-def report_of(packet: bytes) -> Report:
-    """Return the report in a verification packet."""
-    (row,) = LAYOUTS[VERIFICATION.name].array(packet)
-    stage = Stage(int(row["stage"]))
+def report_of(packet: bytes) -> Report | None:
+    """Return the report in a verification packet, or None for a version or stage of other software."""
+    row = row_of(VERIFICATION, packet)
+    if row is None:
+        return None
+    try:
+        stage = Stage(int(row["stage"]))
+    except ValueError:
+        return None
     name, text = text_of(row["name"]), text_of(row["text"])
     request = Request(int(row["packet"]), int(row["sequence"]))
     return Report(int(row["spi"]), int(row["counter"]), stage, name, text, request)

@@ -150,8 +150,8 @@ def _cycle_times(signals: RunSignals) -> Figure | None:
     axes = figure.subplots(2 if len(jobs) else 1, 1, squeeze=False)[:, 0]
     cycle = {name: timing[name].astype(float) for name in ("lateness", "execution")}
     identity = signals.run["run"]
-    period = float(identity["control_period_ns"][0]) * 1e-9 if len(identity) else None
-    panels.exceedance(axes[0], cycle, "Control cycles", period)
+    period = float(identity["control_period_ns"][0]) * 1e-9 if len(identity) else 0.0
+    panels.exceedance(axes[0], cycle, "Control cycles", period or None)
     if len(jobs):
         names = np.array([text_of(name) for name in jobs["name"]], dtype=object)
         work = {str(name): jobs["execution"][names == name].astype(float) for name in sorted(set(names))}
@@ -318,7 +318,7 @@ def _detumbling_rate(ax: Axes, run: Run) -> None:
         ax.semilogy(at, found, ".", color=panels.ORANGE, markersize=5, label="from the magnetometer alone")
     label = "gyro" if source == "imu" else source
     ax.semilogy(time, np.degrees(speed), color=panels.BLUE, linewidth=1.2, label=label, zorder=3)
-    periods = orbit.detumbling_periods(run, float(time[-1]) if len(time) else 0.0)
+    periods = orbit.detumbling_periods(run, float((time if len(time) else seconds(run["spin"]))[-1]))
     for k, (begin, stop, _) in enumerate(periods):
         label = "" if k else "detumbling"
         ax.axvspan(begin, stop, color=panels.GREY, alpha=0.12, linewidth=0, label=label)

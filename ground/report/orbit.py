@@ -49,9 +49,12 @@ def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
 
 
 def body_speeds(run: Run) -> tuple[FloatArray, FloatArray, str]:
-    """Return times (n,), s, rotation speeds (n,), rad/s, and their source, "truth" or "imu"."""
+    """Return times (n,), s, rotation speeds (n,), rad/s, and their source, "truth" or "imu".
+
+    Readings without a valid rate are omitted.
+    """
     name = "truth" if len(run["truth"]) else "imu"
-    packets = run[name]
+    packets = run[name][np.isfinite(run[name]["rate"]).all(axis=1)]
     return seconds(packets), np.linalg.norm(packets["rate"].astype(float), axis=1), name
 
 

@@ -338,6 +338,17 @@ def test_results_of_another_configuration_are_measured_again(
     assert "unknown" not in scripted.report()["steps"]
 
 
+def test_a_step_that_was_repeated_without_arrays_has_no_arrays_of_the_earlier_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = Outcome([], VALUES["rest"], {}, {"allan": np.arange(3)})
+    Scripted(monkeypatch, tmp_path, find=ANSWERS, rest=measured).run("--only", "find", "--only", "rest")
+    scripted = Scripted(monkeypatch, tmp_path, rest=Outcome([FAULT], {"samples": 0}))
+    scripted.run("--only", "rest")
+    scripted.run("--only", "axes")
+    assert scripted.pictures[-1][1]["rest"].arrays == {}
+
+
 @pytest.mark.parametrize("size", [0, 100])
 def test_damaged_arrays_of_a_step_are_refused_as_a_damaged_report(
     size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -13,11 +13,12 @@ import pytest
 from scipy.stats import chi2
 
 from ground.identification.fit import excitation_config, fit, noise_of
-from ground.identification.record import IdentificationError, Record, read_record
+from ground.identification.record import IdentificationError, Record, read_record, reported_problems
 from ground.telemetry import Run, ScanResult
 from knightcube.errors import UsageError
 from tests.ground.identification.worlds import World, believed, fly_stack, motion_error
 from tests.support import flights
+from tests.support.packed_run import packed_run
 
 WORLD = World(inertia=1.15e-3, dipole=0.62, field=4.2e-4, stiffness=1.6e-5, damping=3.0e-6, bias=1e-4, seed=9)
 
@@ -126,6 +127,11 @@ def test_the_field_is_taken_only_while_the_coils_are_off(short: Run) -> None:
     always_on = control["current_written"].copy()
     always_on[:, 0] = 0.05
     assert recorded(altered(short, "control", current_written=always_on)).field is None
+
+
+def test_a_text_in_the_log_does_not_control_the_terminal() -> None:
+    run = packed_run(event=[(1.0, {"severity": 2, "name": "coil-fault", "text": "gone\x1b[2J"})])
+    assert reported_problems(run) == ["coil-fault (1): gone\\x1b[2J"]
 
 
 def test_another_coil_and_a_flight_too_short_are_refused(short: Run) -> None:

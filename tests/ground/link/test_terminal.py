@@ -14,12 +14,19 @@ from typing import Any
 
 import pytest
 
-from flight.link.frames import TELECOMMAND_MASK
+from flight.link.frames import (
+    TELECOMMAND_MASK,
+    TELEMETRY_HEADER,
+    TELEMETRY_MASK,
+    MasterCount,
+    TelemetryFramer,
+)
 from flight.link.process.commanding import Stage
+from flight.link.process.downlink import LIVE
 from flight.link.process.station import parser_of
-from flight.link.security import COMMAND_SPIS, Gate, Vault
-from flight.link.telemetry.definitions import HEALTH, VERIFICATION
-from flight.link.telemetry.packets import Packer
+from flight.link.security import COMMAND_SPIS, OVERHEAD_BYTES, Gate, Sealer, Vault
+from flight.link.telemetry.definitions import HEALTH, LINK, VERIFICATION
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, crc16
 from ground.link import terminal as terminal_module
 from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, make_keys, open_terminal, report_of
 from knightcube.errors import KnightCubeError, UsageError
@@ -178,6 +185,7 @@ def report(counter: int, spi: int, stage: Stage, text: str = "") -> bytes:
 
 def test_a_report_has_the_fields_of_its_packet() -> None:
     found = report_of(report(5, 2, Stage.REFUSED, "too far"))
+    assert found is not None
     assert (found.spi, found.counter, found.stage, found.name, found.text) == (
         2,
         5,
@@ -186,6 +194,39 @@ def test_a_report_has_the_fields_of_its_packet() -> None:
         "too far",
     )
     assert (found.request.packet, found.request.sequence) == (0x1A01, 6)
+
+
+def of_version(packet: bytes, version: int, more: bytes) -> bytes:
+    """Return a packet whose definition has another version and further bytes."""
+    body = packet[:4] + (len(packet) + len(more) - 7).to_bytes(2, "big") + bytes([version]) + packet[7:-2]
+    body += more
+    return body + crc16(body).to_bytes(2, "big")
+
+
+def test_reports_and_counters_of_newer_software_do_not_end_the_reading(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    newer = bytearray(report(5, 1, Stage.STARTED, "queued"))
+    newer[LAYOUTS[VERIFICATION.name].offsets["stage"]] = 99
+    newer[-2:] = crc16(bytes(newer[:-2])).to_bytes(2, "big")
+    link: dict[str, Any] = {field.name: 0 for field in LINK.fields}
+    link |= {"highest": [0] * 2, "generation": [0] * 4, "copies": [0] * 4}
+    old = Packer().pack(LINK, 0, link), report(5, 1, Stage.STARTED)
+    sent = [bytes(newer), *(of_version(one, 9, b"more") for one in old), report(5, 1, Stage.COMPLETED)]
+    settings = TerminalSettings()
+    sealer = Sealer(Vault(keys.parent / "satellite"), 3, TELEMETRY_MASK, encrypted=settings.encrypted)
+    room = settings.frame_bytes - TELEMETRY_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
+    framer = TelemetryFramer(
+        settings.spacecraft, LIVE, room, MasterCount(), lambda header, data: sealer.seal(header, data)[0]
+    )
+    frames = [frame for packet in sent for frame in framer.add(packet)] + framer.flush()
+    line = SharedLine()
+    monkeypatch.setattr(line, "receive", lambda: frames)
+    terminal = Terminal(line, Vault(keys), settings)
+    taken = list(terminal.take())
+    assert [packet for _, packet in taken if packet in sent] == sent
+    monkeypatch.setattr(terminal, "packets", lambda seconds: iter(taken))
+    assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.COMPLETED]
 
 
 def test_frames_that_exceed_the_output_buffer_of_a_serial_line_wait_until_they_are_sent(keys: Path) -> None:

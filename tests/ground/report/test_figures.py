@@ -17,13 +17,14 @@ from ground.telemetry import read_run
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.vmc import plan
 from tests.ground.report.synthetic import CURRENT, Recipe, make_run
+from tests.support.packed_run import packed_run
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from ground.report import panels
-from ground.report.figures import path_figure
+from ground.report.figures import path_figure, spin_figure
 from ground.report.panels import RunSignals, planned_path
 
 EVERY = ["attitude", "current", "power", "paths", "cycle_times", "rate", "overview"]
@@ -33,6 +34,14 @@ ROOT = Path(__file__).resolve().parents[3]
 def is_drawn(path: Path) -> bool:
     """Return whether a plot has pixels that are not white."""
     return bool(imread(path)[..., :3].std() > 0.01)
+
+
+def test_detumbling_without_a_valid_gyro_rate_is_drawn_until_the_last_rate_of_the_magnetometer() -> None:
+    spin = [(float(second), {"rate": [0.1, 0.0, 0.0], "known": 1}) for second in range(4)]
+    readings = [(float(second), {"rate": [np.nan] * 3}) for second in range(4)]
+    figure = spin_figure(RunSignals(packed_run(spin=spin, imu=readings, mode=[(1.0, {"mode": 2})])))
+    assert figure is not None
+    assert figure.axes[0].get_xlim() == pytest.approx((0.6, 3.4))
 
 
 @pytest.mark.parametrize(

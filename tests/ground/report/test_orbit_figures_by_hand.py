@@ -81,6 +81,18 @@ def test_detumbling_has_the_rates_of_its_period_and_the_error_of_the_magnetomete
     assert math.isnan(alone["periods"][0]["largest_rate_rad_s"])
 
 
+def test_readings_without_a_rate_do_not_hide_the_rates_of_a_detumbling() -> None:
+    """A gyro that fails during detumbling sends NaN."""
+    spin = [(float(second), {"rate": [0.1, 0.0, 0.0], "known": 1}) for second in range(4)]
+    rates = (math.nan, 0.2, 0.1, math.nan)
+    readings = [(float(second), {"rate": [rate, 0.0, 0.0]}) for second, rate in enumerate(rates)]
+    mode = [(0.0, {"mode": Mode.DETUMBLE})]
+    found = orbit.detumbling(packed_run(spin=spin, imu=readings, mode=mode))
+    assert found is not None
+    (period,) = found["periods"]
+    assert [period[f"{name}_rate_rad_s"] for name in ("first", "largest", "last")] == [0.2, 0.2, 0.1]
+
+
 def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
     """Attitude errors count while the attitude is fine, and shortly after star fixes.
 

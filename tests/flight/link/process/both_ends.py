@@ -195,7 +195,7 @@ class BothEnds:
 
     def reports(self) -> list[Report]:
         """Return all received reports."""
-        return [report_of(packet) for packet in self.of(VERIFICATION.name)]
+        return list(filter(None, map(report_of, self.of(VERIFICATION.name))))
 
     def of(self, name: str) -> list[bytes]:
         """Return the received packets with a name."""
