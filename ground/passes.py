@@ -152,7 +152,7 @@ def read_stations(path: Path) -> tuple[Station, ...]:
 
     Raises ConfigError for a file that cannot be read, and for a wrong value.
     """
-    return convert(read_document(read_text(path), str(path)), _Stations).stations
+    return convert(read_document(read_text(path, packaged=False), str(path)), _Stations).stations
 
 
 def station_of(text: str) -> Station:

@@ -255,13 +255,17 @@ def config_path(text: str) -> Path:
     return packaged if re.fullmatch(r"\w+", text) and packaged.is_file() else Path(text)
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a configuration file of at most 1 MiB. Raises ConfigError."""
+def read_text(path: Path, packaged: bool = True) -> str:
+    """Return the text of a configuration file of at most 1 MiB. Raises ConfigError.
+
+    If `packaged` is true, the message about a missing file lists the packaged configurations.
+    """
     try:
         with path.open(encoding="utf-8") as file:
             text = file.read(_LONGEST + 1)  # a device may have no end
     except FileNotFoundError as error:
-        raise UnreadConfigError(str(path), f"cannot be read: {no_such_file()}") from error
+        missing = no_such_file() if packaged else "no such file; check the path"
+        raise UnreadConfigError(str(path), f"cannot be read: {missing}") from error
     except OSError as error:
         raise UnreadConfigError(str(path), f"cannot be read: {error}") from error
     except UnicodeDecodeError as error:

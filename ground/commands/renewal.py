@@ -323,7 +323,7 @@ def _release_version(kind: str, source: Path) -> int:
     """Return a release's version as one number, 10203 for 1.2.3. Raises UsageError if no version is found."""
     if kind != "release":
         raise UsageError(f"{kind}: give its version with --version N")
-    text = read_text(source / "pyproject.toml")
+    text = read_text(source / "pyproject.toml", packaged=False)
     found = re.search(r'^version = "(\d+)\.(\d\d?)\.(\d\d?)"$', text, re.MULTILINE)
     if found is None:
         raise UsageError(f"{source}/pyproject.toml: has no version such as 1.2.3: give --version N")

@@ -432,7 +432,7 @@ def _change(text: str) -> tuple[str, float]:
 
 def _parameters_in(path: Path) -> dict[str, float]:
     """Return the parameter table in a YAML file. Raises ConfigError or UsageError if the file is invalid."""
-    document = read_document(read_text(path), str(path))
+    document = read_document(read_text(path, packaged=False), str(path))
     values: dict[str, float] = {}
     for section, entries in document.values.items():
         if not isinstance(entries, dict):

@@ -209,3 +209,9 @@ def test_a_wrong_file_of_stations_names_file_and_key(tmp_path: Path) -> None:
     file.write_text("stations:\n  - {name: Berlin, latitude_deg: 52.5, longitude_deg: 13.4, hight: 40}\n")
     with pytest.raises(UsageError, match=r"stations.yaml:2: .*hight"):
         read_stations(file)
+
+
+def test_a_missing_file_of_stations_is_not_taken_for_a_configuration(tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as found:
+        read_stations(tmp_path / "stations.yaml")
+    assert str(found.value).endswith("stations.yaml: cannot be read: no such file; check the path")
