@@ -348,12 +348,17 @@ class PlainLines:
 
     def feed(self, packets: Mapping[str, PacketArray]) -> None:
         """Process new packets in the order of their times, and write their lines."""
-        slots = {}
+        ordered = {}
         for name, rows in packets.items():
             seconds = np.clip(rows["time_ns"] * 1e-9, -_MAX_TIME, _MAX_TIME)
-            slots[name] = np.floor(seconds / self._every).astype(np.int64)
-        for slot in sorted(set().union(*(found.tolist() for found in slots.values()))):
-            inside = {name: rows[slots[name] == slot] for name, rows in packets.items()}
+            slots = np.floor(seconds / self._every).astype(np.int64)
+            order = np.argsort(slots, kind="stable")
+            ordered[name] = slots[order], rows[order]
+        for slot in sorted(set().union(*(np.unique(slots).tolist() for slots, _ in ordered.values()))):
+            inside = {
+                name: rows[slice(*np.searchsorted(slots, (slot, slot + 1)))]
+                for name, (slots, rows) in ordered.items()
+            }
             for event in self._state.update(inside):
                 self._write(event_line(event, self._state.utc(event.time)) + "\n")
             newest = math.floor(min(self._state.time, _MAX_TIME) / self._every)

@@ -35,6 +35,8 @@ MIN_DIPOLE = 1e-9
 """Smallest residual dipole (A m^2) by which the dipole error is divided."""
 SETTLED_AFTER_S = 600.0
 """Time (s) from the start of pointing at a target until its pointing error is evaluated."""
+_LATEST_START_S = 2.0
+"""Latest time (s) of the first packets of a complete log; these packets are sent every second."""
 
 
 def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
@@ -431,10 +433,14 @@ def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArr
     """Return start and end times (n,), s, of the camera's intervals, and whether the body rotates slowly.
 
     The body rotates slowly if its rate is below `camera.max_rate`. As in flight, an instant at which the body
-    rotates too fast for a frame does not delay the next instant.
+    rotates too fast for a frame does not delay the next instant. The intervals before the oldest packets of a
+    log whose oldest segments were deleted are omitted.
     """
+    names = ("truth", "orbit_truth", "navigation")
+    oldest = max(float(seconds(run[name])[0]) for name in names if len(run[name]))
+    first = camera.period * max(0, math.ceil((oldest - _LATEST_START_S) / camera.period))
     last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
-    ticks = np.arange(0.0, last + camera.period, camera.period)
+    ticks = np.arange(first, last + camera.period, camera.period)
     truth, known = run["truth"], run["navigation"]
     rates = np.linalg.norm(truth["rate"][_rows(truth, ticks)].astype(float), axis=1)
     steady = rates <= FAST

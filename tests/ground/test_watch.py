@@ -33,7 +33,7 @@ from flight.link.telemetry.definitions import (
     Packet,
 )
 from flight.link.telemetry.log import find_segments
-from flight.link.telemetry.packets import Packer, PacketArray
+from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
 from ground.commands import station
 from ground.telemetry import read_run, scan
 from ground.watch import (
@@ -238,6 +238,22 @@ def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same(
     console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
     console.print(panel(view, 0.0))
     assert "\x1b" not in console.export_text()
+
+
+def test_the_time_for_a_long_log_grows_with_its_length() -> None:
+    """Compares the processor time for logs of 800 and 3200 lines, each of 400 packets."""
+
+    def processor_time(lines: int) -> float:
+        packets = {name: np.zeros(0, layout.dtype) for name, layout in LAYOUTS.items()}
+        packets[ATTITUDE.name] = np.zeros(400 * lines, LAYOUTS[ATTITUDE.name].dtype)
+        packets[ATTITUDE.name]["time_ns"] = np.arange(400 * lines) * 25_000_000
+        written: list[str] = []
+        begun = time.process_time()
+        PlainLines(FlightState(), 10.0, written.append).feed(packets)
+        assert len(written) == lines
+        return time.process_time() - begun
+
+    assert processor_time(3200) < 8.0 * min(processor_time(800) for _ in range(2))
 
 
 def test_an_impossible_limit_of_the_current_does_not_lengthen_the_bars_of_the_panel() -> None:

@@ -275,6 +275,16 @@ def test_missing_measurements_lower_the_share_and_the_longest_gap_is_stated() ->
     assert found["longest_gap_s"] == 3 * FINE_PERIOD
 
 
+def test_instants_before_a_log_whose_oldest_segments_were_deleted_do_not_count() -> None:
+    run = cast(dict[str, PacketArray], flight([at + 0.3 for at in FREE]))
+    for name, rows in run.items():
+        run[name] = rows[rows["time_ns"] >= 24 * 10**9]
+    found = star_camera(cast(Run, run), config())
+    assert found is not None
+    assert found["unobstructed"] == found["measured"] == sum(at >= 24 for at in FREE)
+    assert (found["share"], found["longest_gap_s"]) == (1.0, 0.0)
+
+
 @pytest.mark.parametrize(("rate", "period"), [(0.019, FINE_PERIOD), (0.021, PERIOD)])
 def test_a_fine_attitude_lengthens_the_period_only_while_the_body_is_slow(rate: float, period: int) -> None:
     run = cast(dict[str, PacketArray], flight([21.0]))
