@@ -439,6 +439,7 @@ class Portions:
     """A feed whose packets arrive in portions, as over a link."""
 
     silence = 0.0
+    restarts = 0
 
     def __init__(self, *portions: bytes) -> None:
         self.left = list(portions)
