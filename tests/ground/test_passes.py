@@ -211,7 +211,7 @@ def test_a_wrong_file_of_stations_names_file_and_key(tmp_path: Path) -> None:
         read_stations(file)
 
 
-def test_a_missing_file_of_stations_is_not_taken_for_a_configuration(tmp_path: Path) -> None:
+def test_the_message_on_a_missing_file_of_stations_lists_no_configurations(tmp_path: Path) -> None:
     with pytest.raises(UsageError) as found:
         read_stations(tmp_path / "stations.yaml")
     assert str(found.value).endswith("stations.yaml: cannot be read: no such file; check the path")
