@@ -389,8 +389,9 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
         StarTracker(camera="lens")  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match=r"settings\.lens: .* as CameraKnowledge\(\*\*accuracy\)"):
         StarTracker(camera=lens, settings=SolveSettings(lens={"centre": 0.1}))  # type: ignore[arg-type]
+    wrong: tuple[Any, ...] = (-1.0, math.nan, "0.1")
     for name in ("focal_length", "centre", "distortion", "line_time", "psf_sigma"):
-        for value in (-1.0, math.nan, "0.1"):
+        for value in wrong:
             text = re.escape(f"settings.lens.{name}: {value!r}: give a standard deviation of 0")
             knowledge = replace(CameraKnowledge(), **{name: value})
             with pytest.raises(ArgumentError, match=text):
