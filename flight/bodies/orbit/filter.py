@@ -781,8 +781,8 @@ class OrbitFilter:
             # While the orbit is unknown, the gyro continues the estimate. The last field is used, and the
             # dipole counts as unknown. A missing step would make the attitude wrong.
             around = self._steps[-1].around
-        is_doubted = self._dipoles.unknown_ns >= begin_ns or not is_known
-        doubt = self._settings.dipole_limit if is_doubted else self._shifted
+        dipoles_known = self._dipoles.is_known and self._dipoles.unknown_ns < begin_ns
+        doubt = self._shifted if is_known and dipoles_known else self._settings.dipole_limit
         self._shifted = 0.0
         dipole = self._dipoles.mean(begin_ns, end_ns)
         unknown = RateByField(np.zeros(3), self._unknown_rate)

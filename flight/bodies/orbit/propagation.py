@@ -50,12 +50,15 @@ class DipoleHistory:
         self._dipoles: list[Floats] = []
         self._sums: list[Floats] = []  # integral of the dipole up to each time, A m^2 ns
         self.unknown_ns = -1
-        """Last time (ns) at which the dipole was unknown; -1 if it was always known."""
+        """Last time (ns) at which the dipole was unknown; -1 if it was always known. While the dipole is
+        unknown, this is the time of the newest command."""
+        self.is_known = True  # whether the dipole is known now
 
     def record(self, time_ns: int, dipole: Floats, known: bool) -> None:
         """Record the dipole (A m^2) that is in force from `time_ns` on; calls must be in order of time."""
-        if not known:
+        if not (known and self.is_known):
             self.unknown_ns = max(self.unknown_ns, time_ns)
+        self.is_known = known
         if self._dipoles and dipole == self._dipoles[-1]:
             return
         time_ns = max(time_ns, self._times[-1]) if self._times else time_ns

@@ -641,3 +641,20 @@ def test_another_magnetometer_begins_without_the_learned_bias(renewed: bool) -> 
         assert flown.see(24 * PERIOD_NS)
     assert (flown.filter.refused == 0) is renewed
     assert flown.error() < 5.0 * flown.filter.worst_sigma
+
+
+def test_the_dipoles_stay_unknown_while_the_driver_of_the_coils_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Meanwhile the time of the last acknowledged command does not change, and later steps begin after it."""
+    flown = Flown(pulses=True)
+    flown.fly(2.0)
+    failed_ns, command = flown.time_ns, flown.filter.command
+    monkeypatch.setattr(flown.filter, "command", lambda *_: command(failed_ns, np.zeros(3), known=False))
+    flown.fly(4.0)
+    repaired_ns = flown.time_ns
+    monkeypatch.setattr(flown.filter, "command", lambda *_: command(repaired_ns, np.zeros(3)))
+    flown.fly(4.0)
+    doubts = {step.end_ns: step.doubt > 0.0 for step in flown.filter._steps if step.begin_ns > failed_ns}
+    assert len(doubts) > 5
+    assert doubts == {end_ns: end_ns <= repaired_ns + SECOND_NS for end_ns in doubts}
