@@ -20,6 +20,8 @@ from hal.interfaces.devices import MOST_COILS
 
 Vector = tuple[float, float, float]
 PerCoil = Annotated[tuple[float, ...], Meta(min_length=1, max_length=MOST_COILS)]
+Multiple = Annotated[float, Meta(ge=0.0, le=1e4)]
+Delay = Annotated[float, Meta(ge=0.0, le=3600.0)]
 Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
@@ -98,13 +100,13 @@ class Disturbances(Section, frozen=True, kw_only=True):
     voltage.
     """
 
-    gravity_gradient: NotNegative = 1.0
-    drag: NotNegative = 1.0
-    solar_pressure: NotNegative = 1.0
-    residual_dipole: NotNegative = 1.0
-    ring_current: NotNegative = 1.0
+    gravity_gradient: Multiple = 1.0
+    drag: Multiple = 1.0
+    solar_pressure: Multiple = 1.0
+    residual_dipole: Multiple = 1.0
+    ring_current: Multiple = 1.0
     day_bulge: Annotated[float, Meta(ge=0.0, le=1.0)] = 1.0
-    walks: NotNegative = 1.0
+    walks: Multiple = 1.0
     principal_turn_deg: Annotated[float, Meta(ge=0.0, le=45.0)] = 3.0
     coil_scale: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.03
     coil_tilt_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 1.0
@@ -153,7 +155,7 @@ class ImuNoise(Section, frozen=True, kw_only=True):
     """
 
     profile: Literal["bounds", "datasheet"] = "bounds"
-    quaternion_noise: NotNegative = 0.0
+    quaternion_noise: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.0
     rate_noise: NotNegative = 0.0
     gyro_bias: Vector = (0.0, 0.0, 0.0)
     field_bias: Vector = (0.0, 0.0, 0.0)
@@ -163,8 +165,8 @@ class ImuNoise(Section, frozen=True, kw_only=True):
 class Latency(Section, frozen=True, kw_only=True):
     """Latency (s) of the workers' results in lock-step."""
 
-    planner: NotNegative = 0.05
-    vision: NotNegative = 0.25
+    planner: Delay = 0.05
+    vision: Delay = 0.25
 
 
 class Truth(Section, frozen=True, kw_only=True):
@@ -207,7 +209,7 @@ class SkySection(Section, frozen=True, kw_only=True):
     dark_current: NotNegative = 50.0
     pedestal: NotNegative = 100.0
     full_well: Positive = 20000.0
-    readout: NotNegative = 0.05
+    readout: Delay = 0.05
     line_time: NotNegative = 0.0
     lens: CameraLens | None = None
     psf: Literal["integrated", "bilinear"] = "integrated"

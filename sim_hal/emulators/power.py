@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema.devices import Battery
+from flight.schema.document import ConfigError
 from hal.drivers.current_monitors import StringWiring
 from hal.interfaces.errors import check_limits
 from knightcube.astro import quaternion
@@ -92,12 +93,17 @@ class EmulatedPower:
         camera: EmulatedCamera | None,
         start_ns: int,
     ) -> None:
+        """Connect battery, panels and loads. Raises ConfigError for a panel without a direction."""
         self._battery = truth.battery or battery
         self._truth, self._world, self._supply, self._camera = truth, world, supply, camera
         self.charge = truth.charge
         self.rails = (Rail(), Rail())
         self.cells_lost, self.weakness = 0, 1.0
         self.lost_panel: int | None = None
+        for number, panel in enumerate(truth.panels):
+            if not any(panel.normal):
+                key = f"simulation.power.panels[{number}].normal"
+                raise ConfigError(key, "has length 0: give the outward normal of the panel")
         normals = np.array([panel.normal for panel in truth.panels]).reshape(-1, 3)
         self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         self._peaks = np.array([panel.peak for panel in truth.panels])

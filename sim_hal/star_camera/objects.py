@@ -156,6 +156,9 @@ class SkyObjects:
                 raise ConfigError(name, "give either a line_of_sight or a state")
             if entry.state is not None:
                 orbiting(world, name)
+                if (radius := math.hypot(*entry.state.position)) < EARTH_RADIUS:
+                    problem = f"is {radius:g} m from the centre of the Earth, below the ground: give m"
+                    raise ConfigError(f"{name}.state.position", problem)
         self._world = world
         self._start_ns = self._epoch_ns = start_ns
         self._utc = utc_seconds(utc)

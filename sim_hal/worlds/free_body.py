@@ -685,8 +685,20 @@ class FreeBody:
         return (time_ns - self._start_ns) * 1e-9
 
 
+FASTEST_RELEASE = 35.0
+"""Largest rate (rad/s) at release, about 2000 deg/s; a faster rotation would take hours to integrate."""
+
+
 def released(tip_off: TipOff, generator: np.random.Generator) -> tuple[FloatArray, Floats]:
-    """Return the attitude (4,), ICRS into body, and the rate (3,), rad/s, body axes, at release."""
+    """Return the attitude (4,), ICRS into body, and the rate (3,), rad/s, body axes, at release.
+
+    Raises ConfigError for a quaternion of length zero and for an impossible rate.
+    """
+    section = "simulation.free_body.release"
+    if tip_off.attitude is not None and not any(tip_off.attitude):
+        raise ConfigError(f"{section}.attitude", "has length 0: give a quaternion of length 1")
+    if tip_off.rate is not None and (speed := math.hypot(*tip_off.rate)) > FASTEST_RELEASE:
+        raise ConfigError(f"{section}.rate", f"has {speed:g} rad/s: give at most {FASTEST_RELEASE:g} rad/s")
     attitude = quaternion.normalise(generator.standard_normal(4))
     axis = generator.standard_normal(3)
     if tip_off.attitude is not None:
@@ -729,7 +741,8 @@ def built_craft(
 def craft_model(section: FreeBodySection, config: Config | None = None) -> CraftModel:
     """Return the simulated craft; values that `section` omits are taken from the flight configuration.
 
-    Raises ConfigError for an impossible inertia tensor, and for values missing in both sections.
+    Raises ConfigError for an impossible inertia tensor or centre of mass, and for values missing in both
+    sections.
     """
     craft = section.craft
     if isinstance(craft, str):
@@ -748,6 +761,10 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
             problem = "mixes numbers and rows: give three moments, or three rows of three values"
         if problem:
             raise ConfigError("simulation.free_body.craft.inertia", problem)
+    size, centre = craft.size or described.size, craft.centre_of_mass or described.centre_of_mass
+    if any(abs(offset) >= 0.5 * edge for offset, edge in zip(centre, size, strict=True)):
+        problem = f"is {list(centre)}: outside the box of {list(size)} m"
+        raise ConfigError("simulation.free_body.craft.centre_of_mass", problem)
     coils = config.coils
     if craft.windings is not None:
         if len(craft.windings) != len(coils.windings):
@@ -757,9 +774,9 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
         coils = msgspec.structs.replace(coils, windings=craft.windings)
     return CraftModel(
         inertia=inertia,
-        size=craft.size or described.size,
+        size=size,
         dipoles=coils.map().dipoles,
-        centre_of_mass=craft.centre_of_mass or described.centre_of_mass,
+        centre_of_mass=centre,
         offset=described.accuracy.centre_of_mass,
         residual_dipole=craft.residual_dipole or described.residual_dipole,
     )

@@ -17,6 +17,7 @@ from flight.link.events import Mode
 from flight.link.telemetry.definitions import POWER
 from flight.loop.power import PowerTask, Sheddable
 from flight.schema.devices import Battery, Power
+from flight.schema.document import ConfigError
 from flight.schema.sections import Modes
 from hal.drivers.current_monitors import Ina219
 from knightcube.astro.arrays import FloatArray
@@ -149,6 +150,12 @@ def test_limited_coils_draw_less(orbit: Satellite) -> None:
 def test_the_estimated_charge_follows_a_battery_unlike_the_described_one(orbit: Satellite) -> None:
     true = np.array([one["charge"] for one in orbit.true])
     assert np.abs(orbit.column("charge") - true)[5:].max() < 0.06
+
+
+def test_a_panel_without_a_direction_is_refused() -> None:
+    panels = (*TRUTH.panels, SolarPanel(normal=(0.0, 0.0, 0.0), peak=9.0))
+    with pytest.raises(ConfigError, match=r"power\.panels\[2\]\.normal: has length 0"):
+        EmulatedPower(SECTION.battery, PowerTruth(panels=panels), None, lambda *_: (5.0, 0.0), None, 0)
 
 
 def test_battery_bus_and_panels_balance(orbit: Satellite) -> None:

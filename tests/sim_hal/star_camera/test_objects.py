@@ -159,6 +159,9 @@ def test_an_object_without_place_or_an_orbit_on_the_testbed_is_refused() -> None
     for entry in (SkyObject(magnitude=3.0), SkyObject(magnitude=3.0, line_of_sight=line, state=state)):
         with pytest.raises(ConfigError, match=r"objects\[0\].*either"):
             SkyObjects([entry], UTC, 0, _world())
+    kilometres = ObjectState(position=(7e3, 0.0, 0.0), velocity=(0.0, 7.5, 0.0))
+    with pytest.raises(ConfigError, match=r"objects\[0\]\.state\.position: is 7000 m .*: give m"):
+        SkyObjects([SkyObject(magnitude=3.0, state=kilometres)], UTC, 0, _world())
     with pytest.raises(ConfigError, match="orbit"):
         SkyObjects([SkyObject(magnitude=3.0, state=state)], UTC, 0, object())  # type: ignore[arg-type] # no world
 

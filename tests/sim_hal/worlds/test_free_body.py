@@ -408,3 +408,37 @@ def test_the_filter_expects_the_errors_of_tilted_coils_that_the_world_draws() ->
         error = (coils.per_dipole(built.coil_dipole) - np.eye(3)).ravel()
         squares.append(float(error @ np.linalg.solve(prior, error)) / 9.0)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("release", "problem"),
+    [
+        (TipOff(attitude=(0.0, 0.0, 0.0, 0.0)), "release.attitude: has length 0"),
+        (TipOff(rate=(0.0, 400.0, 0.0)), "release.rate: has 400 rad/s: give at most 35 rad/s"),
+    ],
+)
+def test_an_impossible_release_is_refused(release: TipOff, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        free_body.released(release, np.random.default_rng(1))
+
+
+def described_world(text: str) -> World:
+    section = reader.simulation_section(text, "x.yaml", Simulation)
+    assert section is not None
+    return make_world(WorldInputs(reader.parse(text, "x.yaml"), section, lambda: np.zeros(3), 0))
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ("free_body: {disturbances: {drag: 1e300}}", "disturbances.drag"),
+        ("free_body: {craft: {centre_of_mass: [0.06, 0.0, 0.0]}}", "centre_of_mass.*outside the box"),
+        ("imu: {quaternion_noise: 2.0}", "quaternion_noise"),
+        ("latency: {planner: 1e300}", "latency.planner"),
+        ("sky: {readout: 1e300}", "sky.readout"),
+    ],
+)
+def test_values_with_which_no_world_can_be_simulated_are_refused(values: str, problem: str) -> None:
+    text = f"extends: orbit\nsimulation: {{{values}}}\n"
+    with pytest.raises(ConfigError, match=problem):
+        described_world(text)
