@@ -41,7 +41,7 @@ LONGEST_DELAY = 0.5
 """Longest age (s) of the last gyro reading at which a measured direction is compared with the propagated
 direction."""
 LONGEST_GAP = 3.0
-"""Longest gap (s) between gyro readings over which the direction can be propagated."""
+"""Longest gap (s) between gyro readings over which the directions of Sun and field can be propagated."""
 _SECOND = 1e-9
 
 
@@ -226,6 +226,8 @@ class SunAcquisition:
         rotated = attitude_matrix(from_rotation_vector(seconds * rate))
         self._time_ns, self._rate = time_ns, rate
         self._sun.propagate(time_ns, rotated)
+        if seconds > LONGEST_GAP:
+            self._field, self._agrees, self._samples = None, False, []
         if self._field is not None:
             self._field = rotated @ self._field
             self._residual.follow(seconds, rate, self._field, self._acts)

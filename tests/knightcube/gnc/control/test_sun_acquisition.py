@@ -103,6 +103,20 @@ def test_a_single_field_or_one_that_jumps_starts_no_coil() -> None:
     assert set(acted) == {1, 4}
 
 
+def test_after_a_gap_of_the_readings_two_fields_start_the_coils_again() -> None:
+    """A field before the gap is unknown after the gap, in which the body may have rotated anywhere."""
+    law = seeker()
+    acted: list[int] = []
+    for k in [*range(1, 150), *range(560, 800)]:
+        now_ns = k * 25_000_000
+        law.update_sun(now_ns, np.array([1.0, 0.0, 0.0]))
+        law.sample(now_ns, np.array([0.0, 1e-5, 3e-5]), np.zeros(3))
+        if law.dipole(now_ns).any():
+            acted.append(now_ns // SCHEDULE.period_ns)
+    # Readings are missing from 3.725 s (second window) to 14 s (begin of the eighth window).
+    assert sorted(set(acted)) == [1, 8, 9]
+
+
 def test_no_dipole_in_the_pauses_and_a_reading_that_is_not_finite_is_left_out() -> None:
     law = seeker()
     law.update_sun(0, np.array([1.0, 0.0, 0.0]))
