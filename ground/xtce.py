@@ -72,12 +72,13 @@ _SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"  # Yamcs's name for the sequenc
 
 
 def epoch_of(text: str) -> str:
-    """Return a UTC in ISO 8601 without time zone, from a text that may have one. Raises UsageError."""
+    """Return date and time of a UTC without time zone, from any text in ISO 8601. Raises UsageError."""
     try:
         time = datetime.fromisoformat(text)
-    except ValueError as error:
+        utc = time if time.tzinfo is None else time.astimezone(UTC).replace(tzinfo=None)
+    except (ValueError, OverflowError) as error:
         raise UsageError(f"--epoch {text}: give a UTC such as {EPOCH}") from error
-    return text if time.tzinfo is None else time.astimezone(UTC).replace(tzinfo=None).isoformat()
+    return utc.isoformat()
 
 
 def document(

@@ -171,9 +171,9 @@ def utc(text: str) -> datetime:
     """Return the time in an argument, in UTC unless the text has a time zone. Raises ArgumentTypeError."""
     try:
         found = datetime.fromisoformat(text)
-    except ValueError as error:
+        return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+    except (ValueError, OverflowError) as error:
         raise argparse.ArgumentTypeError(f"{text!r}: give a time such as 2026-03-01T12:00:00") from error
-    return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
 
 
 _PNG = b"\x89PNG\r\n\x1a\n"

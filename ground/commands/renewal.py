@@ -29,7 +29,7 @@ from flight.link.security import COMMAND_SPIS
 from flight.loop.state import LinuxFiles, replace_file
 from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
-from ground.commands.options import positive
+from ground.commands.options import positive, utc
 from ground.link.commanding import add_link_options, command, explained, failed, sha256_of, terminal_of
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.errors import KnightCubeError, UsageError, reason_of
@@ -433,8 +433,8 @@ def _signed_bytes(signed: T, signers: Iterable[CryptoSigner]) -> bytes:
 
 
 def _date(text: str) -> datetime:
-    """Return the expiry date in an argument such as 2030-01-01. Raises UsageError."""
+    """Return the expiry date in an argument such as 2030-01-01, in UTC. Raises UsageError."""
     try:
-        return datetime.fromisoformat(text).replace(tzinfo=UTC)
-    except ValueError as error:
+        return utc(text)
+    except argparse.ArgumentTypeError as error:
         raise UsageError(f"--expires {text}: is not a date such as 2030-01-01") from error

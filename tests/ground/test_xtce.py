@@ -246,12 +246,15 @@ def test_each_stage_of_a_command_is_verified_by_identifier_sequence_and_stage() 
         ("2026-11-23T12:00:00", "2026-11-23T12:00:00"),
         ("2026-11-23T12:00:00Z", "2026-11-23T12:00:00"),
         ("2026-11-23T12:00:00+02:00", "2026-11-23T10:00:00"),
+        ("2026-11-23", "2026-11-23T00:00:00"),
+        ("20261123T1200", "2026-11-23T12:00:00"),
         ("foo", None),
+        ("0001-01-01T00:00+01:00", None),
     ],
 )
 def test_an_epoch_is_a_utc(text: str, epoch: str | None) -> None:
     if epoch is None:
-        with pytest.raises(UsageError, match="--epoch foo: give a UTC such as"):
+        with pytest.raises(UsageError, match=r"--epoch .*: give a UTC such as"):
             epoch_of(text)
     else:
         assert epoch_of(text) == epoch

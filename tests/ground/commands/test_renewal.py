@@ -15,6 +15,7 @@ from tuf.api.metadata import Metadata, Timestamp
 from flight.link.files.store import locked
 from flight.link.process.commanding import Report, Stage
 from flight.schema.document import merged_text
+from ground.commands import renewal
 from tests.deploy.scripts import changed_testbed, script
 from tests.ground.commands.in_process import command
 
@@ -155,6 +156,11 @@ def test_what_the_board_would_refuse_is_not_signed(
     assert done.returncode == 2
     assert words in done.stderr
     assert not list(tmp_path.glob("*.renewal"))
+
+
+def test_a_date_of_expiry_with_a_time_zone_is_converted_to_utc() -> None:
+    assert renewal._date("2030-01-01").isoformat() == "2030-01-01T00:00:00+00:00"
+    assert renewal._date("2030-01-01T00:00-05:00").isoformat() == "2030-01-01T05:00:00+00:00"
 
 
 @pytest.mark.parametrize(
