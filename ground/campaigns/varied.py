@@ -274,8 +274,9 @@ def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[fl
 
 
 def numbers_drawn(results: Sequence[Result]) -> dict[str, list[float]]:
-    """Return the random numbers of all flights by key; parameters whose values are texts are omitted."""
-    keys = [key for key, value in results[0]["drawn"].items() if _is_number(value)]
+    """Return the random numbers of all flights by key; parameters with values of other kinds are omitted."""
+    drawn = [result["drawn"] for result in results]
+    keys = [key for key in drawn[0] if all(_is_number(one[key]) for one in drawn)]
     return {key: [float(result["drawn"][key]) for result in results] for key in keys}
 
 

@@ -363,6 +363,8 @@ def test_the_worst_value_of_each_quantity_counts_and_missing_values_are_unknown(
     assert found["b"][2] == pytest.approx([math.nan, 5.0, math.nan], nan_ok=True)
     drawn = [{"drawn": {"x": 1, "on": True, "name": "n"}}, {"drawn": {"x": 2.5, "on": False, "name": "m"}}]
     assert numbers_drawn(drawn) == {"x": [1.0, 2.5]}
+    mixed = [{"drawn": {"x": 1, "y": value}} for value in (0.1, None)]  # such as --vary y=0.1|null
+    assert numbers_drawn(mixed) == {"x": [1.0, 1.0]}
 
 
 def test_the_printed_table_lists_twenty_failed_flights_and_the_facts_list_all(tmp_path: Path) -> None:
