@@ -54,7 +54,7 @@ def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespac
 
 def print_result(options: argparse.Namespace, facts: Any, text: str) -> None:
     """Print a result as one JSON object if the option `--json` is given, otherwise as text."""
-    sys.stdout.write(to_json(facts, allow_nan=False) if options.json else text)
+    sys.stdout.write(to_json(facts) if options.json else text)
 
 
 @contextmanager

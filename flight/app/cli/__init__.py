@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import io
 import json
+import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -105,12 +106,13 @@ class _Answer:
     wanted = made = False
 
 
-def to_json(facts: Any, *, allow_nan: bool = True) -> str:
+def to_json(facts: Any) -> str:
     """Return the result of a command as one line of JSON, with numbers rounded to 15 digits.
 
-    Otherwise, times that are computed from integers in ns would be printed as 15.450000000000001.
+    Otherwise, times that are computed from integers in ns would be printed as 15.450000000000001. NaN and
+    infinity become null, because JSON supports neither.
     """
-    text = json.dumps(_rounded(facts), allow_nan=allow_nan) + "\n"
+    text = json.dumps(_rounded(facts), allow_nan=False) + "\n"
     _Answer.made = True
     return text
 
@@ -120,7 +122,9 @@ def _rounded(value: Any) -> Any:
         return {key: _rounded(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_rounded(each) for each in value]
-    return float(f"{value:.15g}") if isinstance(value, float) else value
+    if isinstance(value, float):
+        return float(f"{value:.15g}") if math.isfinite(value) else None
+    return value
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -143,6 +144,7 @@ def test_numbers_of_a_json_result_are_rounded_to_15_digits() -> None:
     assert to_json(facts) == '{"time_s": 15.45, "rows": [{"x": 15.45}], "utc_ns": 1774008001000000000}\n'
     # A Julian date keeps its fraction of a millisecond.
     assert to_json(2461119.50000123) == "2461119.50000123\n"
+    assert to_json([math.nan, {"x": math.inf}]) == '[null, {"x": null}]\n'
 
 
 def test_the_line_of_progress_names_the_function_that_numba_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
