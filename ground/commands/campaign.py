@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from flight.app.cli import PROGRAM, to_json
+from flight.app.cli.run import seed_number
 from flight.schema.document import config_path
 from ground.commands.options import count, interruptible, positive
 from knightcube.errors import UsageError
@@ -34,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--vary", action="append", default=[], required=True, metavar="KEY=SPREAD", help=text)
     add("--runs", type=count, default=100, metavar="N", help="number of flights (default 100)")
-    add("--seed", type=int, default=1, metavar="N", help="seed of all draws (default 1)")
+    add("--seed", type=seed_number, default=1, metavar="N", help="seed of all draws (default 1)")
     add("--duration", type=positive, metavar="S", help="duration of each flight")
     add("--only", default="", metavar="TEXT", help="run only flights with this text in their name")
     add("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")

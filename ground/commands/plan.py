@@ -256,7 +256,7 @@ def _planned(
         across_axis=config.pointing.across,
         camera_axis=boresight,
         cones=cones,
-        nodes=options.nodes or SLEW_NODES,
+        nodes=SLEW_NODES if options.nodes is None else options.nodes,
     )
 
 

@@ -67,6 +67,12 @@ def test_the_arguments_reach_the_campaign(scripted: Scripted) -> None:
     assert scripted.drawn == [([Path("here"), "results"], Path("here/campaign.png"))]
 
 
+def test_a_negative_seed_is_refused(scripted: Scripted, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        scripted.run("--seed", "-1")
+    assert "give a whole number from 0" in capsys.readouterr().err
+
+
 def test_the_defaults_are_a_hundred_flights_in_a_folder_named_after_the_configuration(
     scripted: Scripted,
 ) -> None:

@@ -43,6 +43,11 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
     )
 
 
+def test_a_number_of_nodes_of_0_is_refused() -> None:
+    done = command(*TO_THE_SUN, "--within", "120", "--nodes", "0")
+    assert (done.returncode, "nodes is 0: must be an integer from 8" in done.stderr) == (1, True)
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_target_behind_the_earth_is_named(side: float) -> None:
     """The target is below the satellite at the end of the slew, or on the opposite side of the Earth."""
