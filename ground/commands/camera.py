@@ -66,8 +66,8 @@ def run(options: argparse.Namespace) -> int:
     """Take and write the frames, and print a line for each. The exit status is 1 if the camera is frozen."""
     if options.count < 1:
         raise UsageError(f"--count {options.count}: give a number of frames, 1 or more")
-    if options.exposure is not None and not 0.0 < options.exposure <= 10.0:
-        raise UsageError(f"--exposure {options.exposure}: give seconds, up to 10")
+    if options.exposure is not None and not 1e-6 <= options.exposure <= 10.0:
+        raise UsageError(f"--exposure {options.exposure}: give seconds, from 1e-6 to 10")
     if options.out is not None and options.out.suffix.lower() != ".png":
         raise UsageError(f"--out {options.out}: frames are written as PNG: give a name that ends in .png")
     facts = []

@@ -126,6 +126,7 @@ def test_a_simulated_camera_has_the_configured_faults(
     [
         (["--count", "0"], "--count 0"),
         (["--exposure", "nan"], "--exposure nan: give seconds"),
+        (["--exposure", "1e-10"], "--exposure 1e-10: give seconds, from 1e-6 to 10"),
         (
             ["--out", "frame.fits"],
             "ends in .png",
