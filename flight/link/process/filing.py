@@ -345,7 +345,11 @@ class Renewal:
             values["part"] = PARTS[directive.part]
         else:
             values["kind"] = KINDS[directive.kind]
-        return "" if self._write(name, encoded(values)) else "the request could not be stored"
+        with suppress(OSError, FileError):
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+            write_whole(self._folder / name, encoded(values))  # the program never reads an incomplete request
+            return ""
+        return "the request could not be stored"
 
     def followed(self, packet: bytes, now_ns: int, *, live: bool) -> None:
         """Note a fault, a refused configuration, or a reaction to SAFE that a telemetry packet reports.

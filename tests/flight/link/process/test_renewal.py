@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from flight.link import events
 from flight.link.events import Mode
 from flight.link.process import filing
+from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
 from flight.link.process.filing import Renewal, decoded, encoded
 from flight.link.telemetry.definitions import EVENT, FIX
@@ -197,3 +199,21 @@ def test_a_disk_that_cannot_be_written_is_reported_and_ends_nothing(tmp_path: Pa
     renewal = Renewal(tmp_path / "missing" / "folder", status, 5.0)
     assert [report.text for report in renewal.turn(1, 0)] == ["x"]
     assert renewal.turn(2, 10**12) == []
+
+
+def test_a_request_that_cannot_be_stored_completely_does_not_exist(tmp_path: Path) -> None:
+    status = tmp_path / "status"
+    status.write_bytes(encoded({"reports": []}))
+    renewal = Renewal(tmp_path / "folder", status, 5.0)
+    done = Report(1, 5, Stage.COMPLETED, "confirm", "", Request(0, 0))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        problem = renewal.request(Confirm(0), done, 0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert problem == "the request could not be stored"
+    assert not list((tmp_path / "folder").glob("*-0"))
+    assert renewal.request(Confirm(0), done, 0) == ""
+    (path,) = (tmp_path / "folder").glob("*-0")
+    assert decoded(path.read_bytes()) == {"do": "confirm", "kind": "configuration"}
