@@ -2,12 +2,14 @@
 
 The script install.sh calls `build_release.py PREFIX build|switch|rollback`. The manifest of a release is
 written last, so a release with a manifest is complete, and only complete releases are linked. Each build
-first removes the incomplete releases of interrupted builds. The script needs only Python's standard library.
+first removes the incomplete releases of interrupted builds, so only one build runs at a time. The script
+needs only Python's standard library.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import fnmatch
 import hashlib
 import os
@@ -16,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -254,6 +256,18 @@ def _write(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
+@contextmanager
+def _alone(prefix: Path) -> Iterator[None]:
+    """Hold the lock of builds. Raises SystemExit while another build runs, which would lose its release."""
+    prefix.mkdir(parents=True, exist_ok=True)
+    with open(prefix / ".build", "a", encoding="ascii") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise SystemExit("install: failed: another build runs: try again after its end") from error
+        yield
+
+
 def _sync(folder: Path) -> None:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -281,7 +295,8 @@ def main(words: list[str]) -> int:
     parser.add_argument("--dry-run", action="store_true")
     options = parser.parse_args(words)
     if options.action == "build":
-        return Build(options.prefix, options).make()
+        with _alone(options.prefix) if not options.dry_run else nullcontext():
+            return Build(options.prefix, options).make()
     if options.action == "switch":
         switch(options.prefix, options.name)
     else:

@@ -14,7 +14,7 @@ import pytest
 
 from flight import __version__
 from flight.app.service import NAME, NOTE, TRIALS, FlownRelease
-from flight.link.files.store import line_of, to_record
+from flight.link.files.store import line_of, locked, to_record
 from tests.deploy.boards import FIRST, SECOND, FakeBoard
 from tests.deploy.scripts import script
 
@@ -175,6 +175,20 @@ def test_an_update_of_an_incomplete_release_keeps_the_previous_one(board: FakeBo
     board.install("newest")
     assert (board.prefix / "releases" / FIRST / "manifest").is_file()
     assert (board.prefix / "previous").resolve().name == FIRST
+
+
+def test_only_one_build_runs_at_a_time(board: FakeBoard) -> None:
+    unfinished = board.prefix / "releases" / f"{__version__}+3"
+    unfinished.mkdir()
+    with locked(board.prefix / ".build", ""):
+        done = subprocess.run(
+            board.words("newest"), env=board.environment(), capture_output=True, text=True, check=False
+        )
+    assert done.returncode == 1
+    assert "another build runs" in done.stderr
+    assert unfinished.is_dir()
+    board.install("newest")
+    assert board.fly()[0] == "newest"
 
 
 @pytest.mark.parametrize("option", ["", "--accept", "--rollback"])
