@@ -22,11 +22,11 @@ for an object that moves along a great circle at a constant angular rate. The ad
 the line of sight is (`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
 
 Each sighting is assigned to at most one track, first to confirmed and then to tentative tracks, in order of
-increasing cost: the chi-square plus the logarithm of the determinant of the innovation's covariance. The
-assignment is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern
-Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A track is confirmed after m
-sightings in n frames if its angular rate differs from the rate of the stars. A confirmed track is propagated
-without measurements while the object is not detected.
+increasing cost: the chi-square of direction and brightness plus the logarithm of the determinant of the
+innovation's covariance. The assignment is the greedy nearest neighbour method (Blackman and Popoli 1999,
+Design and Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A
+track is confirmed after m sightings in n frames if its angular rate differs from the rate of the stars. A
+confirmed track is propagated without measurements while the object is not detected.
 """
 
 from __future__ import annotations
@@ -367,7 +367,7 @@ class ObjectTracker:
                 if unlike > _ALIKE**2 and not track.confirmed:
                     continue
                 seen = compare(track.line, frame.directions[number], spread[number])
-                if seen.chi_square + unlike <= self._gate:
+                if seen.chi_square + (0.0 if track.confirmed else unlike) <= self._gate:
                     # Chi-square alone would favour tracks with large covariances.
                     cost = seen.chi_square + unlike + math.log(float(np.linalg.det(seen.covariance)))
                     pairs.append((not track.confirmed, cost, index, number))

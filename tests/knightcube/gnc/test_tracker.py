@@ -201,6 +201,20 @@ def test_an_object_that_flashes_by_four_magnitudes_is_one_track() -> None:
     assert tracker.objects[0].sightings >= 28
 
 
+@pytest.mark.parametrize("flash", [2.5, 6.0, -6.0])
+def test_a_sudden_flash_belongs_to_the_track_of_its_object(flash: float) -> None:
+    rng = np.random.default_rng(8)
+    times = np.arange(0.0, 20.0, 1.0)
+    flown = a_pass(rng, np.radians(0.3), times, 30.0)
+    tracker = ObjectTracker(TrackSettings())
+    for index, time in enumerate(times):
+        magnitude = np.array([6.0 - (flash if index == 15 else 0.0)])
+        tracker.ingest(
+            sightings(rng, time, flown.directions[index : index + 1], _SIGMA, _ATTITUDE, magnitude)
+        )
+    assert [track.sightings for track in tracker.objects] == [len(times)]
+
+
 def test_noise_and_stars_that_no_catalogue_has_make_no_track_in_100_frames() -> None:
     rng = np.random.default_rng(6)
     fixed = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.17, 0.17, size=(5, 3)) * [1.0, 1.0, 0.0]
