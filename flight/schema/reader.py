@@ -359,6 +359,11 @@ def _check_addresses(config: Config, refuse: Refuse) -> None:
                 hint = f": did you mean 0x{meant:02x}?" if low <= meant <= high else ""
                 chip = f"a chip of type {section.driver} has 0x{low:02x} to 0x{high:02x}"
                 refuse(name, f"is 0x{address:02x} ({address}), but {chip}{hint}")
+        if kind == "coils" and section.driver == "drv8830":
+            last = section.address + len(section.windings) - 1
+            if last > high:
+                problem = f"is 0x{section.address:02x}: the coils use the addresses up to 0x{last:02x}"
+                refuse(f"{key}.address", f"{problem}, but a drv8830 has at most 0x{high:02x}")
 
 
 def _check_connections(config: Config, refuse: Refuse) -> None:

@@ -565,3 +565,10 @@ def test_a_magnetometer_beside_the_inertial_unit_is_checked_like_the_unit() -> N
     tilted = FIELD_SENSOR.replace("max_age: 0.2", "mounting: [0.0, 0.0, 0.0, 2.0]")
     with pytest.raises(ConfigError, match=r"`magnetometer\.mounting`"):
         reader.parse(DEMO + tilted)
+
+
+def test_bridges_of_which_the_last_has_no_address_are_refused() -> None:
+    text = "extends: step_demo\ncoils: {driver: drv8830, address: 0x66}\n"
+    assert reader.parse(text).coils.address == 0x66
+    with pytest.raises(ConfigError, match=r"coils.address` is 0x67: the coils use the addresses up to 0x69"):
+        reader.parse(text.replace("0x66", "0x67"))
