@@ -166,13 +166,13 @@ class _Fit:
 def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the distances (n,), m, between positions (n, 3), ICRS, and elements at Julian dates (n,).
 
-    Raises UsageError for elements that SGP4 cannot propagate to the given dates.
+    Raises UsageError for elements that are not valid or that SGP4 cannot propagate to the given dates.
     """
-    known = TwoLineElements(*lines)
     try:
+        known = TwoLineElements(*lines)
         found = np.array([known.at(float(date)).position for date in dates])
-    except OrbitError as error:
-        raise UsageError(f"no elements fit the positions: {error}") from error
+    except (OrbitError, UsageError) as error:
+        raise UsageError(f"no elements fit the positions, in m: {error}") from error
     return np.asarray(np.linalg.norm(found - positions, axis=1))
 
 
@@ -180,7 +180,7 @@ def _first_guess(positions: FloatArray) -> FloatArray:
     """Return the parameters of a nearly circular orbit through the first of the positions (n, 3), km."""
     normal = np.cross(positions[0], positions[1])
     length = float(np.linalg.norm(normal))
-    if length < 1e-6 * float(positions[0] @ positions[0]):
+    if length <= 1e-6 * float(positions[0] @ positions[0]):
         raise UsageError("the first two positions are equal or opposite: they define no orbital plane")
     normal = normal / length
     inclination = math.acos(max(-1.0, min(1.0, float(normal[2]))))
