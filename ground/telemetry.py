@@ -343,7 +343,8 @@ def write_parquet(run: Run, folder: Path) -> list[Path]:
             for column, array in zip(columns, arrays, strict=True)
         ]
         paths.append(folder / f"{name}.parquet")
-        parquet.write_table(pyarrow.table(arrays, schema=pyarrow.schema(fields)), paths[-1])
+        with paths[-1].open("wb") as file:  # pyarrow itself opens only paths that are UTF-8
+            parquet.write_table(pyarrow.table(arrays, schema=pyarrow.schema(fields)), file)
     return paths
 
 

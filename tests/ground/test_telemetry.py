@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import sqlite3
 import sys
 from contextlib import closing
@@ -19,7 +20,7 @@ from flight.link.telemetry.definitions import CONTROL, EVENT, HOUSEKEEPING, IMU,
 from flight.link.telemetry.log import FlightLog, find_segments
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
 from ground import telemetry
-from ground.telemetry import Run, ScanResult, decode, export, read_run, scan
+from ground.telemetry import FORMATS, Run, ScanResult, decode, export, read_run, scan
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.ground.commands.in_process import command
@@ -381,6 +382,15 @@ def test_parquet_files_hold_every_number_with_its_unit(rich_run: Run, tmp_path: 
     identity = parquet.read_table(files["run"])
     assert identity["seed"].to_pylist() == [2**64 - 1]
     assert identity["config_name"].to_pylist() == ["é"]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_run_is_exported_to_a_path_that_is_not_utf_8(form: str, rich_run: Run, tmp_path: Path) -> None:
+    if form == "parquet":
+        pytest.importorskip("pyarrow", reason="needs the extra `parquet`")
+    files = export(rich_run, tmp_path / os.fsdecode(b"\xff"), form)
+    assert files
+    assert all(path.stat().st_size for path in files)
 
 
 def test_all_formats_have_the_same_columns(tmp_path: Path) -> None:
