@@ -7,6 +7,7 @@ import math
 import os
 import sqlite3
 import sys
+import tracemalloc
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -382,6 +383,19 @@ def test_parquet_files_hold_every_number_with_its_unit(rich_run: Run, tmp_path: 
     identity = parquet.read_table(files["run"])
     assert identity["seed"].to_pylist() == [2**64 - 1]
     assert identity["config_name"].to_pylist() == ["é"]
+
+
+def test_a_log_needs_little_more_than_twice_its_size_in_memory_while_it_is_read() -> None:
+    """Counts the memory without the log itself; the log of two days has a gigabyte."""
+    packer, packets = Packer(), []
+    for second in range(2000):
+        packets += [packer.pack(kind, second, plain_contents(kind)) for kind in (CONTROL, HOUSEKEEPING)]
+    data = b"".join(packets)
+    tracemalloc.start()
+    scan(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2.0 * len(data)
 
 
 @pytest.mark.parametrize("form", FORMATS)
