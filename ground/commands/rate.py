@@ -161,7 +161,8 @@ def _objects(
 ) -> tuple[SpaceObject, ...]:
     if found.rate is None:
         return ()
-    settings = ObjectSettings(gain=likelihood.gain, saturation=likelihood.saturation)
+    gain, saturation = likelihood.gain, likelihood.saturation
+    settings = ObjectSettings(psf_sigma=likelihood.psf_sigma, gain=gain, saturation=saturation)
     found_objects = detect_objects(pixels, pinhole, found.rate, found.exposure, settings).objects
     return tuple(replace(item, flux=unit * item.flux) for item in found_objects)
 

@@ -10,11 +10,23 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
+from ground.commands import rate  # noqa: E402
 from knightcube.vision.camera.images import write_picture  # noqa: E402
+from knightcube.vision.streaks.streak_result import (  # noqa: E402
+    LikelihoodSettings,
+    MotionResult,
+    StreakStatus,
+)
 from sim_hal.star_camera import StarCameraModel  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
+from tests.knightcube.vision.objects.space_objects import (  # noqa: E402
+    frame_with,
+    motion_across,
+    object_path,
+)
 from tests.support.fits_files import fits_file  # noqa: E402
 from tests.support.scenes import Scene, slew  # noqa: E402
+from tests.support.streak_frames import rate_at, star_camera  # noqa: E402
 
 CAMERA = StarCameraModel(columns=640, rows=640, field_of_view=float(np.deg2rad(12.5)))
 FOV = "12.5"
@@ -230,3 +242,17 @@ def test_a_shutter_that_nobody_described_widens_the_claim_and_the_command_asks_f
     assert sigma("--line-time", "0") < sigma()
     assert "--line-time" in command("rate", picture, *usual).stdout
     assert "--line-time" not in command("rate", picture, *usual, "--line-time", "0").stdout
+
+
+def test_an_object_is_searched_with_the_stated_point_spread() -> None:
+    camera = star_camera(512, 1.6)
+    pinhole = camera.pinhole
+    turn = rate_at(np.deg2rad(60.0), 55.0 / pinhole.focal_length, 0.4)
+    place = pinhole.unit_vectors(np.array([[270.0, 230.0]]))[0]
+    path = object_path(camera, place, motion_across(place, 25.0 / pinhole.focal_length, 0.3), turn)
+    pixels = frame_with(camera, turn, 1.0, 6, [(path, 2.5)], 6.0)
+    found = MotionResult(StreakStatus.RATE, 0, 1.0, rate=turn)
+    settings = LikelihoodSettings(saturation=camera.full_well, psf_sigma=1.6)
+    seen = rate._objects(pixels, pinhole, found, settings, 1.0)
+    assert len(seen) == 1
+    assert np.linalg.norm(seen[0].endpoints.mean(axis=0) - path.mean(axis=0)) < 0.5
