@@ -259,17 +259,20 @@ def gate_bounds(sigma: float) -> dict[int, float]:
 
 
 def _inverted(s: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric (1, 1), (2, 2) or (3, 3) matrix, by cofactors."""
+    """Return the inverse of a symmetric (1, 1), (2, 2) or (3, 3) matrix, by cofactors.
+
+    The inverse of a singular matrix is not finite, so that an innovation with this covariance is rejected.
+    """
     if len(s) == 1:
         return np.asarray(1.0 / s)
     if len(s) == 2:
         (a, b), (_, d) = s.tolist()
-        scale = 1.0 / (a * d - b * b)
+        scale = 1.0 / ((a * d - b * b) or math.nan)
         return np.array(((scale * d, -scale * b), (-scale * b, scale * a)))
     (a, b, c), (_, d, e), (_, _, f) = s.tolist()
     ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     cd, ce, cf = a * f - c * c, b * c - a * e, a * d - b * b
-    scale = 1.0 / (a * ca + b * cb + c * cc)
+    scale = 1.0 / ((a * ca + b * cb + c * cc) or math.nan)
     return np.asarray(np.array(((ca, cb, cc), (cb, cd, ce), (cc, ce, cf))) * scale)
 
 
