@@ -22,6 +22,7 @@ let receivedAt = 0;
 let line = null;
 let seeking = false;
 let unknown = false; // the console no longer knows this page
+let opened = false; // the page has been connected once: only the first connection shows the moment of the address
 
 byId("name").textContent = table.name;
 document.title = `${table.name} - KnightCube console`;
@@ -48,7 +49,10 @@ plots.newest = () => newest;
 
 function connect() {
   line = new WebSocket(`ws://${location.host}/api/live`);
-  line.onopen = () => { if (state.live) moment(); else move(state.time, state.speed); };
+  line.onopen = () => {
+    if (!opened) moment(); else if (!state.live) move(state.time, state.speed);
+    opened = true;
+  };
   line.onmessage = (message) => take(JSON.parse(message.data));
   line.onclose = async () => {
     // After a restart the console has other tokens. A WebSocket only fails, but a request gets the reason.

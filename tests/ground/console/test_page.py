@@ -63,6 +63,13 @@ _RED = """(() => {
 """Script that returns whether the last plot has a dashed line in the colour of a fault."""
 
 
+_KEEP_SOCKETS = """window.sockets = [];
+window.WebSocket = class extends WebSocket {
+  constructor(...words) { super(...words); sockets.push(this); }
+};"""
+"""Script that keeps the WebSockets of a page in the array `sockets`."""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
@@ -76,7 +83,9 @@ def _event(kind: events.EventKind, time_s: float, text: str) -> bytes:
 @pytest.fixture(scope="module")
 def orbit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run of a satellite with 105 saturated frames, a gyro outage, and a parameter table."""
-    run = make_run(tmp_path_factory.mktemp("orbit"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
+    near_elements_ns = 1_774_000_000 * 10**9  # the elements of config/orbit.yaml are from 2026-03-20
+    recipe = Recipe(duration=6.0, rate_hz=10.0, hold=3.0, utc_ns=near_elements_ns)
+    run = make_run(tmp_path_factory.mktemp("orbit"), recipe)
     shutil.copy(ROOT / "config/orbit.yaml", run / "config.yaml")
     values = [sum(field.valid) / 2.0 for field in PARAMETER_FIELDS if field.valid]
     table = {field.name: value for field, value in zip(PARAMETER_FIELDS, values, strict=True)}
@@ -152,6 +161,21 @@ def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder
             assert "open the newest address that it printed" in page.text("#trouble")
             page.page.reload()
             assert "open the newest address" in page.text("body")
+
+
+def test_a_page_that_is_connected_again_stays_live(folder: Path) -> None:
+    with serving(folder) as url, browsing() as chromium:
+        context = chromium.new_context()
+        context.add_init_script(_KEEP_SOCKETS)
+        page = open_page(context, f"{url}#at=2")
+        page.wait("document.body.dataset.time === '2'")
+        page.page.click("#live")
+        page.wait("Number(document.body.dataset.time) > 5")
+        page.page.evaluate("sockets[0].close()")
+        page.wait("sockets.length === 2 && sockets[1].readyState === WebSocket.OPEN")
+        page.page.wait_for_timeout(500)
+        assert float(page.page.evaluate("document.body.dataset.time")) > 5.0
+        assert page.text("#light").startswith("no telemetry for")
 
 
 def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:

@@ -45,6 +45,7 @@ class Recipe:
     performance: bool = True
     commands: bool = True
     bus_power: float | None = 0.05
+    utc_ns: int = 1_700_000_000_000_000_000
 
 
 def second_order(t: FloatArray, damping: float, frequency: float) -> FloatArray:
@@ -121,7 +122,7 @@ def _identity(packer: Packer, recipe: Recipe) -> bytes:
         config_crc=0x12345678,
         software="0.2.0",
         seed=7,
-        utc_ns=1_700_000_000_000_000_000,
+        utc_ns=recipe.utc_ns,
         simulated=recipe.truth,
         realtime=False,
         control_period_ns=round(1e9 / recipe.rate_hz),
