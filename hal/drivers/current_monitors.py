@@ -10,7 +10,9 @@ outside the measuring range is reported as the limit of the range and marked as 
 An A/D converter ADS1115 (TI SBAS444) has four inputs. The current of a string flows through a shunt, whose
 voltage is amplified; the output voltage per current is `volt_per_ampere`. A periodic job reads the completed
 conversion of one channel and starts the conversion of the next channel, on all converters at once. No call
-waits for a conversion, because a conversion takes 7.8 ms and the job runs at intervals of at least 10 ms.
+waits for a conversion, because a conversion takes 7.8 ms and the job runs at intervals of at least 10 ms. A
+current outside the measuring range is reported as the limit of the range, and the text `error` names its
+string.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class PolledMonitor(Generic[_Reading]):
             return self._latest
 
     def error(self) -> str:
-        """Return the text of the current failure, or an empty text while readings arrive."""
+        """Return the text of the current failure, or an empty text."""
         with self._lock:
             return self._error
 
@@ -300,14 +302,14 @@ class AdsSolarStrings(PolledMonitor[StringReading]):
             self._counts[address, channel] = word - 0x10000 if word & 0x8000 else word
 
     def _publish(self) -> None:
-        currents = np.empty(len(self._wirings))
+        currents, error = np.empty(len(self._wirings)), ""
         for index, wiring in enumerate(self._wirings):
             counts = self._counts[wiring.address, wiring.channel]
+            current = counts * STEP / wiring.volt_per_ampere
             if abs(counts) >= 0x7FFF:
-                bound = FULL_SCALE / wiring.volt_per_ampere
-                current = counts * STEP / wiring.volt_per_ampere
-                raise OutOfRange(self.name, f"current of string {index + 1}", current, -bound, bound, "A")
-            currents[index] = counts * STEP / wiring.volt_per_ampere
+                bound, name = FULL_SCALE / wiring.volt_per_ampere, f"current of string {index + 1}"
+                error = str(OutOfRange(self.name, name, current, -bound, bound, "A"))
+            currents[index] = current
         with self._lock:
             self._latest = StringReading(self._clock.now_ns(), currents)
-            self._error = ""
+            self._error = error

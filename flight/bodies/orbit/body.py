@@ -219,6 +219,8 @@ class OrbitFeed:
 
 SUNLIT_SHARE = 0.5
 """Fraction of its peak current above which a string of solar cells is in sunlight."""
+_LIGHTEST = 1.6
+"""Largest possible current of a string, as a fraction of its peak current, in the light of Sun and Earth."""
 _BELOW = 0.8
 """Largest rate of a planned path, as a fraction of the rate at which detumbling starts."""
 
@@ -348,7 +350,8 @@ class SatelliteEstimation(BodyEstimation):
         sun = self._sun
         if sun is not None and sun.newest is not None:
             recent = abs(reading.time_ns - sun.newest.time_ns) <= LATEST_WITNESS_NS
-            sunlit = recent and float(np.max(sun.newest.currents / sun.strings.peaks)) >= SUNLIT_SHARE
+            shares = sun.newest.currents / sun.strings.peaks
+            sunlit = recent and bool(((shares >= SUNLIT_SHARE) & (shares <= _LIGHTEST)).any())
         used = self.environment.fix(reading, Witness(field, sigma, sunlit))
         return FixVerdict(used, self.environment.refusal)
 

@@ -402,15 +402,25 @@ def test_a_silent_part_is_reported_and_a_brown_out_heals() -> None:
     assert flown.driver.error() == ""
 
 
-def test_a_current_beyond_the_range_is_refused() -> None:
-    flown = bench(peak=1.3)
-    flown.strings.gain = 2.0
+def test_a_current_beyond_the_range_is_clipped_and_named_and_leaves_the_other_strings() -> None:
+    flown, sound = bench(peak=0.5), bench(peak=0.5)
+    light = flown.strings._light
+    flown.strings._light = lambda now_ns: light(now_ns) + np.array([0.0, 0.0, 1.3, 0.0, 0.0, 0.0])  # type: ignore[method-assign]
     flown.wait(1.2)
+    sound.wait(1.2)
     error = flown.driver.error()
-    assert "current of string" in error
+    assert "current of string 3" in error
     numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", error)]
     assert numbers == pytest.approx([1.024, -1.024, 1.024], abs=5e-3), "2.048 V of full scale by 2 V/A"
-    assert flown.driver.latest() is None
+    reading, whole = flown.driver.latest(), sound.driver.latest()
+    assert reading is not None
+    assert whole is not None
+    assert reading.currents[2] == pytest.approx(1.024, abs=5e-3)
+    others = [0, 1, 3, 4, 5]
+    np.testing.assert_allclose(reading.currents[others], whole.currents[others], atol=STEP)
+    flown.strings._light = light  # type: ignore[method-assign]
+    flown.wait(1.2)
+    assert flown.driver.error() == ""
 
 
 def test_wirings_and_periods_that_cannot_be_are_refused() -> None:

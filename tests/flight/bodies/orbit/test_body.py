@@ -274,7 +274,7 @@ def fix(time_ns: int) -> GpsReading:
 
 
 @pytest.mark.parametrize(("age", "recent"), [(20 * S, True), (20 * S + 1, False), (-20 * S, True)])
-@pytest.mark.parametrize(("share", "lit"), [(0.5, True), (0.499, False)])
+@pytest.mark.parametrize(("share", "lit"), [(0.5, True), (0.499, False), (1.5, True), (1.7, False)])
 def test_a_fix_is_judged_with_the_recent_field_and_the_brightest_solar_cell(
     age: int, recent: bool, share: float, lit: bool
 ) -> None:
