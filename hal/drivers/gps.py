@@ -38,7 +38,7 @@ from operator import xor
 import numpy as np
 
 from hal.interfaces.devices import FloatArray, GpsLink, GpsReading
-from hal.interfaces.errors import OutOfRange
+from hal.interfaces.errors import NotResponding, OutOfRange
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
 
 SYNC = b"\xb5\x62"
@@ -303,13 +303,19 @@ class UbloxReceiver:
             for kind, payload, behind in parser.feed(data):
                 self._arrivals_ns["frame"] = arrival_ns
                 sent_ns = arrival_ns - behind * _BITS * SECOND_NS // self._port.baud_rate
-                readings.append(self._reading(kind, payload, sent_ns))
+                if (reading := self._reading(kind, payload, sent_ns)) is not None:
+                    readings.append(reading)
             if parser.sentences > sentences:
                 self._arrivals_ns["sentence"] = arrival_ns
-        self._search_rate()
-        if self._port.baud_rate == self._own_rate:
-            self._set_up()
-        return [reading for reading in readings if reading is not None]
+        try:
+            self._search_rate()
+            if self._port.baud_rate == self._own_rate:
+                self._set_up()
+        except NotResponding:
+            # If the port is lost, the next call raises the error again.
+            if not readings:
+                raise
+        return readings
 
     def link(self) -> GpsLink:
         """Return the counters of the serial line."""
@@ -419,8 +425,9 @@ class UbloxReceiver:
                 self._change_rate(self._own_rate)
         elif port.baud_rate == self._own_rate:
             if now_ns - decoded_ns >= UNDECODED_NS and self._last_byte_ns > decoded_ns:
-                self._change_rate(self._others[0])
+                # A port that rejects a baud rate is set to the next one later.
                 self._others.append(self._others.pop(0))
+                self._change_rate(self._others[-1])
         elif decoded_ns > self._rate_ns:
             self._found_rate, self._return_ns = port.baud_rate, now_ns + _RETURN_NS
             values = b"\x00\x01\x00\x00" + UART1_BAUDRATE.to_bytes(4, "little")

@@ -287,8 +287,9 @@ class Recovery:
                 self._begin(now_ns)
             else:
                 if self._port.baud_rate == self._own_rate:
-                    self._port.set_baud_rate(self._others[0])
+                    # A port that rejects a baud rate is set to the next one later.
                     self._others.append(self._others.pop(0))
+                    self._port.set_baud_rate(self._others[-1])
                 else:
                     self._port.set_baud_rate(self._own_rate)
                 self._listen(now_ns, packets, received)
@@ -620,7 +621,12 @@ class Vn100:
             foreign, self._foreign = parser.foreign - self._foreign, parser.foreign
             self._converter.check_for_others(items, foreign, now_ns)
             packets = parser.packets + parser.foreign
-            self._recovery.advance(now_ns, len(readings), sentences, packets, parser.bytes_received)
+            try:
+                self._recovery.advance(now_ns, len(readings), sentences, packets, parser.bytes_received)
+            except NotResponding:
+                # If the port is lost, the next call raises the error again.
+                if not readings:
+                    raise
         return readings
 
     def link(self) -> ImuLink:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from functools import reduce
 from operator import xor
@@ -148,6 +149,40 @@ def test_a_broken_line_gives_no_false_fix(faults: LineFaults) -> None:
     assert gps.driver.link().discarded_bytes > 0
     for reading in readings:
         np.testing.assert_array_equal(reading.position, expected[reading.utc_ns])
+
+
+def test_a_fix_is_read_although_the_request_for_the_next_fixes_cannot_be_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gps = bench()
+    gps.fly(3.0)
+
+    def full(_: bytes) -> None:
+        raise NotResponding("line", "the output queue is full")
+
+    monkeypatch.setattr(gps.line.host, "send", full)
+    gps.driver._is_due = True
+    assert len(gps.fly(1.0)) == 1
+    gps.driver._is_due = True
+    with pytest.raises(NotResponding, match="queue is full"):
+        gps.driver.poll()
+
+
+def test_each_baud_rate_is_tried_although_the_port_rejects_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    gps, tried = bench(), list[int]()
+
+    def change(baud_rate: int) -> None:
+        gps.line.host.baud_rate = baud_rate
+        tried.append(baud_rate)
+        if baud_rate == 9600:
+            raise NotResponding("line", "does not support 9600 baud")
+
+    monkeypatch.setattr(gps.line.host, "set_baud_rate", change)
+    gps.line.to_host.faults = LineFaults(garbage=True)
+    for _ in range(600):
+        with suppress(NotResponding):
+            gps.fly(0.1)
+    assert {9600, 38400, 57600} <= set(tried)
 
 
 def test_a_lost_port_is_reported() -> None:

@@ -181,6 +181,35 @@ def test_values_that_never_change_are_not_accepted_as_readings(bench: BenchLine)
     assert seconds_until_readings(bench) <= 2.0
 
 
+def test_readings_are_not_lost_if_a_command_cannot_be_sent(
+    bench: BenchLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: bytes) -> None:
+        raise NotResponding("line", "the output queue is full")
+
+    monkeypatch.setattr(bench.line.host, "send", full)
+    bench.driver._recovery.reset()
+    assert len(bench.run(1.0)) >= 39
+
+
+def test_each_baud_rate_is_tried_although_the_port_rejects_one(
+    bench: BenchLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def change(baud_rate: int) -> None:
+        bench.line.host.baud_rate = baud_rate
+        tried.append(baud_rate)
+        if baud_rate == 230400:
+            raise NotResponding("line", "does not support 230400 baud")
+
+    monkeypatch.setattr(bench.line.host, "set_baud_rate", change)
+    bench.line.to_host.faults = LineFaults(garbage=True)
+    for _ in range(400):
+        poll(bench)
+    assert {230400, 921600, 460800} <= set(tried)
+
+
 def test_a_unit_that_refuses_is_asked_again_a_second_later_and_not_at_every_cycle(bench: BenchLine) -> None:
     bench.unit.registers.values[1] = ("VN-200T-CR",)
     asked: list[bytes] = []
