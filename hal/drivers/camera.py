@@ -34,6 +34,8 @@ PERIOD_NS = 10_000_000
 RETRY_NS = 1_000_000_000
 PATIENCE_NS = 3_000_000_000
 _MOST_EXPOSURES = 6
+_FAILURES = DeviceError, OSError, RuntimeError, ValueError
+"""Exceptions after which a camera is reopened; only a driver of another team raises the last three."""
 
 
 @dataclass(slots=True)
@@ -117,7 +119,7 @@ class ServedCamera:
         self._closed = False
         try:
             self._open_device()
-        except DeviceError as error:
+        except _FAILURES as error:
             if not patient:
                 raise
             self._drop(error)
@@ -170,7 +172,7 @@ class ServedCamera:
             if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:
                 problem = "no frame arrived after the trigger: check the camera and its cable"
                 raise NotResponding(self.name, problem)
-        except DeviceError as error:
+        except _FAILURES as error:
             self._drop(error)
             return
         if frame is not None:
@@ -188,7 +190,7 @@ class ServedCamera:
         self._retry_ns = now_ns + RETRY_NS
         try:
             self._open_device()
-        except DeviceError as error:
+        except _FAILURES as error:
             self._drop(error)
             return False
         with self._lock:
@@ -198,23 +200,26 @@ class ServedCamera:
     def _open_device(self) -> None:
         try:
             self._device.open()
-        except DeviceError:
+        except _FAILURES:
             self._device.close()
             raise
         self.counts.openings += 1
         self._open = True
 
-    def _drop(self, error: DeviceError) -> None:
+    def _drop(self, error: Exception) -> None:
         """Close a failing camera and discard the pending request."""
-        self._device.close()
         self._open = False
         self._deadline_ns = None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
         kind = Refused if isinstance(error, Refused) else NotResponding
+        device, text = self.name, f"{type(error).__name__}: {error}"
+        if isinstance(error, DeviceError):
+            device, text = error.device, error.message
         with self._lock:
             self._asked = None
             if not self._closed:
-                self._failure = kind(error.device, error.message)
+                self._failure = kind(device, text)
+        self._device.close()
 
 
 class FrameNumbers:

@@ -18,6 +18,7 @@ from hal.buses.system import SystemClock
 from hal.drivers.camera import PIXEL_FORMATS, CameraCounts, FrameNumbers, PixelError, ServedCamera
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+from sim_hal.clock import SimClock
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.hal.cameras.rig import EXPOSURE_NS, Rig, settled, video_rig
 from tests.manual_clock import ManualClock
@@ -70,6 +71,43 @@ def test_neither_trigger_nor_poll_waits_for_a_camera_that_hangs() -> None:
     assert frame is not None
     assert frame.exposure_ns == 2_000_000
     assert camera.counts.delivered == 1, "the first was abandoned"
+    camera.close()
+
+
+@pytest.mark.parametrize("error", [OSError(19, "No such device"), RuntimeError("lost"), ValueError("bad")])
+def test_a_camera_whose_driver_raises_another_exception_is_reopened(error: Exception) -> None:
+    class Foreign(SlowCamera):
+        broken = False
+        openings = 0
+
+        def open(self) -> None:
+            self.openings += 1
+            self.fail()
+
+        def collect(self) -> Frame | None:
+            self.fail()
+            return super().collect()
+
+        def close(self) -> None:
+            self.fail()
+
+        def fail(self) -> None:
+            if self.broken:
+                raise error
+
+    device, clock = Foreign(), SimClock()
+    device.go.set()
+    camera = ServedCamera(device, clock)
+    device.broken = True
+    clock.sleep_until_ns(clock.now_ns() + 3_500_000_000)
+    with pytest.raises(NotResponding, match=str(error.args[-1])):
+        camera.poll()
+    assert device.openings == 4, "one at the start, and one a second"
+    device.broken = False
+    clock.sleep_until_ns(clock.now_ns() + 1_500_000_000)
+    camera.trigger(1_000_000)
+    clock.sleep_until_ns(clock.now_ns() + 100_000_000)
+    assert camera.poll() is not None
     camera.close()
 
 
