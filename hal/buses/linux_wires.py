@@ -192,6 +192,9 @@ class PySerialPort:
                 continue
             with self._port_lock:
                 self._serial = port
+                # The baud rate may have changed while the port was opened.
+                with suppress(*_PORT_ERRORS):
+                    port.baudrate = self.baud_rate
             self._failure = ""
             return
 

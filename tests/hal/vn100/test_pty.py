@@ -8,12 +8,15 @@ import os
 import signal
 import subprocess
 import sys
+import termios
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 
 from flight.schema.sections import CONTROL_RATE_HZ
 from hal.buses import linux_wires
@@ -135,6 +138,41 @@ def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
     assert words == b"again"
     port.send(b"answer")
     assert os.read(second[0], 100).endswith(b"answer")
+    port.close()
+    for end in second:
+        os.close(end)
+
+
+def test_a_baud_rate_that_is_set_while_the_port_is_reopened_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linux_wires, "_REOPEN_S", 0.005)
+    clock, name = SystemClock(), tmp_path / "imu"
+    first, second = os.openpty(), os.openpty()
+    name.symlink_to(os.ttyname(first[1]))
+    port = PySerialPort(str(name), 115200, clock)
+    opening, changed = threading.Event(), threading.Event()
+    open_port = port._open
+
+    def slowly() -> serial.Serial:
+        opened = open_port()
+        opening.set()
+        assert changed.wait(10.0)
+        return opened
+
+    monkeypatch.setattr(port, "_open", slowly)
+    name.unlink()
+    os.close(first[1])
+    os.close(first[0])
+    name.symlink_to(os.ttyname(second[1]))
+    assert opening.wait(10.0)
+    port.set_baud_rate(57600)
+    changed.set()
+    deadline_ns = clock.now_ns() + 10_000_000_000
+    while port._failure and clock.now_ns() < deadline_ns:
+        clock.sleep_until_ns(clock.now_ns() + 1_000_000)
+    assert port._failure == ""
+    assert termios.tcgetattr(second[1])[4:6] == [termios.B57600, termios.B57600]
     port.close()
     for end in second:
         os.close(end)
