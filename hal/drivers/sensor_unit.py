@@ -421,9 +421,9 @@ class Adis16470:
         for _ in range(_TRIES):
             before, *halves, after = self._read([DATA_CNTR, *range(first, first + 12, 2), DATA_CNTR])
             if before == after:
-                break
-        words = [high << 16 | low for low, high in zip(halves[::2], halves[1::2], strict=True)]
-        return tuple((word - (word >> 31 << 32)) * step for word in words)
+                words = [high << 16 | low for low, high in zip(halves[::2], halves[1::2], strict=True)]
+                return tuple((word - (word >> 31 << 32)) * step for word in words)
+        raise NotResponding("ADIS16470", f"the sample changed during each of {_TRIES} reads")
 
     def _read(self, registers: Sequence[int]) -> list[int]:
         """Return the values of 16-bit registers, each received in the frame after the register's request."""

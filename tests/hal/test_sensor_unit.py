@@ -18,6 +18,8 @@ from flight.schema.devices import axis_matrix
 from hal.buses.linux_wires import LinuxSpiDevice, LinuxWires
 from hal.buses.system import SystemClock
 from hal.drivers.sensor_unit import (
+    PROD_ID,
+    PRODUCT,
     Adis16470,
     CheckedUnit,
     SensorPart,
@@ -267,6 +269,24 @@ def test_an_adis16470_measures_negative_rates_and_averages() -> None:
     clock.sleep_until_ns(2_000_000_000)
     np.testing.assert_allclose(sensor.gyro, motion.rate, atol=5e-4)
     np.testing.assert_allclose(sensor.acceleration, motion.specific_force_body, atol=5e-3)
+
+
+def test_an_adis16470_never_mixes_the_axes_of_two_samples() -> None:
+    """If the sample counter changes in every try, there is no reading."""
+
+    class Part:
+        counter = 0
+
+        def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+            self.counter += 1
+            requested = [b"\0\0", *frames[:-1]]
+            known = {PROD_ID: PRODUCT}
+            words = [known.get(frame[0], 16 * self.counter + index) for index, frame in enumerate(requested)]
+            return [word.to_bytes(2, "big") for word in words]
+
+    sensor = Adis16470(Part())
+    with pytest.raises(NotResponding, match="the sample changed"):
+        _ = sensor.gyro
 
 
 @pytest.mark.parametrize(("answer", "error"), [(b"\xff\xff", NotResponding), (b"\x12\x34", Refused)])
