@@ -56,7 +56,7 @@ _MOST_HIDDEN = 0.5
 """Largest fraction of a horizon camera's image that the configured structure may cover."""
 Polygon = Annotated[tuple[tuple[float, float], ...], Meta(min_length=3, max_length=64)]
 Quantity = Literal["gyro", "magnetic", "acceleration"]
-ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
+ExposureTime = Annotated[float, Meta(ge=1e-6, le=10.0)]
 
 
 class UnitAccuracy(Section, frozen=True, kw_only=True):
@@ -586,7 +586,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
     decades: Annotated[float, Meta(ge=1.0, le=12.0)] = 6.0
     bits: Annotated[int, Meta(ge=8, le=16)] = 8
     pedestal: Annotated[float, Meta(ge=0.0, le=200.0)] = 8.0
-    exposure: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.005
+    exposure: Annotated[float, Meta(ge=1e-6, le=1.0)] = 0.005
     period: Annotated[float, Meta(ge=0.5)] = 5.0
     fine_period: Annotated[float, Meta(ge=0.5)] = 60.0
     sun: bool = True

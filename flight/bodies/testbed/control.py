@@ -583,7 +583,10 @@ _ACROSS: FloatArray = np.array([1.0, 0.0, 1.0])
 
 
 class CageField:
-    """Predicts the magnetic field of the Helmholtz cage at any time."""
+    """Predicts the magnetic field of the Helmholtz cage at any time.
+
+    The host's UTC is read once at the start, so that a later step of the host's UTC does not move the field.
+    """
 
     def __init__(self, section: Cage, weakest: float, clock: Clock) -> None:
         """Raise ConfigError for malformed elements, or if the field falls below `weakest` (T)."""

@@ -125,6 +125,7 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
             "gps: {device: /dev/knightcube-imu}\ncamera:",
             "`gps.device` is /dev/knightcube-imu, which `inertial_unit.device` also uses",
         ),
+        ("exposure: 1.0", "exposure: 1.0e-10", "`camera.exposure`.*1e-06"),
         ("exposure: 1.0", "exposure: 6.0", "must be shorter than `camera.period`"),
         ("psf_sigma: 1.0", "psf_sigma: 0.2", r"`camera.psf_sigma` is 0.2: expected a number >= 0.3"),
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
