@@ -532,7 +532,7 @@ class Renewal:
         """Check a bundle and begin its trial. Raises Refused for an invalid bundle, and OSError."""
         state, board = self._state, self._board
         if state.returning:
-            raise Refused("the return to an earlier version is not finished")
+            raise Refused("the return to an earlier version is not finished: activate again later")
         if state.trial is not None:
             raise Refused(
                 f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw this trial first"
@@ -754,7 +754,10 @@ class Renewal:
         return min({*map(self._board.flown_release, units)} - {"", trial.new}, default="")
 
     def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
-        """Return to the previous release or configuration. Returns False without a previous version."""
+        """Return to an earlier release or configuration.
+
+        Returns False without an undamaged earlier version that differs from the present one.
+        """
         state, board = self._state, self._board
         if what == "release":
             current, name = board.release("current"), board.release("previous")

@@ -179,7 +179,8 @@ def _check_craft(craft: Craft, refuse: Refuse) -> None:
         refuse("craft.inertia", problem)
     for offset, edge, axis in zip(craft.centre_of_mass, craft.size, "xyz", strict=True):
         if abs(offset) >= 0.5 * edge:
-            refuse("craft.centre_of_mass", f"is {offset:g} m along {axis}: outside the box of {edge:g} m")
+            problem = f"is {offset:g} m along {axis}: outside the box of {edge:g} m"
+            refuse("craft.centre_of_mass", f"{problem}: give m from the centre of the box")
 
 
 # Limits of the density of a satellite, kg/m^3: an inflated balloon, and platinum.
@@ -360,10 +361,11 @@ def _check_addresses(config: Config, refuse: Refuse) -> None:
                 chip = f"a chip of type {section.driver} has 0x{low:02x} to 0x{high:02x}"
                 refuse(name, f"is 0x{address:02x} ({address}), but {chip}{hint}")
         if kind == "coils" and section.driver == "drv8830":
-            last = section.address + len(section.windings) - 1
+            last, greatest = section.address + len(section.windings) - 1, high - len(section.windings) + 1
             if last > high:
                 problem = f"is 0x{section.address:02x}: the coils use the addresses up to 0x{last:02x}"
-                refuse(f"{key}.address", f"{problem}, but a drv8830 has at most 0x{high:02x}")
+                cure = f"a drv8830 has at most 0x{high:02x}: give at most 0x{greatest:02x}"
+                refuse(f"{key}.address", f"{problem}, but {cure}")
 
 
 def _check_connections(config: Config, refuse: Refuse) -> None:

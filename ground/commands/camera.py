@@ -55,7 +55,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="PNG", help="write the frame; several as name-NUMBER.png")
     parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
-    parser.add_argument("--exposure", type=float, metavar="S", help="exposure instead of the configuration's")
+    text = "exposure time, 1e-6 to 10 s, instead of that of the configuration"
+    parser.add_argument("--exposure", type=float, metavar="S", help=text)
     text = "rotate a simulated camera, rad/s in its axes: boresight +z, x right, y down"
     parser.add_argument("--rate", type=finite, nargs=3, metavar=("X", "Y", "Z"), help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object")

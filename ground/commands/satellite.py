@@ -441,7 +441,7 @@ def _parameters_in(path: Path) -> dict[str, float]:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise document.error(f"{section}.{name}", f"is {value!r}: must be a number")
             if not abs(value) <= sys.float_info.max:
-                raise document.error(f"{section}.{name}", "must be a finite number")
+                raise document.error(f"{section}.{name}", f"is {value!r:.20}: must be a finite number")
             values[f"{section}.{name}"] = float(value)
     if problem := commands.problem_of(values):
         raise UsageError(f"{path}: {problem}")

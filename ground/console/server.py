@@ -145,7 +145,7 @@ class Console:
         doubts = [text for doubt in self.doubts if (text := doubt())]
         if self.restarts:
             doubts.append(
-                f"restarts of the flight: {self.restarts}; the page shows the packets since the last"
+                f"restarts of the flight: {self.restarts}; the page shows the packets since the last restart"
             )
         self.trouble = "; ".join(doubts)
         # Packets of one time may arrive in two reads, so the page shows times up to the previous read.

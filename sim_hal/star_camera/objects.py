@@ -157,7 +157,7 @@ class SkyObjects:
             if entry.state is not None:
                 orbiting(world, name)
                 if (radius := math.hypot(*entry.state.position)) < EARTH_RADIUS:
-                    problem = f"is {radius:g} m from the centre of the Earth, below the ground: give m"
+                    problem = f"is {radius:g} m from the centre of the Earth, below the ground: give metres"
                     raise ConfigError(f"{name}.state.position", problem)
         self._world = world
         self._start_ns = self._epoch_ns = start_ns

@@ -763,7 +763,7 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
             raise ConfigError("simulation.free_body.craft.inertia", problem)
     size, centre = craft.size or described.size, craft.centre_of_mass or described.centre_of_mass
     if any(abs(offset) >= 0.5 * edge for offset, edge in zip(centre, size, strict=True)):
-        problem = f"is {list(centre)}: outside the box of {list(size)} m"
+        problem = f"is {list(centre)}: outside the box of {list(size)} m: give m from the centre of the box"
         raise ConfigError("simulation.free_body.craft.centre_of_mass", problem)
     coils = config.coils
     if craft.windings is not None:

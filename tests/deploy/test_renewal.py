@@ -625,7 +625,9 @@ def test_a_return_that_fails_is_tried_again_and_blocks_no_request(board: Renewed
     board.step()
     refused = board.activate(board.bundle("configuration", board.place / "second.yaml", 2))
     assert "cannot return yet" in board.step()
-    assert board.reports(refused) == [("failed", "the return to an earlier version is not finished")]
+    assert board.reports(refused) == [
+        ("failed", "the return to an earlier version is not finished: activate again later")
+    ]
     shutil.rmtree(board.config)
     board.step()
     assert board.flown() == ground

@@ -172,7 +172,7 @@ def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) 
         known = TwoLineElements(*lines)
         found = np.array([known.at(float(date)).position for date in dates])
     except (OrbitError, UsageError) as error:
-        raise UsageError(f"no elements fit the positions, in m: {error}") from error
+        raise UsageError(f"no elements fit the positions, which must be in m: {error}") from error
     return np.asarray(np.linalg.norm(found - positions, axis=1))
 
 

@@ -92,7 +92,7 @@ class PointingTarget:
         try:  # a list or an array could be changed later
             object.__setattr__(self, "numbers", tuple(map(float, self.numbers)))
         except (TypeError, ValueError):
-            raise UsageError(f"{self.goal.label}: {self.numbers!r} are not a sequence of numbers") from None
+            raise UsageError(f"{self.goal.label}: {self.numbers!r}: give a sequence of numbers") from None
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))

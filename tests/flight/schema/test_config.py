@@ -476,7 +476,9 @@ def test_the_craft_needs_its_inertia_or_its_mass() -> None:
     mass = next(line for line in ORBIT.splitlines() if line.startswith("  mass:"))
     with pytest.raises(ConfigError, match="`craft` needs `inertia` or `mass`"):
         reader.parse(ORBIT.replace(inertia, "", 1).replace(mass, "", 1))
-    with pytest.raises(ConfigError, match=r"centre_of_mass` is 0.06 m along y: outside the box"):
+    with pytest.raises(
+        ConfigError, match=r"centre_of_mass` is 0.06 m along y: outside the box of .*: give m"
+    ):
         reader.parse(ORBIT.replace(inertia, f"{inertia}\n  centre_of_mass: [0.0, 0.06, 0.0]", 1))
 
 
@@ -571,5 +573,5 @@ def test_a_magnetometer_beside_the_inertial_unit_is_checked_like_the_unit() -> N
 def test_bridges_of_which_the_last_has_no_address_are_refused() -> None:
     text = "extends: step_demo\ncoils: {driver: drv8830, address: 0x66}\n"
     assert reader.parse(text).coils.address == 0x66
-    with pytest.raises(ConfigError, match=r"coils.address` is 0x67: the coils use the addresses up to 0x69"):
+    with pytest.raises(ConfigError, match=r"is 0x67: the coils use .* up to 0x69, .*: give at most 0x66"):
         reader.parse(text.replace("0x66", "0x67"))

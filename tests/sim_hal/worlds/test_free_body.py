@@ -432,7 +432,10 @@ def described_world(text: str) -> World:
     ("values", "problem"),
     [
         ("free_body: {disturbances: {drag: 1e300}}", "disturbances.drag"),
-        ("free_body: {craft: {centre_of_mass: [0.06, 0.0, 0.0]}}", "centre_of_mass.*outside the box"),
+        (
+            "free_body: {craft: {centre_of_mass: [0.06, 0.0, 0.0]}}",
+            "centre_of_mass.*outside the box.*: give m",
+        ),
         ("imu: {quaternion_noise: 2.0}", "quaternion_noise"),
         ("latency: {planner: 1e300}", "latency.planner"),
         ("sky: {readout: 1e300}", "sky.readout"),

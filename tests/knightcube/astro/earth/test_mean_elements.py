@@ -110,5 +110,5 @@ def test_positions_without_an_orbit_are_refused() -> None:
         fit_elements(DATE + np.arange(4) / 1440.0, np.ones((4, 3)) * 7e6)
     with pytest.raises(UsageError, match="define no orbital plane"):
         fit_elements(DATE + np.arange(4) / 1440.0, np.zeros((4, 3)))
-    with pytest.raises(UsageError, match="no elements fit the positions, in m: "):
+    with pytest.raises(UsageError, match="no elements fit the positions, which must be in m: "):
         fit_elements(DATE + np.arange(4) / 1440.0, 1e-3 * positions)

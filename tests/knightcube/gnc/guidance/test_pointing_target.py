@@ -53,7 +53,7 @@ def test_a_roll_is_shown_in_degrees() -> None:
     ("goal", "numbers", "roll", "message"),
     [
         (Goal.NADIR, (1.0,), None, "nadir takes 0 numbers, not 1"),
-        (Goal.GROUND, 0.1, None, "ground: 0.1 are not a sequence of numbers"),
+        (Goal.GROUND, 0.1, None, "ground: 0.1: give a sequence of numbers"),
         (Goal.INERTIAL, (0.0, 0.0, 1.0), None, "inertial takes 4 numbers, not 3"),
         ("sun", (), None, "'sun': give one of Goal.NADIR, Goal.VELOCITY"),
         (Goal.GROUND, (0.1,), None, "ground takes 2 numbers, not 1: latitude, longitude"),
