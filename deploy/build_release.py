@@ -258,7 +258,7 @@ def _write(path: Path, text: str) -> None:
 
 @contextmanager
 def _alone(prefix: Path) -> Iterator[None]:
-    """Hold the lock of builds. Raises SystemExit while another build runs, which would lose its release."""
+    """Hold the lock of builds. Raises SystemExit while another build runs, whose release would be removed."""
     prefix.mkdir(parents=True, exist_ok=True)
     with open(prefix / ".build", "a", encoding="ascii") as lock:
         try:

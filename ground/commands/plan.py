@@ -25,6 +25,7 @@ from knightcube.gnc.guidance.pointing_target import NUMBERS, Goal, PointingTarge
 from knightcube.gnc.guidance.slew_model import HORIZON_RANGE as SLEW_HORIZON_RANGE
 from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, BoresightEnd
 from knightcube.gnc.guidance.slew_model import NODES as SLEW_NODES
+from knightcube.gnc.guidance.slew_model import NODES_RANGE as SLEW_NODES_RANGE
 from knightcube.gnc.guidance.slew_plan import STRETCH, OrderedSlew, SlewStatus
 from knightcube.gnc.guidance.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, StepPlan
 
@@ -64,7 +65,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--time-price", type=positive, metavar="W", help=text)
     text = "energy to minimise: R I^2 of the mean current (heat), or V |I| from the supply"
     parser.add_argument("--cost", choices=[cost.value for cost in PathCost], help=text)
-    parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
+    text = f"nodes of the path (default {NODES}; with --orbit {SLEW_NODES})"
+    parser.add_argument("--nodes", type=int, metavar="N", help=text)
     text = f"configuration of the plant, a file or an installed name (default {_DEFAULT_CONFIG})"
     parser.add_argument("--config", type=config_path, metavar="CONFIG", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")
@@ -162,10 +164,15 @@ def _check(options: argparse.Namespace) -> None:
         ("--horizon", options.horizon, HORIZON_RANGE),
         ("--nodes", options.nodes, NODES_RANGE),
     ):
-        if value is not None and not low <= value <= high:
-            raise UsageError(f"{option} {value:g}: must be {low:g} to {high:g}")
+        _check_range(option, value, low, high)
     if options.time_price is not None and options.horizon is not None:
         raise UsageError(f"--horizon {options.horizon:g}: --time-price chooses the horizon: give one of them")
+
+
+def _check_range(option: str, value: float | None, low: float, high: float) -> None:
+    """Raise UsageError for an option whose value is given and out of range."""
+    if value is not None and not low <= value <= high:
+        raise UsageError(f"{option} {value:g}: must be {low:g} to {high:g}")
 
 
 def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
@@ -226,6 +233,7 @@ def _planned(
     if options.least_time and options.time_price is not None:
         raise UsageError("--least-time and --time-price: give one of them")
     longest = STRETCH * options.within if options.longest is None else options.longest
+    _check_range("--nodes", options.nodes, *SLEW_NODES_RANGE)
     low, high = SLEW_HORIZON_RANGE
     if not low <= options.within <= longest <= high:
         raise UsageError(f"--within {options.within:g}, longest {longest:g}: must be {low:g} to {high:g}")

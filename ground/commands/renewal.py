@@ -273,7 +273,9 @@ def artefact(kind: str, path: Path) -> bytes:
     if kind == "configuration":
         text = read_text(path)
         if parse(text, str(path)).link is None:
-            raise UsageError(f"{path}: has no `link`, so its flight could not be reached")
+            raise UsageError(
+                f"{path}: has no section `link`, without which the ground cannot reach the board: add it"
+            )
         if len(read_document(text, str(path)).chain) > 1:
             cure = f"merge the files by `{PROGRAM} check {path} --merged NEW`, and sign NEW"
             raise UsageError(f"{path}: `extends` names a file that the board does not have: {cure}")

@@ -599,7 +599,7 @@ class NmeaReceiver:
         """
         self._port, self._clock, self._earliest_ns = port, clock, earliest_ns
         self._buffer = b""
-        self._halves: dict[str, tuple[int, list[str]]] = {}  # time (ns) of the begin, and fields
+        self._halves: dict[str, tuple[int, list[str]]] = {}  # time (ns) of the first byte, and fields
         self._height: tuple[float, float] | None = None  # seconds of the day and altitude (m) of the last fix
         self._bytes = self._sentences = self._bad = self._discarded = 0
         self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0

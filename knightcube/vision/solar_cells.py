@@ -32,7 +32,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.errors import UsageError
 
 _MOST_STEPS, _FULL_STEPS = 30, 8
-"""Maximum number of Gauss-Newton steps, and number of steps that may increase chi-square."""
+"""Maximum number of Gauss-Newton steps, and number of first steps that may increase chi-square."""
 _SOFT = 0.05
 """Width of the range of the incidence angle's cosine in which the modelled current rises smoothly from zero.
 
@@ -160,8 +160,9 @@ def _fitted_direction(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return direction (3,), tangent basis (2, 3) and covariance (2, 2) of the Sun with least chi-square.
 
-    The Gauss-Newton iteration starts from `direction` (3,). The `readings` (n,) without earthlight, fractions
-    of the peak currents, are from strings with `normals` (n, 3), and have the `information` (n, n).
+    The Gauss-Newton iteration starts from `direction` (3,). The `readings` (n,) are the currents of strings
+    with `normals` (n, 3), without earthlight and as fractions of the peak currents. The `information` (n, n)
+    is the inverse of their covariance.
     """
     best, share = math.inf, 1.0
     for number in range(_MOST_STEPS):

@@ -357,7 +357,10 @@ class StarTracker:
 
 
 def _check_size(shape: tuple[int, ...], camera: CameraModel, owner: str) -> None:
-    """Raise ArgumentError unless an image of `shape` has the size of `camera`; `owner` begins its size."""
+    """Raise ArgumentError unless an image of `shape` has the size of `camera`.
+
+    The text `owner` stands before the expected size in the message.
+    """
     if shape != (camera.rows, camera.columns):
         raise ArgumentError(
             "image",

@@ -262,7 +262,8 @@ def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
 def refusal(task: SlewTask, tried: int, least: float = math.inf) -> str:
     """Return the error message for a task without a path, with possible remedies.
 
-    The argument `least` is the attribute of the search with this name.
+    The argument `least` is the smallest ratio of the peak dipole to the dipole limit that the search found
+    without the dipole limit (`SlewSearch.least`).
     """
     text = f"no slew within the dipole limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"

@@ -121,7 +121,7 @@ def _bent_one(x: float, y: float, z: float, bend: FloatArray) -> tuple[float, fl
 # Maximum number of iterations that invert the lens errors, and step (rad) below which they end.
 # Each iteration reduces the error to a few per cent.
 _BEND_STEPS, _LEAST_STEP = 8, 1e-11
-# Step (rad) of the last iteration above which a direction, far outside the image, has no inverse.
+# Last step (rad) above which the iteration has diverged, as it does for directions far outside the image.
 _DIVERGED = 1e-4
 
 

@@ -45,7 +45,7 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
 
 def test_a_number_of_nodes_of_0_is_refused() -> None:
     done = command(*TO_THE_SUN, "--within", "120", "--nodes", "0")
-    assert (done.returncode, "nodes is 0: must be an integer from 8" in done.stderr) == (1, True)
+    assert (done.returncode, "--nodes 0: must be 8 to 96" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

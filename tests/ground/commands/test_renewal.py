@@ -167,7 +167,7 @@ def test_a_date_of_expiry_with_a_time_zone_is_converted_to_utc() -> None:
     ("text", "words"),
     [
         ("extends: base.yaml\nname: derived\n", "--merged NEW`, and sign NEW"),
-        ("extends: orbit.yaml\nname: silent\n", "has no `link`"),
+        ("extends: orbit.yaml\nname: silent\n", "has no section `link`"),
     ],
 )
 def test_a_configuration_that_the_board_could_not_use_is_not_signed(
