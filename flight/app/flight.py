@@ -675,9 +675,9 @@ def _begin_folder(
         run = begin_run(request.archive, config.telemetry.archive_bytes, logs_bytes)
         request = replace(request, out=run.folder)
     out = request.out
-    if any(out.glob("*.ccsds")):
-        raise UsageError(f"{out} already contains a run: give another folder, or remove this one")
     try:
+        if any(out.glob("*.ccsds")):
+            raise UsageError(f"{out} already contains a run: give another folder, or remove this one")
         out.mkdir(parents=True, exist_ok=True)
         file = stack.enter_context((out / "config.yaml").open("a", encoding="utf-8"))
         _lock(out, file)

@@ -88,7 +88,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def link(options: argparse.Namespace) -> int:
     """Run the link until a signal arrives. Raises ConfigError, and KnightCubeError for other errors."""
-    if options.log.exists() and not options.log.is_dir():
+    if os.path.exists(options.log) and not os.path.isdir(options.log):  # false if the disk fails
         raise ConfigError(f"--log {options.log}", "is not the folder of a run or of an archive")
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -119,8 +119,9 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
         stack.callback(overseer.stopping)
         status = f"link open on {names}"
         _say("; ".join(filter(None, (status, retry.summary()))))
-        if not find_segments((find_runs(log) or [log])[-1], "flight"):
-            _say(f"--log {log}: no flight log yet: telemetry begins with the flight log in this folder")
+        with suppress(OSError):  # a damaged disk of the flight must not end the link
+            if not find_segments((find_runs(log) or [log])[-1], "flight"):
+                _say(f"--log {log}: no flight log yet: telemetry begins with the flight log in this folder")
         overseer.ready(status)
         release = FlownRelease(os.environ)
         if release.note:

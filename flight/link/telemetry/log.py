@@ -19,6 +19,7 @@ import math
 import os
 import re
 import shutil
+import stat
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -210,9 +211,9 @@ MOST_RUNS = 1000
 LEAST_FREE_BYTES = 64 << 20
 """Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""
 
-DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""Error numbers (errno) of a full or failing disk. A different error number indicates a wrong path of the
-log."""
+DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EUCLEAN, errno.EBADMSG})
+"""Error numbers (errno) of a full, failing or damaged disk. A different error number indicates a wrong path
+of the log."""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
@@ -226,8 +227,8 @@ class NewRun:
 
 
 def find_runs(archive: Path) -> list[Path]:
-    """Return the run folders in an archive, oldest first, or an empty list if there are none."""
-    return [path for _, path in _numbered(archive) if path.is_dir() and not path.is_symlink()]
+    """Return the run folders in an archive, oldest first, without folders that a failing disk hides."""
+    return [path for _, path in _numbered(archive) if os.path.isdir(path) and not os.path.islink(path)]
 
 
 def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
@@ -242,7 +243,9 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
             f"archive budget of {budget_bytes} bytes is too small: one run needs {coming_bytes} bytes"
         )
     runs, taken = find_runs(archive), _numbered(archive)
-    folder = archive / f"run-{taken[-1][0] + 1 if taken else 1:06d}"
+    number = taken[-1][0] + 1 if taken else 1
+    while os.path.lexists(folder := archive / f"run-{number:06d}"):  # a failing disk hides the earlier runs
+        number += 1
     dropped = _make_room(runs, budget_bytes - coming_bytes)
     while dropped < len(runs) - 1 and _free(archive) < LEAST_FREE_BYTES:
         _drop(runs[dropped])
@@ -273,8 +276,16 @@ def _drop(run: Path) -> None:
 
 
 def _numbered(archive: Path) -> list[tuple[int, Path]]:
-    """Return the run numbers and paths of all files and folders with the name of a run, in order."""
-    matches = ((_NAME.fullmatch(path.name), path) for path in archive.glob("run-*"))
+    """Return the run numbers and paths of all files and folders with the name of a run, in order.
+
+    A disk in trouble gives an empty list.
+    """
+    try:
+        matches = [(_NAME.fullmatch(path.name), path) for path in archive.glob("run-*")]
+    except OSError as error:
+        if error.errno not in DISK_TROUBLE:
+            raise
+        return []
     return sorted((int(match[1]), path) for match, path in matches if match)
 
 
@@ -290,14 +301,13 @@ def _make_room(runs: list[Path], room_bytes: int) -> int:
 
 
 def _size(folder: Path) -> int:
-    """Return the total size (bytes) of all files below a folder, ignoring files that disappear meanwhile."""
+    """Return the total size (bytes) of all files below a folder, except files that cannot be examined."""
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            if path.is_file() and not path.is_symlink():
-                total += path.stat().st_size
-        except OSError:
-            continue
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with suppress(OSError):
+                found = os.lstat(os.path.join(place, name))
+                total += found.st_size if stat.S_ISREG(found.st_mode) else 0
     return total
 
 

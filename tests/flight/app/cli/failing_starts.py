@@ -109,10 +109,15 @@ def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Ca
 
         yield f"the whole disk for three attempts: {errno.errorcode[error]}", long
 
+        def archive(event: str, about: str, error: int = error) -> int:
+            return error if event == "os.scandir" and about == str(place / "board" / "runs") else 0
+
+        yield f"the list of runs at all times: {errno.errorcode[error]}", archive
+
 
 def run(place: Path, complete: bool = False) -> None:
     """Run all starts of the link in the folder `place`, and print the result of each start."""
-    (place / "board").mkdir()
+    (place / "board" / "runs").mkdir(parents=True)
     config = write_linked_config(place / "board", udp="127.0.0.1:0", tcp="127.0.0.1:0")
     words = ["link", str(config), "--log", str(place / "board" / "runs")]
     faults, came_up = Faults(), False

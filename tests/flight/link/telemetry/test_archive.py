@@ -120,3 +120,37 @@ def test_a_flight_starts_although_the_disk_stores_nothing(
     monkeypatch.setattr(Path, "mkdir", mkdir)
     run = begin_run(tmp_path / "runs", 10, 1)
     assert (run.folder, run.folder.exists()) == (tmp_path / "runs" / "run-000001", False)
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EUCLEAN])
+def test_a_flight_starts_in_a_new_folder_although_the_archive_cannot_be_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    for _ in range(3):
+        fill(begin_run(tmp_path, 10_000, 100).folder, 300)
+    real = os.scandir
+
+    def scandir(path: Path) -> object:
+        if Path(path) == tmp_path:
+            raise OSError(number, os.strerror(number), str(path))
+        return real(path)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "scandir", scandir)
+        assert begin_run(tmp_path, 10_000, 100).folder.name == "run-000004"
+        assert names(tmp_path) == []
+    assert names(tmp_path)[-1] == "run-000004"
+
+
+def test_a_damaged_run_folder_stops_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for _ in range(3):
+        fill(begin_run(tmp_path, 10_000, 100).folder, 300)
+    real = os.scandir
+
+    def scandir(path: Path) -> object:
+        if "run-000002" in str(path):
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert begin_run(tmp_path, 10_000, 100).folder.name == "run-000004"
