@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import errno
 import importlib
 import math
 import os
@@ -105,6 +106,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
     """Return the object `module:object`; `known` maps short names to such objects. Raises ConfigError.
 
     A flight computer imports only known objects and the objects in the file that `KNIGHTCUBE_MODULES` names.
+    Raises OSError if a flight computer cannot read a file, because a later attempt may succeed.
     """
     place = known.get(named, named)
     module, colon, name = place.partition(":")
@@ -116,6 +118,8 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
     try:
         return getattr(importlib.import_module(module), name)
     except _MISTAKES as error:
+        if isinstance(error, OSError) and file is not None:
+            raise
         problem = _import_problem(module, name, error, on_board=file is not None)
         raise ConfigError(key, f"is {named!r}, which cannot be imported: {problem}") from error
 
@@ -166,12 +170,25 @@ def _mistake(error: Exception, file: str | None, cure: str) -> str:
     return f"{where}{type(error).__name__}: {error}{cure if where else ''}"
 
 
+_TRANSIENT = frozenset({errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE})
+"""Error numbers of a failing disk, and of used up memory or descriptors: a later attempt may succeed."""
+
+
 def _permitted_objects(path: Path) -> list[str]:
-    """Return the lines of a file, or nothing if anybody but root could have written it."""
-    with suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8", opener=_without_waiting) as file:
-        found = os.fstat(file.fileno())
-        if stat.S_ISREG(found.st_mode) and found.st_uid == 0 and not found.st_mode & 0o022:
-            return file.read(_LONGEST).split()
+    """Return the lines of a file, or nothing if anybody but root could have written it.
+
+    Raises OSError for a transient error.
+    """
+    try:
+        with open(path, encoding="utf-8", opener=_without_waiting) as file:
+            found = os.fstat(file.fileno())
+            if stat.S_ISREG(found.st_mode) and found.st_uid == 0 and not found.st_mode & 0o022:
+                return file.read(_LONGEST).split()
+    except UnicodeDecodeError:
+        pass
+    except OSError as error:
+        if error.errno in _TRANSIENT:
+            raise
     return []
 
 

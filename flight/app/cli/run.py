@@ -156,13 +156,22 @@ def _faults_help() -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Fly, show progress on standard error, and print the summary."""
+    try:
+        return _flown(options)
+    except OSError as error:
+        if options.archive is None:
+            raise
+        raise KnightCubeError(str(error)) from error  # the service manager restarts the service
+
+
+def _flown(options: argparse.Namespace) -> int:
     from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
     from flight.app.run import default_folder  # noqa: PLC0415
     from flight.app.service import StoppedError  # noqa: PLC0415
 
     request = RunRequest(
         options.config,
-        options.out or default_folder(options.config),
+        options.out or options.archive or default_folder(options.config),
         options.realtime,
         options.duration,
         options.seed,
@@ -179,10 +188,6 @@ def run(options: argparse.Namespace) -> int:
     except StoppedError as error:  # a signal interrupted the service's start
         sys.stderr.write(f"knightcube: {error}\n")
         return 0
-    except OSError as error:
-        if options.archive is None:
-            raise
-        raise KnightCubeError(str(error)) from error  # the service manager restarts the service
     if sys.stderr.isatty():
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -379,6 +380,26 @@ def test_a_list_that_another_user_owns_or_a_fifo_permits_nothing(tmp_path: Path)
     for file in (path, fifo, link):
         with pytest.raises(ConfigError, match="add it as a line"):
             imported("simulation.world", "math:tau", {}, {MODULES: str(file)})
+
+
+def test_a_transient_disk_error_at_an_import_is_no_mistake_of_the_configuration_on_a_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A service does not start again after a ConfigError, but retries after an OSError."""
+    known, board = {"plain": "tests.support.places:ROOT"}, {MODULES: str(tmp_path / "modules")}
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("flight.schema.document.importlib.import_module", fail)
+        with pytest.raises(OSError, match="Input/output error"):
+            imported("body", "plain", known, board)
+        with pytest.raises(ConfigError, match="cannot be imported: .*Input/output error"):
+            imported("body", "plain", known, {})
+    monkeypatch.setattr("flight.schema.document._without_waiting", fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        imported("body", "math:tau", {}, board)
 
 
 @pytest.mark.parametrize("read", [read_text, lambda path: accepted_config(path, {}).text])

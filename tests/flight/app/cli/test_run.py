@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import json
 import math
+import os
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from flight.app import flight
-from flight.app.cli import to_json
+from flight.app.cli import main, to_json
 from flight.app.cli.run import configure, counts_text, progress_on, seed_number, summary_facts, summary_text
 from flight.app.run import RunRequest, RunResult
 from flight.loop.flight_loop import FlightEnding, FlightProgress
@@ -116,6 +120,31 @@ def test_elapsed_time_is_that_of_the_flight_and_a_failure_is_status_1(
     (request,) = requests
     assert (request.seed, request.duration, request.out) == (7, 3.0, Path("runs/mine"))
     assert (request.faults, request.accepted, request.realtime) == (("imu: silent",), True, False)
+
+
+def test_a_disk_error_before_the_flight_ends_a_service_with_status_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service manager does not restart a service that ends with status 2."""
+
+    def fail(path: object, *_: object, **__: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    words = ["run", str(tmp_path / "flight.yaml"), "--archive", str(tmp_path / "runs")]
+    with monkeypatch.context() as patch:
+        patch.setattr(flight, "fly", fail)
+        assert main(words) == 1
+        patch.setattr("flight.app.run.default_folder", fail)
+        assert main([*words[:2], "--out", str(tmp_path)]) == 2, "a person reads the message"
+        patch.setitem(sys.modules, "flight.app.flight", _Unread("flight.app.flight"))
+        assert main(words) == 1
+
+
+class _Unread(ModuleType):
+    """A module whose file cannot be read."""
+
+    def __getattr__(self, name: str) -> object:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), self.__name__)
 
 
 def test_progress_states_time_attitude_currents_slips_and_events(monkeypatch: pytest.MonkeyPatch) -> None:
