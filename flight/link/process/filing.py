@@ -168,7 +168,7 @@ class Filing:
         """
         try:
             path = self._received(use.name)
-        except FileError as error:
+        except (FileError, OSError) as error:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
         self._checks.append((done, self._choosing(path, use.name, use.sum, then)))
         return []
@@ -331,7 +331,7 @@ class Renewal:
         The request to activate an artefact contains the UTC (s) from the GPS receiver, if a fix was used
         since the start of the link. The host's clock may be wrong, so expiry dates are not compared with it.
         """
-        if not self._status.exists():
+        if not os.path.exists(self._status):
             return "the renewal service is not installed on this board: run deploy/install.sh"
         name = f"{done.spi}-{done.counter}-{done.request.packet}-{done.request.sequence}"
         values: dict[str, Any] = {"do": type(directive).__name__.lower()}
@@ -374,7 +374,7 @@ class Renewal:
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
         """Record the number `admitted` of authentic frames so far, and return new reports of the program."""
         contact = (str(admitted), self._fault)
-        if contact != self._recorded and now_ns >= self._due_ns and self._status.parent.exists():
+        if contact != self._recorded and now_ns >= self._due_ns and os.path.exists(self._status.parent):
             self._due_ns = now_ns + CONTACT_NS
             values = {"session": self._session, "frames": contact[0], "fault": contact[1]}
             if self._write("contact", encoded(values | {"limit_s": self._limit})):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,6 +107,25 @@ def test_a_report_that_could_not_be_read_once_is_sent_later(
     assert stages(ends, "activate") == []
     ends.turn(2.5)
     assert stages(ends, "activate") == [("failed", "no")]
+
+
+def test_a_folder_that_cannot_be_read_does_not_end_the_link(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directive, stat = put(ends), os.stat
+
+    def fail(path: object, **options: bool) -> os.stat_result:
+        if str(path).startswith((str(ends.place / "keys/files/received/"), str(ends.renewal.parent) + "/s")):
+            raise OSError(errno.EIO, "Input/output error")
+        return stat(path, **options)  # type: ignore[arg-type]  # as called
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "stat", fail)
+        ends.ask(directive)
+        ends.ask(Confirm(0))
+        ends.turn(2.5)
+    assert stages(ends, "activate")[-1][0] == "failed"
+    assert stages(ends, "confirm")[-1][0] == "failed"
 
 
 def test_an_activation_has_the_time_of_the_receiver_and_never_that_of_the_host(ends: Ends) -> None:
