@@ -116,6 +116,10 @@ def final_mode(command: Command) -> Mode | None:
             return None
 
 
+_LOG_DELAY_NS = 10 * SECOND_NS
+"""Mission time (ns) after which the log has been read beyond the BOOT packet at the begin of a flight."""
+
+
 class Verification:
     """Tracker of the stages of commands that were sent to the control process."""
 
@@ -151,7 +155,9 @@ class Verification:
         (row,) = layout.array(packet)
         sent, wanted, since_ns = self._open
         slews, trigger = isinstance(sent.command, Slew), to_text(row["trigger"])
-        if row["time_ns"] <= since_ns:
+        # The mission time of a restarted flight begins at 0 again, with the mode BOOT.
+        restarted = row["mode"] == Mode.BOOT and since_ns > _LOG_DELAY_NS
+        if row["time_ns"] <= since_ns and not restarted:
             return []
         if row["mode"] == wanted and (not slews or trigger == _ARRIVED):
             return self._close(Stage.COMPLETED, f"mode {wanted.label}")
@@ -192,9 +198,14 @@ class ControlLine(Generic[T]):
         self._waiting: list[_Waiting[T]] = []
         self._count = 0
 
+    @property
+    def is_full(self) -> bool:
+        """Whether as many commands as possible wait for answers."""
+        return len(self._waiting) >= AT_MOST
+
     def send(self, command: T, data: bytes, now_ns: int) -> str:
         """Send a command without waiting. Return the problem, or an empty text on success."""
-        if len(self._waiting) >= AT_MOST:
+        if self.is_full:
             return f"{AT_MOST} commands are already waiting for answers"
         self._count += 1
         path = self._folder / f"answer-{self._count}"

@@ -625,12 +625,16 @@ class Station:
             self._report_stages(report(sent, Stage.FAILED, problem))
 
     def _execute_due(self, now_ns: int) -> None:
-        """Send due scheduled commands to the control process, and report commands that are not executed."""
+        """Send due scheduled commands to the control process, and report commands that are not executed.
+
+        If too many commands are due at once, the others wait for the answers to the first ones.
+        """
         waits = self._log.label and now_ns - self._begun_ns < _UTC_WAIT_NS
         if self._utc_offset_ns is None and waits:
             return
         utc_ns = self._utc_ns()
-        for due in self._scheduling.due(utc_ns):
+        entries = self._scheduling.due(utc_ns)
+        while not self._control.is_full and (due := next(entries, None)) is not None:
             if isinstance(due, Sent):
                 self._hand_over(due, self._commands.pack(due.command, utc_ns), now_ns)
             else:

@@ -27,6 +27,7 @@ from flight.link.events import FOREIGN_MODES, Mode
 from flight.link.files.store import overwrite
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import (
+    AT_MOST,
     LATEST_NS,
     MOST_ENTRIES,
     Report,
@@ -135,6 +136,14 @@ def test_a_time_that_passes_during_a_stop_is_reported_and_not_executed(link: Bot
     assert texts(link, counter)[-1].startswith("not executed, it is ")
     assert texts(link, counter)[-1].endswith("slew to q2 +0.2000")
     assert texts(link, send(link, Listing()))[-1] == "0 scheduled"
+
+
+def test_more_commands_at_one_time_than_may_wait_for_answers_are_all_executed(link: BothEnds) -> None:
+    at = in_seconds(link, 5)
+    counters = [send(link, Scheduled(at, f"ping {number}")) for number in range(AT_MOST + 2)]
+    link.turn(8.0)
+    assert [unpack(data) for data in link.obeyed] == [Ping(number) for number in range(AT_MOST + 2)]
+    assert all(link.stages(counter)[-1] == "completed" for counter in counters)
 
 
 def test_safe_suspends_the_schedule(link: BothEnds) -> None:

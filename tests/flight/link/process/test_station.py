@@ -19,7 +19,7 @@ from flight.link.process import directives, station
 from flight.link.process.directives import Deletion, NewKey, Play, Portion, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK, Downlink
 from flight.link.security import Admitted
-from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
+from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT, MODE
 from flight.link.telemetry.log import SegmentStore
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, crc16
 from hal.interfaces.wires import SECOND_NS
@@ -64,6 +64,27 @@ def test_a_slew_is_completed_when_it_arrives_and_fails_otherwise(link: BothEnds)
     link.record(link.mode_packet(Mode.HOLD, "reaction hold"))
     link.turn()
     assert link.stages(third) == ["accepted", "started", "failed"]
+
+
+def test_a_command_that_a_restart_of_the_flight_interrupts_fails(link: BothEnds) -> None:
+    """The mission time of the next flight begins at zero again."""
+    link.turn(30.0)
+    counter = link.terminal.send(packet(Slew(0.2)))
+    link.turn()
+    assert link.stages(counter)[-1] == "started"
+    begun = {"before": 0, "mode": int(Mode.BOOT), "trigger": "begin", "reason": "", "target_q2": 0.0}
+    link.record(link.packer.pack(MODE, 0, begun))
+    link.turn()
+    assert link.stages(counter)[-1] == "failed"
+
+
+def test_a_late_packet_of_the_begin_of_a_flight_does_not_end_a_command(link: BothEnds) -> None:
+    begun = {"before": 0, "mode": int(Mode.BOOT), "trigger": "begin", "reason": "", "target_q2": 0.0}
+    counter = link.terminal.send(packet(Slew(0.2)))
+    link.turn()
+    link.record(link.packer.pack(MODE, 0, begun))
+    link.turn()
+    assert link.stages(counter)[-1] == "started"
 
 
 def test_each_way_to_refuse_has_its_report_and_its_count(link: BothEnds) -> None:
