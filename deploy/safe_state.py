@@ -129,9 +129,10 @@ def pack(obeyed: bool, name: str, count: int, text: str) -> bytes:
 
 
 def say(text: str) -> None:
-    """Write a line to standard error, from where it enters the journal of the board."""
-    sys.stderr.write(f"safe state: {text}\n")
-    sys.stderr.flush()
+    """Write a line to standard error, from where it enters the journal of the board, if possible."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"safe state: {text}\n")
+        sys.stderr.flush()
 
 
 def listen(path: str) -> socket.socket | None:

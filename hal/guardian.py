@@ -210,7 +210,9 @@ def main(arguments: list[str]) -> int:
     opened = getattr(importlib.import_module(module), function)
     switch = CoilSwitch(opened, where, [int(number, 0) for number in numbers])
     if not switch.off():
-        sys.stderr.write(f"guardian: the coils' chip at {numbers[0]} on {where} does not answer\n")
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"guardian: the coils' chip at {numbers[0]} on {where} does not answer\n")
+            sys.stderr.flush()
     # The guardian also works without real-time priority, locked memory and protection from the OOM killer.
     system.prioritise(0, PRIORITY)
     system.lock_memory()

@@ -38,7 +38,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence, Set
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, NamedTuple, Protocol
@@ -342,20 +342,19 @@ class WorkerProcess:
         self._name = worker.name
         self._received = bytearray()
         self.ready = False
-        memory = os.memfd_create(f"knightcube-{worker.name}")
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            os.ftruncate(memory, SLAB_BYTES)
-            self._slab = mmap.mmap(memory, SLAB_BYTES)
-            ours.setblocking(False)
-            ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-            self._process = self._start(worker, theirs.fileno(), memory, cores)
-        except OSError:
-            ours.close()
-            raise
-        finally:
-            theirs.close()
-            os.close(memory)
+        with theirs, ExitStack() as unused:
+            unused.enter_context(ours)
+            memory = os.memfd_create(f"knightcube-{worker.name}")
+            try:
+                os.ftruncate(memory, SLAB_BYTES)
+                self._slab = mmap.mmap(memory, SLAB_BYTES)
+                ours.setblocking(False)
+                ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+                self._process = self._start(worker, theirs.fileno(), memory, cores)
+            finally:
+                os.close(memory)
+            unused.pop_all()
         self._socket = ours
 
     @staticmethod

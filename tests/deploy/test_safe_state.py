@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -133,6 +134,14 @@ def test_a_hanging_script_is_killed_with_its_children(
     number = int(child.read_text(encoding="ascii"))
     while (place := Path(f"/proc/{number}/stat")).exists() and place.read_text().split()[2] != "Z":
         time.sleep(0.01)
+
+
+def test_a_journal_that_has_ended_does_not_end_the_safe_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: str) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(write=fail))
+    safe_state.say("coils at zero")
 
 
 def test_without_a_folder_no_try_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -25,6 +27,7 @@ from flight.loop.executive import (
     Worker,
     WorkerChange,
     WorkerNews,
+    WorkerProcess,
 )
 from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS
@@ -54,6 +57,24 @@ def wait(runner: JobRunner, seconds: float = 20.0) -> list[JobResult]:
             return results
         time.sleep(0.005)
     raise AssertionError("no result arrived")
+
+
+def test_a_process_that_cannot_be_started_leaves_no_descriptor_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    before = sorted(os.listdir("/proc/self/fd"))
+    for owner, name in (
+        (socket, "socketpair"),
+        (os, "memfd_create"),
+        (os, "ftruncate"),
+        (subprocess, "Popen"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, fail)
+            with pytest.raises(OSError, match="Too many"):
+                WorkerProcess(worker("double", double))
+        assert sorted(os.listdir("/proc/self/fd")) == before, name
 
 
 def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:

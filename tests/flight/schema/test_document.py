@@ -382,7 +382,7 @@ def test_a_list_that_another_user_owns_or_a_fifo_permits_nothing(tmp_path: Path)
             imported("simulation.world", "math:tau", {}, {MODULES: str(file)})
 
 
-def test_a_transient_disk_error_at_an_import_is_no_mistake_of_the_configuration_on_a_board(
+def test_on_a_board_a_disk_error_at_an_import_does_not_refuse_the_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A service does not start again after a ConfigError, but retries after an OSError."""
@@ -395,7 +395,7 @@ def test_a_transient_disk_error_at_an_import_is_no_mistake_of_the_configuration_
         patch.setattr("flight.schema.document.importlib.import_module", fail)
         with pytest.raises(OSError, match="Input/output error"):
             imported("body", "plain", known, board)
-        with pytest.raises(ConfigError, match="cannot be imported: .*Input/output error"):
+        with pytest.raises(ConfigError, match=r"cannot be imported: .*Input/output error"):
             imported("body", "plain", known, {})
     monkeypatch.setattr("flight.schema.document._without_waiting", fail)
     with pytest.raises(OSError, match="Input/output error"):

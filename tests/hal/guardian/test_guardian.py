@@ -159,6 +159,26 @@ def test_coils_that_answer_only_after_the_start_are_reported_as_zero(log: Path) 
     line.close()
 
 
+def test_a_guardian_waits_for_a_silent_chip_though_its_message_about_the_chip_cannot_be_written(
+    log: Path,
+) -> None:
+    broken = log.with_name("bytes.broken")
+    broken.touch()
+    usual, (reader, writer) = os.dup(2), os.pipe()
+    os.close(reader)
+    os.dup2(writer, 2)
+    try:
+        line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ((65, 0xFD, 0x10),)))
+    finally:
+        os.dup2(usual, 2)
+        os.close(usual)
+        os.close(writer)
+    line.wait_ready(10.0, patient=True)
+    broken.unlink()
+    assert news_until(line, GuardianNews.READY) == [GuardianNews.READY]
+    line.close()
+
+
 def test_a_guardian_that_hangs_is_replaced_and_reported(guardian: GuardianLine) -> None:
     first = guardian.process_id
     os.kill(first, signal.SIGSTOP)
