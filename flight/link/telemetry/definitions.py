@@ -492,7 +492,7 @@ GPS_LINK = _packet(
     counter("long_frames", "UBX frames with more than 256 bytes of payload, which are skipped"),
     counter("bad_checksum", "UBX frames with a wrong checksum"),
     counter("discarded_bytes", "bytes outside UBX frames"),
-    counter("sentences", "NMEA sentences, which are not used"),
+    counter("sentences", "NMEA sentences, which only the driver `nmea` uses"),
     counter("out_of_range", "navigation solutions with an impossible value"),
     counter("unresolved", "navigation solutions without a valid date, time or leap seconds"),
     counter("no_fix", "navigation solutions without a valid fix"),
