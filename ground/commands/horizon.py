@@ -48,8 +48,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube horizon` to the parser."""
     parser.description = (
         "Find the Earth's limb in a picture and the direction to the Earth's centre in camera axes: z along "
-        "the boresight, x to the right, y down. The picture is a PNG, TIFF, JPEG or FITS file, grey or "
-        "colour. Without --altitude the altitude is fitted too, within --altitudes. The Earth is modelled "
+        "the boresight, x to the right, y down. The picture is grey or colour: PNG, TIFF, JPEG, BMP, PGM "
+        "or FITS. Without --altitude the altitude is fitted too, within --altitudes. The Earth is modelled "
         "as a sphere; the uncertainty includes the error of this model."
     )
     parser.epilog = "example: knightcube horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"

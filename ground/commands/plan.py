@@ -65,8 +65,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--time-price", type=positive, metavar="W", help=text)
     text = "energy to minimise: R I^2 of the mean current (heat), or V |I| from the supply"
     parser.add_argument("--cost", choices=[cost.value for cost in PathCost], help=text)
-    text = f"nodes of the path (default {NODES}; with --orbit {SLEW_NODES})"
-    parser.add_argument("--nodes", type=int, metavar="N", help=text)
+    parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
     text = f"configuration of the plant, a file or an installed name (default {_DEFAULT_CONFIG})"
     parser.add_argument("--config", type=config_path, metavar="CONFIG", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")

@@ -61,8 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube rate` to the parser."""
     parser.description = (
         "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
-        "JPEG or FITS. The rate is of the camera, in its frame: boresight +z, x right, y "
-        "down. "
+        "JPEG, BMP, PGM or FITS. The rate is of the camera, in its frame: boresight +z, x right, y down. "
         "A single picture does not determine the sign of the rate: --prior gives the approximate rate."
     )
     parser.epilog = "example: knightcube rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
@@ -74,7 +73,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exposure", type=positive, metavar="S", help=text)
     parser.add_argument("--gain", type=positive, metavar="E", help="electrons per count (default 1)")
     parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="count at which pixels clip")
-    parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, standard deviation (1)")
+    parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, 1 sigma (default 1)")
     text = "time between rows, 0 for a global shutter (default: unknown, about 0)"
     parser.add_argument("--line-time", type=finite, metavar="S", help=text)
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
