@@ -4,8 +4,8 @@ The dispatcher is one of the documented containment boundaries: no command can e
 
 A command replaces the whole table of onboard parameters, and the new table is stored for later boots. Before
 a table takes effect, its values are checked against their ranges and against the bounds of the configuration.
-If a flight ends uncleanly within `PROVEN_NS` after a table was loaded, the next boot uses the previous table
-(`flight.loop.state`).
+If a flight ends uncleanly, or restarts the process, within `PROVEN_NS` after a load, the next boot uses the
+previous table (`flight.loop.state`).
 """
 
 from __future__ import annotations
@@ -86,6 +86,14 @@ class OnboardParameters:
         """Mark a table as proven when it has been in use for `PROVEN_NS`."""
         if not self._table.proven and now_ns - self._loaded_ns >= PROVEN_NS:
             self._keep(msgspec.structs.replace(self._table, proven=True))
+
+    def leave_unproven(self, now_ns: int) -> None:
+        """Let the next boot use the previous table unless the table is proven; called before a restart."""
+        if not self._table.proven:
+            before = self._table.before
+            self._keep(msgspec.structs.replace(self._table, values=before, before={}, proven=True))
+            text = "the table had just been loaded when the flight had to be restarted"
+            self._events.report(events.PARAMETERS_LEFT, now_ns, text)
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
         """Replace the table with the CRC `replaced` by another; return why it is rejected, or ""."""
@@ -174,6 +182,11 @@ class CommandTask:
     def begin(self, now_ns: int) -> None:
         """Apply the parameters that an earlier boot stored."""
         self._parameters.begin(now_ns)
+
+    def end(self, now_ns: int, *, restarts: bool) -> None:
+        """End the flight; a table that may be the cause of a restart is not used by the next boot."""
+        if restarts:
+            self._parameters.leave_unproven(now_ns)
 
     def run(self, cycle: Cycle) -> None:
         """Execute the commands that have arrived or are due on the time line."""

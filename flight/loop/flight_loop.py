@@ -392,6 +392,8 @@ class FlightLoop:
             self._ended_ns = max(now_ns - epoch_ns, 0)
             reason = self._stop_reason or "the configured duration is over"
             self._tasks.housekeeping.report_lost(now_ns)
+            if self._tasks.commanding is not None:
+                self._tasks.commanding.end(now_ns, restarts=bool(self.restart))
             services.events.flush(now_ns)
             services.events.report(events.STOPPED, now_ns, reason)
             self._record_performance(now_ns)

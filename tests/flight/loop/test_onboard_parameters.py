@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from flight.link import events
 from flight.link.commands import crc_of
 from flight.link.telemetry.definitions import PARAMETER_KEYS
 from flight.loop.commanding import OnboardParameters
 from flight.loop.facts import EventLog
-from flight.loop.state import KeptTable
+from flight.loop.state import KeptTable, StateStore
+from flight.schema import reader as configuration
 from flight.schema.sections import Modes
-from tests.support.flights import demo_config
+from tests.support.flights import Rigged, demo_config, event_names, fly
 
 MINUTE_NS = 60_000_000_000
 
@@ -67,6 +70,21 @@ def test_a_table_is_proven_after_a_minute(flown_ns: int, proven: bool) -> None:
     assert [table.proven for table in board.noted] == [False, True], "it is stored once"
 
 
+def test_a_restart_of_the_flight_leaves_a_table_that_is_not_proven() -> None:
+    """A memory limit below the flight's memory would otherwise restart every later flight."""
+    board = begun()
+    board.load(7, modes__tumble_rate=0.25)
+    board.parameters.run(7 + MINUTE_NS)
+    board.parameters.leave_unproven(8 + MINUTE_NS)
+    assert board.events == []
+    board.load(9 + MINUTE_NS, health__memory=1e6)
+    board.parameters.leave_unproven(10 + MINUTE_NS)
+    assert board.events == ["parameters-left"]
+    assert board.noted[-1].values["modes.tumble_rate"] == 0.25
+    assert board.noted[-1].values["health.memory"] == demo_config(4.0).health.memory
+    assert (board.noted[-1].proven, board.noted[-1].loads) == (True, 2)
+
+
 def test_the_table_before_an_unproven_one_is_the_last_proven_one() -> None:
     board = begun()
     board.load(7, modes__tumble_rate=0.25)
@@ -113,3 +131,23 @@ def test_a_stored_table_that_is_invalid_now_is_left_and_reported() -> None:
     assert (board.records[0]["table"], board.records[0]["loads"]) == (0, 4)
     board.parameters.run(5 + MINUTE_NS)
     assert board.noted == [], "there is nothing to prove"
+
+
+def test_a_flight_that_restarts_the_process_soon_after_a_load_stores_the_previous_table(
+    tmp_path: Path,
+) -> None:
+    config = demo_config(3.0, camera=False)
+    kept = configuration.replace(config.state, folder=str(tmp_path / "state"))
+    socket = configuration.replace(config.commands, socket=str(tmp_path / "commands"))
+
+    def prepare(rigged: Rigged) -> None:
+        parameters = cast(Any, rigged.loop)._tasks.commanding._parameters
+        table = {**parameters._values, "health.memory": 1e6}
+        rigged.at(1.0, lambda: parameters.load(table, parameters._crc, rigged.lock.clock.now_ns()))
+        report = cast(Any, rigged.loop)._services.events.report
+        rigged.at(1.5, lambda: report(events.MEMORY_HIGH, rigged.lock.clock.now_ns(), "2 MB"))
+
+    run = fly(configuration.replace(config, state=kept, commands=socket), tmp_path / "run", prepare)
+    assert event_names(run)[-2:] == ["parameters-left", "stopped"]
+    stored = StateStore(tmp_path / "state", lambda *_: None).load()
+    assert (stored.running, stored.table) == (False, KeptTable(loads=1))
