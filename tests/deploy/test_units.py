@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from flight.app.cli.run import REFUSED
 from flight.app.flight import fly
 from flight.app.run import RunRequest
 from flight.schema.document import ConfigError
@@ -136,7 +137,9 @@ def test_the_safe_state_listens_where_the_flight_does_and_starts_it_again(tmp_pa
     begun = re.findall("^ExecStart=(.*)$", text, re.MULTILINE)
     assert "' safe_state.py\n" in text
     assert begun[-1].endswith("--no-block start knightcube.service")
-    assert "RestartPreventExitStatus=2\n" in (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
+    assert f"RestartPreventExitStatus={REFUSED}\n" in (DEPLOY / "knightcube.service").read_text("utf-8")
+    shell = subprocess.run(["/bin/sh", str(tmp_path / "no-launcher")], capture_output=True, check=False)
+    assert shell.returncode != REFUSED, "a launcher that cannot be read once is started again"
 
 
 def test_the_watchdog_leaves_room_for_four_meals() -> None:

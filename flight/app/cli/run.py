@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from flight.app.cli import PROGRAM, to_json
+from flight.app.cli import PROGRAM, complain, to_json
 from flight.app.devices import (
     NO_CAMERA,
     check_settings,
@@ -154,13 +154,23 @@ def _faults_help() -> str:
     )
 
 
+REFUSED = 78
+"""Exit status of a service whose configuration is wrong (EX_CONFIG of sysexits.h).
+
+The service manager restarts the service after any other failure. A shell that cannot start the service for a
+moment ends with status 2.
+"""
+
+
 def run(options: argparse.Namespace) -> int:
     """Fly, show progress on standard error, and print the summary."""
     try:
         return _flown(options)
-    except OSError as error:
+    except (OSError, UsageError) as error:
         if options.archive is None:
             raise
+        if isinstance(error, UsageError):
+            return complain(str(error), REFUSED)
         raise KnightCubeError(str(error)) from error  # the service manager restarts the service
 
 

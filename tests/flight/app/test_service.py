@@ -11,6 +11,7 @@ import pytest
 
 from flight.app import service as patient_start
 from flight.app.cli import main
+from flight.app.cli.run import REFUSED
 from flight.app.run import RunRequest
 from flight.app.service import StartRetry, StoppedError, pauses, retried_start
 from flight.link.telemetry.packets import to_text
@@ -147,9 +148,9 @@ def test_a_board_that_is_stopped_while_it_waits_ends_well(
     assert "stopped before the flight began" in capsys.readouterr().err
 
 
-def test_a_board_whose_configuration_is_wrong_ends_with_status_2(board: list[str]) -> None:
+def test_a_board_whose_configuration_is_wrong_ends_with_its_own_status(board: list[str]) -> None:
     Path(board[1]).write_text("name: wrong\n", encoding="utf-8")
-    assert main(board) == 2
+    assert main(board) == REFUSED
 
 
 def test_a_disk_error_at_the_end_of_a_boards_flight_is_not_reported_as_wrong_use(

@@ -8,7 +8,7 @@ nearly all calls before it only read modules. With as many runs as points, the c
 
 A case is a board whose emulated devices run in a separate process. Its flight starts repeatedly, each time
 with one point. The campaign replaces the service manager: it restarts a process that ends, without the fault,
-unless its exit status is 2. With that status the board would stay grounded, which must not happen.
+unless its exit status is 78. With that status the board would stay grounded, which must not happen.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+from flight.app.cli.run import REFUSED
 from flight.app.service import FlownConfig, sum_file
 from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.errors import UsageError
@@ -43,7 +44,7 @@ FAULTS = 10
 _LONGEST_S = 120.0
 _CONFIG = "flight.yaml"
 _MOST_RESTARTS = 5
-_GROUNDED = 2
+_GROUNDED = REFUSED
 """Exit status after which the service manager does not start a flight again."""
 
 
