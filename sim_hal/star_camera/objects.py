@@ -289,6 +289,9 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera, sky: SkySec
         def finish(done: Future[Image]) -> None:
             if not seen.set_running_or_notify_cancel():
                 return
+            if (error := done.exception()) is not None:
+                seen.set_exception(error)
+                return
             frame = done.result().copy()
             if blinded:
                 frame[:] = min(top, np.iinfo(frame.dtype).max)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.schema.devices import Camera
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import load, simulation_section
 from flight.schema.sections import Config
@@ -27,6 +29,7 @@ from sim_hal.settings import (
     FreeBodySection,
     LineOfSight,
     ObjectState,
+    OrbitSection,
     Simulation,
     SkyObject,
     SkySection,
@@ -38,6 +41,7 @@ from sim_hal.star_camera.objects import (
     ResidentSpaceObject,
     SkyObjects,
     directions,
+    from_orbit,
     hidden_by_earth,
     source_tracks,
 )
@@ -133,6 +137,20 @@ def test_an_object_in_orbit_is_shifted_by_its_motion_relative_to_the_camera_alon
     assert np.linalg.norm(np.cross(shown, expected)) < 1e-7
     turned = np.arccos(np.clip(track.directions[0] @ track.directions[-1], -1.0, 1.0))
     assert turned / 0.5 == pytest.approx(900.0 / np.linalg.norm(away), rel=0.02)
+
+
+def test_a_failed_rendering_of_a_frame_with_the_sun_is_reported() -> None:
+    world = FreeBody(FreeBodySection(orbit=OrbitSection(local_time=12.0)), lambda: np.zeros(3))
+    ahead = world.surroundings().sun[2] > 0.0
+    attitudes = np.array([[0.0, 0.0, 0.0, 1.0] if ahead else [1.0, 0.0, 0.0, 0.0]] * 2)
+    rendered: Future[Image] = Future()
+    sky = SkySection(sun_exclusion_deg=90.0)
+    expose = from_orbit(lambda *_: rendered, world, Camera(columns=64, rows=64), sky)
+    frame = expose(1, np.array([0.0, 0.1]), attitudes, [])
+    assert frame is not rendered, "the Sun is in view"
+    rendered.set_exception(ValueError("too fast"))
+    with pytest.raises(ValueError, match="too fast"):
+        frame.result(timeout=0.0)
 
 
 def test_a_tumbling_object_is_as_bright_as_its_mean_light_over_the_exposure() -> None:
