@@ -156,7 +156,7 @@ def check_elements(request: SimulationRequest, config: Config) -> None:
     from sim_hal.worlds.orbit import misfit  # noqa: PLC0415 - loads SciPy
 
     try:
-        problem = misfit(lines, described.orbit, section.utc)
+        problem = misfit(lines, described.orbit, section.utc, f"simulation.{world}.orbit")
     except UsageError as error:
         raise ConfigError(name, f"are not valid two-line elements: {error}: {cure}") from error
     except OrbitError as error:

@@ -24,17 +24,21 @@ Multiple = Annotated[float, Meta(ge=0.0, le=1e4)]
 Delay = Annotated[float, Meta(ge=0.0, le=3600.0)]
 Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
+YEARS = 2001, 2043
+"""First and last year of a simulation; `sim_hal.worlds.orbit` has the magnetic field of 2000 to 2045."""
 
 
 def utc_seconds(utc: str) -> float:
     """Return the time since 1970 (s) of an ISO 8601 time, which is UTC unless the text has a time zone.
 
-    Raises ConfigError for another text.
+    Raises ConfigError for another text, and for a year in which the simulated magnetic field is not known.
     """
     try:
         found = datetime.fromisoformat(utc)
     except ValueError as error:
         raise ConfigError("simulation.utc", f"is {utc!r}: give a UTC such as 2026-03-20T12:00:00Z") from error
+    if not YEARS[0] <= found.year <= YEARS[1]:
+        raise ConfigError("simulation.utc", f"is {utc!r}: give a year from {YEARS[0]} to {YEARS[1]}")
     return (found.replace(tzinfo=UTC) if found.tzinfo is None else found).timestamp()
 
 
@@ -321,7 +325,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     magnetometer, body axes. Each row of `coil_field` has one value for each coil.
     """
 
-    seed: Annotated[int, Meta(ge=0)] = 1
+    seed: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)] = 1
     utc: str = "2026-01-01T00:00:00Z"
     world: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
     release: Release | None = None

@@ -29,6 +29,7 @@ import msgspec
 import numpy as np
 
 from flight.schema.bodies import OrbitConfig
+from flight.schema.devices import Coils, Winding
 from flight.schema.document import ConfigError, inertia_matrix
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
@@ -765,21 +766,32 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
     if any(abs(offset) >= 0.5 * edge for offset, edge in zip(centre, size, strict=True)):
         problem = f"is {list(centre)}: outside the box of {list(size)} m: give m from the centre of the box"
         raise ConfigError("simulation.free_body.craft.centre_of_mass", problem)
-    coils = config.coils
-    if craft.windings is not None:
-        if len(craft.windings) != len(coils.windings):
-            raise ConfigError(
-                "simulation.free_body.craft.windings", f"must have {len(coils.windings)} entries"
-            )
-        coils = msgspec.structs.replace(coils, windings=craft.windings)
     return CraftModel(
         inertia=inertia,
         size=size,
-        dipoles=coils.map().dipoles,
+        dipoles=_true_coils(config.coils, craft.windings).map().dipoles,
         centre_of_mass=centre,
         offset=described.accuracy.centre_of_mass,
         residual_dipole=craft.residual_dipole or described.residual_dipole,
     )
+
+
+def _true_coils(coils: Coils, windings: Sequence[Winding] | None) -> Coils:
+    """Return the coils with other `windings`, if any. Raises ConfigError for windings that cannot be."""
+    if windings is None:
+        return coils
+    key = "simulation.free_body.craft.windings"
+    if len(windings) != len(coils.windings):
+        raise ConfigError(key, f"must have {len(coils.windings)} entries")
+    for index, coil in enumerate(windings):
+        if not any(coil.axis):
+            problem = f"is {list(coil.axis)}: give the direction of the coil's dipole moment"
+            raise ConfigError(f"{key}[{index}].axis", problem)
+        try:
+            coil.strength()
+        except ConfigError as error:
+            raise ConfigError(f"{key}[{index}].{error.where}", error.problem) from error
+    return msgspec.structs.replace(coils, windings=tuple(windings))
 
 
 def body_inputs(

@@ -210,17 +210,15 @@ def julian_date(utc: str) -> float:
     return UNIX_EPOCH + utc_seconds(utc) / DAY
 
 
-def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
-    """Return the Keplerian elements of a configured orbit at a Julian date.
+def elements(orbit: OrbitSection, date: float, key: str = "simulation.free_body.orbit") -> KeplerianElements:
+    """Return the Keplerian elements of the orbit that the section `key` describes, at a Julian date.
 
     Raises ConfigError for a perigee that is too low.
     """
     perigee = (EARTH_RADIUS + orbit.altitude) * (1.0 - orbit.eccentricity) - EARTH_RADIUS
     if perigee < _LOWEST_PERIGEE:
         problem = f"is {orbit.eccentricity:g}: the perigee is at {1e-3 * perigee:.0f} km and must be above"
-        raise ConfigError(
-            "simulation.free_body.orbit.eccentricity", f"{problem} {1e-3 * _LOWEST_PERIGEE:.0f} km"
-        )
+        raise ConfigError(f"{key}.eccentricity", f"{problem} {1e-3 * _LOWEST_PERIGEE:.0f} km")
     node = math.radians(orbit.ascending_node_deg)
     if orbit.local_time is not None:
         x, y, _ = sun_position(date).tolist()
@@ -243,8 +241,10 @@ in 2026. J2 varies the inclination by 0.03 deg in a revolution.
 """
 
 
-def misfit(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> str:
-    """Return how two-line elements differ from a configured orbit, or an empty text if they fit.
+def misfit(
+    lines: tuple[str, str], orbit: OrbitSection, utc: str, key: str = "simulation.free_body.orbit"
+) -> str:
+    """Return how two-line elements differ from the orbit in the section `key`, or an empty text if they fit.
 
     The mean elements of both orbits over the first revolution after `utc` are compared, and their largest
     distance in this revolution is limited. The tolerances also hold for an orbit that is described by mean
@@ -253,7 +253,7 @@ def misfit(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> str:
     SGP4 cannot propagate them to the first revolution.
     """
     date = julian_date(utc)
-    start, known = elements(orbit, date), TwoLineElements(*lines)
+    start, known = elements(orbit, date, key), TwoLineElements(*lines)
     times = np.linspace(0.0, start.period, 25)
     states = [known.at(date + time / DAY) for time in times.tolist()]
     found = np.array([[*state.position, *state.velocity] for state in states])

@@ -204,7 +204,8 @@ class OrbitField:
         date = julian_date(utc)
         generator = np.random.default_rng([seed, _CAGE_STREAM])
         multiples = Disturbances(ring_current=section.ring_current)
-        self._environment = Environment(elements(section.orbit, date), date, generator, multiples)
+        start = elements(section.orbit, date, "simulation.cage.orbit")
+        self._environment = Environment(start, date, generator, multiples)
         self._scale = scale * section.gain
 
     def at(self, seconds: float) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, sunlit_share
 from sim_hal.rig import utc_ns
-from sim_hal.settings import Disturbances, OrbitSection
+from sim_hal.settings import CageTruth, Disturbances, OrbitSection
 from sim_hal.worlds.orbit import (
     RING_CURRENT,
     Environment,
@@ -34,6 +34,7 @@ from sim_hal.worlds.orbit import (
     propagate,
     sun_position,
 )
+from sim_hal.worlds.testbed import OrbitField
 
 DATE = julian_date("2026-03-20T12:00:00Z")
 VALLADO = KeplerianElements(
@@ -478,6 +479,8 @@ def test_the_field_of_every_permitted_orbit_is_within_the_accepted_range(
 def test_a_perigee_in_the_air_is_refused_and_the_air_thins_up_to_two_thousand_kilometres() -> None:
     with pytest.raises(ConfigError, match="the perigee is at -188 km and must be above 150 km"):
         elements(OrbitSection(altitude=500e3, eccentricity=0.1), DATE)
+    with pytest.raises(ConfigError, match=r"simulation\.cage\.orbit\.eccentricity"):
+        OrbitField(CageTruth(orbit=OrbitSection(eccentricity=0.1)), 1.0, "2026-03-20T12:00:00Z", 1)
     distances = EARTH_RADIUS + np.array([[1_000e3], [1_268e3], [2_000e3]])
     logs = log_density(distances * [1.0, 0.0, 0.0], np.array([1.5e11, 0.0, 0.0]))
     assert logs[0] - logs[1] == pytest.approx(1.0, abs=0.01)

@@ -263,6 +263,28 @@ def test_a_configuration_that_is_refused_is_one_line_and_status_2(
             2,
             "`simulation.utc` is '20.3.2026': give a UTC such as 2026-03-20T12:00:00Z",
         ),
+        (
+            "simulation: {seed: 18446744073709551616}",
+            2,
+            "`simulation.seed` is 18446744073709551616: expected",
+        ),
+        (
+            "simulation: {utc: '1999-12-31T00:00:00Z'}",
+            2,
+            "`simulation.utc` is '1999-12-31T00:00:00Z': give a year from 2001 to 2043",
+        ),
+        (
+            "simulation: {free_body: {craft: {windings: [{axis: [0, 0, 0], resistance: 1},"
+            " {axis: [0, 1, 0], resistance: 1}, {axis: [0, 0, 1], resistance: 1}]}}}",
+            2,
+            "`simulation.free_body.craft.windings[0].axis` is [0.0, 0.0, 0.0]: give the direction",
+        ),
+        (
+            "simulation: {free_body: {craft: {windings: [{axis: [1, 0, 0], resistance: 1},"
+            " {axis: [0, 1, 0], resistance: 1}, {axis: [0, 0, 1], resistance: 1}]}}}",
+            2,
+            "`simulation.free_body.craft.windings[0].dipole_per_ampere` is missing",
+        ),
         ("craft: {mass: 4,5}", 2, "`craft.5` is not a key: keys are texts; write decimals with a point"),
         (
             "simulation: {utc: '2027-01-01T00:00:00Z'}",
