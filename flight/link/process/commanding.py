@@ -117,7 +117,7 @@ def final_mode(command: Command) -> Mode | None:
 
 
 _LOG_DELAY_NS = 10 * SECOND_NS
-"""Mission time (ns) after which the log has been read beyond the BOOT packet at the begin of a flight."""
+"""Mission time (ns) after which the log has been read beyond the BOOT packet at the beginning of a flight."""
 
 
 class Verification:
