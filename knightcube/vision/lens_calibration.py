@@ -37,6 +37,7 @@ from knightcube.vision.lens_knowledge import (
     FitStep,
     LensFit,
     MatchedFrame,
+    UndeterminedAttitudeError,
     accepted_matches,
     cauchy_weights,
     matched_frame,
@@ -431,7 +432,13 @@ def calibrate_one_lens(
     }
     while True:
         kept = [number for number in range(len(frames)) if number not in excluded]
-        found = calibrate([frames[number] for number in kept], initial)
+        try:
+            found = calibrate([frames[number] for number in kept], initial)
+        except UndeterminedAttitudeError as error:
+            if len(kept) == 1:
+                raise
+            excluded[kept[error.frame]] = "the lens of the other frames fits none of its stars"
+            continue
         parts = np.array([used.mean() for used in found.used])
         worst = int(parts.argmin())
         if parts[worst] >= _MIN_USED or len(kept) == 1:

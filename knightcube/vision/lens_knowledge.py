@@ -63,6 +63,18 @@ class CalibrationError(KnightCubeError):
     """
 
 
+class UndeterminedAttitudeError(CalibrationError):
+    """Error raised for a frame whose accepted matches do not determine its attitude.
+
+    The attribute `frame` is the index of the frame.
+    """
+
+    def __init__(self, frame: int) -> None:
+        """Initialise the error with the index of the frame."""
+        super().__init__(f"frame {frame}: its matches do not determine its attitude")
+        self.frame = frame
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFrame:
     """The n stars identified in one frame, a few of which may be misidentified.
@@ -165,7 +177,8 @@ def step(
 
     The squared residuals of the stars of each frame have the `weights` (n,). The prior means `expected` (9,)
     of the lens parameters have the inverse variances `prior` (9,), or an information matrix. Raises
-    CalibrationError if a frame does not determine its attitude, or if the data do not determine the lens.
+    UndeterminedAttitudeError if a frame does not determine its attitude, and CalibrationError if the data do
+    not determine the lens.
     """
     information, gradient = np.zeros((len(fit.parameters),) * 2), np.zeros(len(fit.parameters))
     prior = np.diag(prior) if prior.ndim == 1 else prior
@@ -174,7 +187,7 @@ def step(
         lens, turn, misfit = _linearised(frame, fit, number, weights[number])
         own = turn.T @ turn
         if np.linalg.eigvalsh(own)[0] <= _MIN_SPREAD * np.trace(own):
-            raise CalibrationError(f"frame {number}: its matches do not determine its attitude")
+            raise UndeterminedAttitudeError(number)
         inverse = np.linalg.inv(own)
         free, coupling = inverse @ (turn.T @ misfit), inverse @ (turn.T @ lens)
         turns.append((free, coupling))

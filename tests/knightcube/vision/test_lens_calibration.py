@@ -253,6 +253,21 @@ def test_frames_of_another_focus_are_excluded_also_if_they_are_half_of_the_frame
     assert all("its focal length is" in reason for reason in excluded.values())
 
 
+def test_frames_whose_stars_are_all_rejected_are_excluded() -> None:
+    """Frames are excluded whose focal length differs by 0.5 %, although all their stars are rejected."""
+    rng = np.random.default_rng(95)
+    begun = _begun(20.0)
+    frames = [
+        *_frames(rng, Lens.of(begun.rescaled(1.005)), 2, 40, noise=0.01)[0],
+        *_frames(rng, Lens.of(begun), 6, 40, noise=0.01)[0],
+    ]
+    focal_lengths = begun.focal_length * np.repeat([1.005, 1.0], [2, 6])
+    found, excluded = calibrate_one_lens(frames, begun, focal_lengths, np.full(8, 0.1))
+    assert set(excluded) == {0, 1}
+    error = found.calibration.lens.focal_length - begun.focal_length
+    assert abs(error) < 4.0 * found.calibration.sigma["focal_length"]
+
+
 def test_malformed_frames_are_refused() -> None:
     rng = np.random.default_rng(90)
     (good,), _ = _frames(rng, Lens.of(_begun()), 1, 20)
