@@ -117,7 +117,9 @@ class SunMeasurement:
     Attributes:
         direction: unit vector (3,) to the Sun in camera axes.
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
-        tangent_covariance: covariance (2, 2) of the direction along `basis` without lens errors, rad^2.
+        tangent_covariance: covariance (2, 2) of the direction along `basis` without lens errors, rad^2. It
+            includes the displacement by asymmetric glare, if a wider contour of the glare shows it, and
+            0.05 deg per axis if the edge of the image truncates the disc.
         point: position of the Sun's centre (2,) in the image, px. The position is NaN if the lens does not
             image the direction of the Sun's centre.
         radius: radius of the bright disc with its glare, rad.
@@ -185,6 +187,12 @@ _STEP = 0.5
 """Distance (px) between samples along a spoke from the centre of a patch to its rim."""
 _ROUNDS = 3
 """Maximum number of times a rim is traced, each time from the centre of the last fitted circle."""
+_WIDER = 1.5
+"""Radius of the contour that shows asymmetric glare, as a multiple of the radius of the disc."""
+_ASYMMETRIC = 3.0
+"""Displacement of the wider contour, in standard deviations, above which the glare counts as asymmetric."""
+_CUT = np.radians(0.05)
+"""Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 _NEAR = 0.5
 """Largest distance (px) between the fitted centre and the origin of the spokes in the last tracing of a rim.
 """
@@ -227,7 +235,8 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if disc is None or reason:
             reasons.append(f"{reason} about pixel ({middle[0]:.0f}, {middle[1]:.0f})")
         else:
-            found.append(_measurement(disc, camera, settings))
+            asymmetry = _asymmetry(disc, strip, first, camera, settings)
+            found.append(_measurement(disc, asymmetry, camera, settings))
     if not found:
         if reasons or narrow:
             return SunSolution(SunStatus.NOT_THE_SUN, [*reasons, narrow][0], None, read)
@@ -423,8 +432,43 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     return ""
 
 
-def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> SunMeasurement:
-    """Return the measured Sun direction from an accepted disc."""
+def _asymmetry(
+    disc: _Disc, strip: Image, first: int, camera: CameraModel, settings: SunSettings
+) -> FloatArray:
+    """Return the displacement (3,) of a disc's centre by asymmetric glare, rad, or zero if none is measured.
+
+    Glare that is brighter on one side displaces each contour in proportion to its radius. The displacement
+    is extrapolated from the centre of the disc and the centre of a wider contour.
+    """
+    circle, axis = disc.circle, disc.axis
+    basis = tangent_basis(axis)
+    angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
+    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ basis
+    wide = _WIDER * circle.radius
+    counts = sample(strip, first, camera.project(np.cos(wide) * axis + np.sin(wide) * ways))
+    counts = counts[np.isfinite(counts)]
+    none = np.zeros(3)
+    if not len(counts) or (level := float(np.median(counts))) >= settings.level:
+        return none
+    rim = _trace(strip, first, camera, axis, level, 2.0 * wide - circle.radius)
+    wider = fit_circle(rim.points, 2.0 * settings.tolerance / disc.pixels_per_radian)
+    if wider is None or np.count_nonzero(wider.used) < settings.least_agreement * (
+        len(rim.points) + rim.endless
+    ):
+        return none
+    apart = wider.radius / circle.radius - 1.0
+    if apart < 0.5 * (_WIDER - 1.0):
+        return none
+    noise = circle.residual**2 * circle.shape + wider.residual**2 * wider.shape
+    if wider.centre @ np.linalg.solve(noise, wider.centre) < _ASYMMETRIC**2:
+        return none
+    return np.asarray(wider.centre @ basis / apart)
+
+
+def _measurement(
+    disc: _Disc, asymmetry: FloatArray, camera: CameraModel, settings: SunSettings
+) -> SunMeasurement:
+    """Return the measured Sun direction from an accepted disc, and its displacement `asymmetry` (3,), rad."""
     circle, scale = disc.circle, disc.pixels_per_radian
     rim_sigma = max(circle.residual, settings.rim_sigma / scale)
     backward = np.linalg.inv(disc.scale)
@@ -433,10 +477,13 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
     # The basis of the tangent plane in which the rim was traced is made normal to the fitted direction.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
+    basis = np.stack([first, np.cross(axis, first)])
+    displaced = basis @ asymmetry
+    systematic = np.outer(displaced, displaced) + (_CUT**2 * np.eye(2) if disc.rim.cut else 0.0)
     return SunMeasurement(
         direction=axis,
-        basis=np.stack([first, np.cross(axis, first)]),
-        tangent_covariance=rim_sigma**2 * circle.shape + floor,
+        basis=basis,
+        tangent_covariance=rim_sigma**2 * circle.shape + floor + systematic,
         point=camera.project(axis[None, :])[0],
         radius=circle.radius,
         residual=circle.residual * scale,
@@ -562,8 +609,6 @@ _SHARES = (1.0 / 6.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 5.0 / 6.0, 1.0)
 """
 _CONTRADICTED = 5.0
 """Largest accepted deviation of the measured from the coarse Sun direction, in standard deviations."""
-_CUT = np.radians(0.05)
-"""Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -654,9 +699,7 @@ def sun_of_cameras(
             continue
         direction = camera.in_body(sun.direction)
         if not _contradicts(direction, strings):
-            across = np.eye(3) - np.outer(sun.direction, sun.direction)
-            covariance = sun.covariance + (_CUT**2 * across if sun.cut else 0.0)
-            covariance = np.asarray(camera.to_camera.T @ covariance @ camera.to_camera)
+            covariance = np.asarray(camera.to_camera.T @ sun.covariance @ camera.to_camera)
             return SunOfCameras(direction, covariance, choice.index, each)
         reason = f"camera {choice.index}: its Sun direction contradicts the solar strings"
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
