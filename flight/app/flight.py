@@ -131,7 +131,7 @@ def open_flight(
         compiled.use_numpy_forms()
     flight_log = _open_log(folder, "flight", rig, config, stack, patient)
     performance_log = _open_log(folder, "performance", rig, config, stack, patient)
-    # The stored state is opened last, so that a boot in which the start fails is not counted.
+    # The stored state is opened after the devices, so that a boot that waits for a device is not counted.
     # The outer exit stack closes the stored state after the devices.
     after_coils = stack.enter_context(ExitStack())
     guardian = start_guardian(rig, stack)

@@ -53,6 +53,7 @@ from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock
 from knightcube.astro.arrays import FloatArray
+from knightcube.errors import KnightCubeError
 from knightcube.gnc.estimation.estimate import (
     BIAS,
     FIELD_BIAS,
@@ -649,8 +650,8 @@ def open_state(
 
     The sequence `runs` holds the folders of the newest runs, which contain files with boot numbers. The last
     folder belongs to the present run. When `stack` closes, the final state is written, as a clean end unless
-    an exception was raised. A DeviceError counts as a clean end, because it is reported as a device error and
-    safe mode would not help.
+    an exception was raised. The errors after which a start is retried (DeviceError, KnightCubeError and
+    OSError) count as clean ends, because they are reported, and safe mode would not help.
     """
     folder = state_folder(config, environment)
     if folder is None:
@@ -670,7 +671,7 @@ def open_state(
         note_boot([folder, *runs[-1:]], keeper.record.boot_count)
 
     def close(kind: type[BaseException] | None, *_: object) -> bool:
-        keeper.close(clean=kind is None or issubclass(kind, DeviceError))
+        keeper.close(clean=kind is None or issubclass(kind, DeviceError | KnightCubeError | OSError))
         return False
 
     stack.push(close)

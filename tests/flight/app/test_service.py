@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from flight.app import flight
 from flight.app import service as patient_start
 from flight.app.cli import main
 from flight.app.cli.run import REFUSED
@@ -118,6 +119,22 @@ def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_th
     events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(run)["event"]}
     assert events["start-waited"].startswith("started at attempt ")
     assert StateStore(tmp_path / "state", lambda *_: None).load().boot_count == 1
+
+
+def test_attempts_that_fail_when_the_loop_is_built_are_not_counted_as_crashes(
+    board: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "later").mkdir()
+    build, failures = flight.build_loop, [OSError(5, "Input/output error"), UsageError("no image")] * 3
+
+    def fail(*arguments: Any) -> Any:
+        if failures:
+            raise failures.pop()
+        return build(*arguments)
+
+    monkeypatch.setattr(flight, "build_loop", fail)
+    assert main(board) == 0
+    assert StateStore(tmp_path / "state", lambda *_: None).load().unclean == ()
 
 
 @pytest.mark.parametrize("stores", [True, False])
