@@ -229,8 +229,10 @@ class Store:
         return self.last
 
     def add_ending(self, ending: Ending) -> None:
-        """Store the result of an ended incoming transfer."""
-        self._write_numbers(self.last, (*self.endings, ending)[-_KEPT_ENDINGS:])
+        """Keep the result of an ended incoming transfer, and store it if the disk can be written."""
+        self.endings = (*self.endings, ending)[-_KEPT_ENDINGS:]
+        with suppress(FileError):  # an error here would hold up all other transfers
+            self._write_numbers(self.last, self.endings)
 
     def outgoing(self) -> list[Outgoing]:
         """Return the open outgoing transfers, ignoring damaged records."""

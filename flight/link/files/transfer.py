@@ -330,8 +330,9 @@ class Sender:
                 self._sum_of_sent = value
                 return
             self.record = msgspec.structs.replace(self.record, checksum=value)
-            self._save(self.record)
-        except (OSError, FileError) as error:
+            with suppress(FileError):  # after a restart, the checksum is computed again
+                self._save(self.record)
+        except OSError as error:
             if self._stopped is None:
                 self.cancel(Condition.FILESTORE_REJECTION, str(error))
             self._sum = None  # the transmitted data can no longer be read

@@ -6,11 +6,13 @@ import errno
 import os
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from flight.link.files import store
 from flight.link.files.store import FileError, Store, problem_of_name
 from flight.link.files.transfer import (
     CRC32,
@@ -239,6 +241,35 @@ def test_metadata_that_a_failing_disk_could_not_judge_are_judged_when_they_come_
     answer = end.unit(0)
     assert answer is not None
     assert unpack(answer)[1] == Finished(Condition.FILESTORE_REJECTION, False, FileStatus.REJECTED)
+
+
+def test_a_full_disk_holds_up_no_file_that_was_begun_before(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    small = tmp_path / "small"
+    small.write_bytes(b"abc")
+    pair.send(SATELLITE, file, "down")
+    up = pair.send(GROUND, small, "up")
+    whole = store.write_whole
+
+    def full(path: Path, data: bytes) -> None:
+        if path.is_relative_to(tmp_path / str(SATELLITE)):
+            raise FileError("no space left")
+        whole(path, data)
+
+    def keep(now_ns: int) -> None:
+        with suppress(FileError):  # `flight.link.process.filing` reports this error
+            Entity.keep(end, now_ns)
+
+    end = pair.ends[SATELLITE]
+    monkeypatch.setattr(store, "write_whole", full)
+    monkeypatch.setattr(end, "keep", keep)
+    pair.until_closed()
+    assert pair.received(GROUND, "down") == file.read_bytes()
+    assert [(one.name, one.condition) for one in pair.ended[GROUND]] == [("up", 4), ("down", 0)]
+    end.take(pack(Transaction(GROUND, up.number, SATELLITE), Eof(0, 1, 3)), pair.now_ns)
+    assert not end.transfers(), "an ended transfer began again"
 
 
 def test_a_file_that_shrinks_or_is_cancelled_ends_at_both_ends(tmp_path: Path, file: Path) -> None:
