@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo cage orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast explore slow-list pictures lock release clean help
 
 help:           ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
+	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 # Python compiles a module when it first imports it, and keeps that: most of what is installed is never imported.
 INSTALL := $(VENV)/bin/pip --disable-pip-version-check install --quiet --no-compile
@@ -31,7 +31,7 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	KNIGHTCUBE_COMPILED=0 $(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
 
-cage: $(READY)  ## fly the testbed in a Helmholtz cage that plays an orbit's field, for a revolution; report and pictures
+cage: $(READY)  ## fly the testbed for a revolution in a Helmholtz cage that reproduces the field of an orbit; report and pictures
 	@rm -rf runs/cage
 	$(RUN) -m flight run config/cage.yaml --out runs/cage
 	$(RUN) -m flight report runs/cage --figures runs/cage/figures
@@ -41,62 +41,62 @@ orbit: $(READY) ## fly a KnightCube for an orbit: detumble from 10 deg/s, point 
 	$(RUN) -m flight run config/orbit.yaml --out runs/orbit
 	$(RUN) -m flight report runs/orbit
 
-orbit-3u: $(READY) ## the same with a 3U, for two and a half hours of flight
+orbit-3u: $(READY) ## fly a 3U in the same way, for two and a half hours of flight
 	@rm -rf runs/orbit_3u
 	$(RUN) -m flight run config/orbit_3u.yaml --out runs/orbit_3u
 	$(RUN) -m flight report runs/orbit_3u
 
-object: $(READY) ## a 3U finds an object that passes, follows it, and determines its orbit: two and a half minutes of flight
+object: $(READY) ## fly a 3U that finds a passing object, follows it for two and a half minutes, and determine the object's orbit
 	@rm -rf runs/object
 	$(RUN) -m flight run config/orbit_object.yaml --out runs/object
 	$(RUN) -m flight orbit runs/object --opm runs/object/orbits
 
-console: $(READY) ## the demonstration flying in real time in the browser, with forms to command it
+console: $(READY) ## fly the demonstration in real time and show it in the browser, with forms for commands
 	@rm -rf runs/console
 	$(RUN) -m flight console runs/console --fly config/step_demo.yaml --open
 
-quick: $(TOOLS) ## style, import arrows and the fast tests: about 5 min on two hyperthreads
+quick: $(TOOLS) ## check style, import contracts and the fast tests: about 5 min on two hyperthreads
 	@$(MAKE) --no-print-directory lint arrows fast
 
 # The tests begin first: they wait for processes and sockets, and the other checks fill the pauses.
-test: $(TOOLS)  ## every check, two at a time
+test: $(TOOLS)  ## run every check, two at a time
 	@$(MAKE) --no-print-directory --jobs 2 unit lint types arrows docs
 
-test-container: $(TOOLS)  ## the service installed and booted under systemd in a container; needs root and nspawn
+test-container: $(TOOLS)  ## install and boot the service under systemd in a container; needs root and systemd-nspawn
 	$(RUN) -m pytest -rs tests/deploy/test_container.py
 
-lint: $(TOOLS)  ## style
+lint: $(TOOLS)  ## check the style
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check --quiet .
 
-types: $(TOOLS) ## strict types
+types: $(TOOLS) ## check the types strictly
 	$(VENV)/bin/mypy
 
-arrows: $(TOOLS) ## which package may import which
+arrows: $(TOOLS) ## check which package imports which
 	$(VENV)/bin/lint-imports --no-cache
 
-docs: $(TOOLS)  ## the documentation site, strict, into build/site
+docs: $(TOOLS)  ## build the documentation site into build/site; a warning is an error
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --site-dir build/site
 	$(RUN) -m tests.docs.built_site build/site
 
-house: $(TOOLS) ## sizes of files, classes and functions
+house: $(TOOLS) ## check the sizes of files, classes and functions
 	$(RUN) -m tests.studies.house
 
-unit: $(TOOLS)  ## the tests, on all cores
+unit: $(TOOLS)  ## run the tests on all cores
 	$(TESTS) -rs --dist loadfile --no-loadscope-reorder
 
-fast: $(TOOLS)  ## the tests that are not slow, on all cores
+fast: $(TOOLS)  ## run the tests that are not slow on all cores
 	$(TESTS) --dist worksteal -m "not slow"
 
-explore: $(TOOLS) ## the property tests with new random examples; `make test` draws the same ones each time
+explore: $(TOOLS) ## run the property tests with new random examples; `make test` uses the same examples each time
 	$(TESTS) --dist worksteal -m hypothesis --hypothesis-profile explore
 
 slow-list: $(TOOLS)  ## measure every test alone and write tests/slow.txt and tests/order.txt
 	$(RUN) -m pytest --write-slow-list
 
-pictures: $(TOOLS) ## the README's pictures
+pictures: $(TOOLS) ## draw the pictures of the documentation
 	$(RUN) -m tests.studies.pictures
 
-lock:           ## choose versions of all packages and write them down with their hashes; keeps those that still fit
+lock:           ## choose versions of all packages and store them with their hashes; versions that still fit are kept
 	$(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet pip-tools hatchling
 	build/lock/bin/pip wheel --quiet --no-deps --wheel-dir build/lock/wheels ./knightcube
 	@# Each list takes the versions of the one before it, so that a board flies what the tests tested.
@@ -120,5 +120,5 @@ release: $(READY) ## sign the committed release and check its bundle as a board 
 	  build/release/opened - -
 	@cd build/release && sha256sum release-*.renewal
 
-clean:          ## forget the virtual environment and the runs
+clean:          ## delete the virtual environment and the folders runs and build
 	rm -rf $(VENV) runs build *.egg-info
