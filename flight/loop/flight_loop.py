@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 import zlib
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -21,7 +22,7 @@ from flight.link.telemetry.definitions import ATTITUDE, COIL_CURRENTS, RUN
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, ControlOutput, FlightBody, Steered, SteeringState, Target
 from flight.loop.commanding import CommandTask
-from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
+from flight.loop.executive import Cycle, CyclicExecutive, JobResult, RateGroup
 from flight.loop.facts import CLOCK_OFF_NS, COILS_BROKEN, Services
 from flight.loop.health import (
     CONTROL,
@@ -121,6 +122,7 @@ class ControlCycle:
         self._knowledge = CoilKnowledge()
         self._ever_started = self._had_estimate = self._was_measured = False
         self._target: Target | None = None
+        self._results: deque[JobResult] = deque()
 
     def run(self, cycle: Cycle) -> ControlOutput:
         """Run one cycle."""
@@ -183,7 +185,10 @@ class ControlCycle:
     def _accept_results(self, record: _CycleRecord) -> None:
         """Pass the workers' results to their tasks, and update the estimate if cameras changed it."""
         tasks, now_ns = self._tasks, record.now_ns
-        for result in self._jobs.collect():
+        # After an error in a task, the next cycle accepts the other results.
+        self._results.extend(self._jobs.collect())
+        while self._results:
+            result = self._results.popleft()
             tasks.observer.job(result, now_ns)
             if result.worker == PLANNER:
                 self._body.control.planner.finish(result, now_ns)

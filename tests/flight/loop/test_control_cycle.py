@@ -113,6 +113,18 @@ def test_one_control_law_commands_the_coils(mode: Mode, flags: tuple[str, ...], 
     assert output.steered is getattr(steering, law).return_value
 
 
+def test_an_error_about_one_result_loses_no_other_result() -> None:
+    """A planner that never receives its result is busy for ever, and ends the flight."""
+    bench = Bench(Mode.HOLD)
+    _, plan = bench.results(imaging.WORKER, PLANNER)
+    bench.tasks.imaging.finish.side_effect = ZeroDivisionError
+    with pytest.raises(ZeroDivisionError):
+        bench.run()
+    bench.results()
+    bench.run(1)
+    bench.control.planner.finish.assert_called_once_with(plan, bench.now_ns)
+
+
 @pytest.mark.parametrize(("speed", "rate"), [(0.5, 0.5), (math.inf, None)])
 def test_an_unknown_rate_and_an_inaccurate_estimate_are_passed_to_the_modes(
     speed: float, rate: float | None
