@@ -138,7 +138,7 @@ class SelfTest:
         self._quiet: list[float] = (_QUIET * settings.limits).tolist()
         self._shown_ns: list[int | None] = [None] * len(settings.limits)
         self._running: tuple[int, int, int, float] | None = None
-        self._loud_ns = 0
+        self._loud_ns = self._called_ns = 0
         self._tested: dict[int, int] = {}  # end (ns) of each test without a report, by axis
 
     def request(self) -> None:
@@ -157,6 +157,9 @@ class SelfTest:
         """
         if any(abs(current) > limit for current, limit in zip(wanted.tolist(), self._quiet, strict=True)):
             self._loud_ns, self._running = now_ns, None
+        if now_ns - self._called_ns > _GAP_NS:  # another mode has interrupted the test
+            self._running = None
+        self._called_ns = now_ns
         for axis, shown_ns in enumerate(self._shown_ns):
             if shown_ns is None or self._response.is_healthy(axis):
                 self._shown_ns[axis] = now_ns

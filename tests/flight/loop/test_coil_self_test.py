@@ -106,6 +106,12 @@ def test_no_test_runs_while_the_coils_are_needed() -> None:
     assert _driven(_fly(test, 12.0, begin=INTERVAL + 22.0)) == [0], "and tried again"
 
 
+def test_a_test_that_another_mode_interrupts_is_made_again() -> None:
+    test = _test()
+    assert _driven(_fly(test, INTERVAL + 2.0)) == [0]
+    assert _driven(_fly(test, 20.0, begin=INTERVAL + 30.0)) == [0, 1, 2]
+
+
 def test_all_coils_are_tested_at_once_on_request() -> None:
     test = _test()
     assert np.isnan(_fly(test, 15.0)).all()
