@@ -394,7 +394,8 @@ class Receiver:
         # A transfer that continues after a restart requests its missing ranges at once.
         age_ns = SILENT_NS if record.name is not None else 0
         self._lack, self._silence = (Timer(period, now_ns - age_ns) for period in (LACK_NS, SILENT_NS))
-        if record.finished is not None and record.finished[1] and store.part(record).exists():
+        # A damaged file must not keep the link from starting.
+        if record.finished is not None and record.finished[1] and os.path.exists(store.part(record)):
             self._place()
 
     @property

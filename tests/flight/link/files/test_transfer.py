@@ -114,6 +114,21 @@ def test_killed_while_a_whole_file_is_placed_it_is_placed_after(
     assert pair.received(GROUND, "down") == file.read_bytes()
 
 
+def test_a_received_file_that_cannot_be_read_does_not_prevent_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, stat = Store(tmp_path), os.stat
+    folder.save(store.Incoming(GROUND, 1, "release/a", 1, finished=(0, True, 2)))
+
+    def fail(path: object, **options: bool) -> os.stat_result:
+        if str(path).endswith(".part"):
+            raise OSError(errno.EIO, "Input/output error")
+        return stat(path, **options)  # type: ignore[arg-type]  # as called
+
+    monkeypatch.setattr(os, "stat", fail)
+    assert len(Entity(SATELLITE, folder, lambda _: "", SIZE, 0).transfers()) == 1
+
+
 def test_an_eof_that_comes_again_is_acknowledged_again_also_after_the_end(tmp_path: Path, file: Path) -> None:
     pair = Pair(tmp_path, 0.0)
     number = pair.send(SATELLITE, file, "down").number
