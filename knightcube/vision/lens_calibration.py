@@ -26,11 +26,13 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
+from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import ArgumentError
 from knightcube.vision.camera.lens import SHAPE_TERMS, CameraModel, Lens, LensError
 from knightcube.vision.frame import grey_image
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.lens_knowledge import (
+    MIN_COSINE,
     NONE,
     PARAMETERS,
     CalibrationError,
@@ -73,6 +75,8 @@ _USUAL_SHAPE = 0.02
 """Prior standard deviation of aspect, shear and, as a fraction at image corners, tangential distortion."""
 _SHOWN = 18.4
 """Chi-square (2 degrees of freedom, probability 1e-4) above which a pair of lens terms is significant."""
+_SIXTH_POWER = 0.1
+"""Prior standard deviation of the sixth-power distortion of an image corner, as a fraction."""
 _ROUNDS = 3
 """Number of passes over the images. Each pass identifies the stars with the lens of the previous pass.
 
@@ -339,6 +343,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
     """
     prior = _shape_prior(frames, initial)
     whole = found = calibrate(frames, initial, prior)
+    beyond = _sixth_power(frames, whole, prior)
     omitted: dict[str, OmittedTerm] = {}
     while (term := _next_omitted(found, omitted)) is not None:
         lens, sigma = found.lens, found.sigma
@@ -353,7 +358,34 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
             name: gone.assumed if name == "centre" else gone.assumed[0] for name, gone in omitted.items()
         }
         found = calibrate(frames, replace(lens, **assumed), prior)
-    return DeterminedLens(found, omitted, lens_accuracy(whole, found, omitted))
+    changed = _sixth_power(frames, found, prior)[:-1]
+    found = replace(found, covariance=found.covariance + np.outer(changed, changed))
+    return DeterminedLens(found, omitted, lens_accuracy(whole, found, omitted, beyond))
+
+
+def _sixth_power(frames: Sequence[MatchedFrame], found: Calibration, prior: LensPrior) -> FloatArray:
+    """Return the changes (10,) of PARAMETERS and of the sixth-power distortion if the latter is fitted, too.
+
+    The sixth-power distortion is the displacement of an image corner, as a fraction of its distance from the
+    image centre. The changes are zero unless the stars show this distortion.
+    """
+    lens = found.lens
+    corner = math.hypot(*lens.ideal.centre) / lens.focal_length
+    extended = []
+    for frame, attitude in zip(frames, found.attitudes, strict=True):
+        in_camera = frame.directions @ attitude_matrix(attitude).T
+        tangent = in_camera[:, :2] / np.maximum(in_camera[:, 2:], MIN_COSINE)
+        power = np.sum((tangent / corner) ** 2, axis=1, keepdims=True) ** 3
+        extended.append(replace(frame, late=lens.focal_length * tangent * power))
+    begun = np.append(parameters_of(lens), 0.0)
+    expected = np.append(parameters_of(Lens.of(lens.ideal)), 0.0)
+    information = np.append(prior.information(lens), _SIXTH_POWER**-2)
+    weights = [used.astype(float) for used in found.used]
+    last = step(extended, LensFit(begun, found.attitudes), weights, information, expected)
+    changes = last.fit.parameters - begun
+    variance = np.linalg.inv(last.information + np.diag(information))[-1, -1]
+    shown = changes[-1] ** 2 > _SHOWN * variance * max(found.chi_square / found.degrees, 1.0)
+    return changes if shown else np.zeros_like(changes)
 
 
 def _shape_prior(frames: Sequence[MatchedFrame], initial: CameraModel) -> LensPrior:
@@ -387,7 +419,7 @@ def _next_omitted(found: Calibration, omitted: dict[str, OmittedTerm]) -> str | 
 
 
 def lens_accuracy(
-    whole: Calibration, found: Calibration, omitted: dict[str, OmittedTerm]
+    whole: Calibration, found: Calibration, omitted: dict[str, OmittedTerm], beyond: FloatArray | None = None
 ) -> dict[str, float]:
     """Return the standard deviations of lens parameters by the keys of `camera.accuracy` in a configuration.
 
@@ -395,7 +427,8 @@ def lens_accuracy(
     the omitted terms. The standard deviation of the focal length includes its difference from the fit
     `whole`, which includes all terms. The distortion is expressed as the displacement of an image corner, as
     a fraction of the distance of the corner from the image centre. The standard deviation of the distortion
-    includes the uncertainty of the fit with all terms and the difference between the two fits.
+    includes the uncertainty of the fit with all terms, the difference between the two fits, and the changes
+    `beyond` (10,) of `_sixth_power`.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -406,7 +439,8 @@ def lens_accuracy(
     by_terms = np.array([1.0 / lens.focal_length, 0.0, 0.0, square, square**2, 0.0, 0.0, 0.0, 0.0])
     variance = float(by_terms @ whole.covariance @ by_terms)
     difference = float(by_terms @ (parameters_of(whole.lens) - parameters_of(lens)))
-    distortion, assumed = math.hypot(math.sqrt(variance), difference), LensPrior()
+    error = 0.0 if beyond is None else float(by_terms @ beyond[:-1] + beyond[-1])
+    distortion, assumed = math.hypot(math.sqrt(variance), difference, error), LensPrior()
     if distortion < _DETERMINED * math.hypot(assumed.k1 * square, assumed.k2 * square**2):
         accuracy["distortion"] = distortion
     return accuracy

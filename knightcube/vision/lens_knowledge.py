@@ -48,7 +48,7 @@ _MIN_SPREAD = 1e-12
 """Minimum eigenvalue of the information matrix of a frame's attitude, as a fraction of its trace."""
 _MIN_INDEPENDENCE = 1e-10
 """Minimum eigenvalue of the information matrix of the lens, normalised to a unit diagonal."""
-_MIN_COSINE = 0.05
+MIN_COSINE = 0.05
 """Minimum cosine of the angle between a star in the image and the optical axis."""
 NONE = 1e-7
 """Prior standard deviation of a lens term that is fixed at zero."""
@@ -142,7 +142,7 @@ def residuals(frame: MatchedFrame, fit: LensFit, number: int) -> FloatArray:
     """
     focal_length, x, y, k1, k2 = fit.parameters[:5]
     in_camera = frame.directions @ attitude_matrix(fit.attitudes[number]).T
-    ahead = in_camera[:, 2:] > _MIN_COSINE
+    ahead = in_camera[:, 2:] > MIN_COSINE
     tangent = in_camera[:, :2] / np.where(ahead, in_camera[:, 2:], 1.0)
     square = np.sum(tangent**2, axis=1, keepdims=True)
     distorted = tangent * (1.0 + square * (k1 + square * k2))

@@ -253,6 +253,35 @@ def test_frames_of_another_focus_are_excluded_also_if_they_are_half_of_the_frame
     assert all("its focal length is" in reason for reason in excluded.values())
 
 
+@pytest.mark.parametrize("sixth_power", [0.0, 0.01])
+def test_distortion_that_the_lens_does_not_contain_increases_the_covariance(sixth_power: float) -> None:
+    """A sixth-power distortion of 1 % at the corners displaces focal length and distortion by many sigma.
+
+    The standard deviations of a lens without this distortion do not increase.
+    """
+    rng = np.random.default_rng(96)
+    begun = _begun(20.0)
+    frames, attitudes = _frames(rng, Lens.of(begun), 8, 60, noise=0.03)
+    corner = math.hypot(*begun.centre)
+    distorted = []
+    for frame, attitude in zip(frames, attitudes, strict=True):
+        off = begun.project(frame.directions @ attitude_matrix(attitude).T) - begun.centre
+        power = (np.linalg.norm(off, axis=1, keepdims=True) / corner) ** 6
+        distorted.append(replace(frame, points=frame.points + sixth_power * off * power))
+    found = calibrate_determined(distorted, begun)
+    lens = found.calibration.lens
+    error = lens.focal_length / begun.focal_length - 1.0
+    assert abs(error) < 4.0 * found.accuracy["focal_length"]
+    points = rng.uniform(0.0, 1023.0, (500, 2))
+    off = points - begun.centre
+    true = points + sixth_power * off * (np.linalg.norm(off, axis=1, keepdims=True) / corner) ** 6
+    displaced = lens.project(begun.unit_vectors(points)) - true
+    # A common displacement is an error of the optical axis.
+    assert np.linalg.norm(displaced.std(axis=0)) < 4.0 * found.accuracy["distortion"] * corner
+    assert (found.accuracy["focal_length"] > 1e-4) == (sixth_power > 0.0)
+    assert found.accuracy["distortion"] < 3e-3
+
+
 def test_frames_whose_stars_are_all_rejected_are_excluded() -> None:
     """Frames are excluded whose focal length differs by 0.5 %, although all their stars are rejected."""
     rng = np.random.default_rng(95)
