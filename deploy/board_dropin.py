@@ -41,6 +41,8 @@ def dropin(config: Config) -> str:
         awaited = [device_unit(path) for path, _ in _nodes(config)]
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
+    if config.simulation is None and config.body != "testbed":
+        lines.append("Restart=always")  # a satellite begins the next flight when the duration of one is over
     if config.commands.udp is not None:  # UDP commands are accepted only from this machine
         lines += _network([LOOPBACK])
     return _text(lines)

@@ -142,6 +142,11 @@ def test_the_safe_state_listens_where_the_flight_does_and_starts_it_again(tmp_pa
     assert shell.returncode != REFUSED, "a launcher that cannot be read once is started again"
 
 
+def test_a_satellite_flies_again_after_the_configured_duration_and_a_testbed_ends() -> None:
+    assert "Restart=always\n" in dropin(ROOT / "config" / "board_orbit.yaml")
+    assert "Restart=" not in dropin(TESTBED)
+
+
 def test_the_watchdog_leaves_room_for_four_meals() -> None:
     text = (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
     (seconds,) = re.findall(r"^WatchdogSec=(\d+)$", text, re.MULTILINE)
