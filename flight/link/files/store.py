@@ -235,14 +235,12 @@ class Store:
             self._write_numbers(self.last, self.endings)
 
     def outgoing(self) -> list[Outgoing]:
-        """Return the open outgoing transfers, ignoring damaged records."""
-        found = (_read(path, Outgoing) for path in sorted(self._folder.glob("out-*.json")))
-        return [record for record in found if record is not None]
+        """Return the open outgoing transfers, ignoring damaged records and a folder that cannot be listed."""
+        return self._records("out-*.json", Outgoing)
 
     def incoming(self) -> list[Incoming]:
-        """Return the open incoming transfers, ignoring damaged records."""
-        found = (_read(path, Incoming) for path in sorted(self._folder.glob("in-*.json")))
-        return [record for record in found if record is not None]
+        """Return the open incoming transfers, ignoring damaged records and a folder that cannot be listed."""
+        return self._records("in-*.json", Incoming)
 
     def save(self, record: Outgoing | Incoming) -> None:
         """Store a record durably. Raises FileError if the disk cannot be written."""
@@ -273,6 +271,12 @@ class Store:
     def room(self) -> int:
         """Return the disk space (bytes) available for received files."""
         return max(0, shutil.disk_usage(self._folder).free - _FREE_BYTES)
+
+    def _records(self, pattern: str, shape: type[T]) -> list[T]:
+        with suppress(OSError):  # a damaged folder must not keep the link from starting
+            found = (_read(path, shape) for path in sorted(self._folder.glob(pattern)))
+            return [record for record in found if record is not None]
+        return []
 
     def _path(self, record: Outgoing | Incoming) -> Path:
         if isinstance(record, Outgoing):

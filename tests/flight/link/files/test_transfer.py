@@ -287,6 +287,23 @@ def test_a_full_disk_holds_up_no_file_that_was_begun_before(
     assert not end.transfers(), "an ended transfer began again"
 
 
+def test_a_damaged_folder_of_transfers_does_not_keep_an_end_from_starting(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    pair.send(SATELLITE, file, "down")
+
+    def damaged(path: Path) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "scandir", damaged)
+        pair.kill(SATELLITE)
+    assert not pair.ends[SATELLITE].transfers()
+    pair.kill(SATELLITE)
+    assert len(pair.ends[SATELLITE].transfers()) == 1
+
+
 def test_a_file_that_shrinks_or_is_cancelled_ends_at_both_ends(tmp_path: Path, file: Path) -> None:
     pair = Pair(tmp_path, 0.3, seed=1)
     pair.send(SATELLITE, file, "shrinks")
