@@ -255,6 +255,8 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
         make_lasting(archive)
     except OSError as error:
         if error.errno not in DISK_TROUBLE:
+            with suppress(OSError):
+                folder.rmdir()  # the next attempt would leave another empty folder
             raise UsageError(
                 f"{archive}: the folder of a new run cannot be made: {error.strerror or error}"
             ) from error

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from flight.link.telemetry import log
 from flight.link.telemetry.log import LEAST_FREE_BYTES, MOST_RUNS, begin_run, find_runs
 from knightcube.errors import UsageError
 
@@ -154,3 +155,15 @@ def test_a_damaged_run_folder_stops_no_flight(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(os, "scandir", scandir)
     assert begin_run(tmp_path, 10_000, 100).folder.name == "run-000004"
+
+
+def test_an_attempt_that_fails_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folders of many attempts would displace the earlier runs."""
+
+    def fail(_: Path) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(log, "make_lasting", fail)
+    with pytest.raises(UsageError, match="Too many open files"):
+        begin_run(tmp_path, 1000, 100)
+    assert find_runs(tmp_path) == []
