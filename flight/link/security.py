@@ -167,9 +167,12 @@ class Vault:
         self._witness = None if witness is None else _Witness(witness)
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; `knightcube keys` makes keys")
-        for path in folder.glob("spi-*"):
-            if stat.S_IMODE(path.stat().st_mode) & 0o077:
-                raise UsageError(f"{path}: other users may read this key: run chmod 600, or make new keys")
+        with suppress(OSError):  # the keys may be readable although the damaged folder cannot be listed
+            for path in folder.glob("spi-*"):
+                if stat.S_IMODE(path.stat().st_mode) & 0o077:
+                    raise UsageError(
+                        f"{path}: other users may read this key: run chmod 600, or make new keys"
+                    )
         self.restored = False
         """Whether the primary command SPI is refused because its association is outdated."""
         if self._witness is not None:

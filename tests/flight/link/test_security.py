@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import random
@@ -386,6 +387,16 @@ def test_no_nonce_is_used_twice_if_the_folder_is_restored_from_a_backup(ground: 
                 path.write_bytes(data)
     assert len(set(counters)) < len(counters), "no counter was used twice: the test restores nothing"
     assert len(set(nonces)) == len(nonces)
+
+
+def test_keys_in_a_folder_that_cannot_be_listed_are_used(
+    sky: Vault, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(path: Path) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    monkeypatch.setattr(os, "scandir", damaged)
+    assert Vault(tmp_path / "sky").read(1) == sky.read(1)
 
 
 def test_keys_are_for_their_owner_only_and_not_in_what_is_printed(sky: Vault, tmp_path: Path) -> None:
