@@ -116,6 +116,8 @@ LONGEST_NAME = 96
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
 _MOST_PARTS = 4
 _KEPT_ENDINGS = 64
+_TRIES = 3
+"""Number of attempts to list a folder, because a single failed disk access does not mean damage."""
 _FREE_BYTES = 64 << 20
 """Free disk space (bytes) that received files must not use."""
 _LONGEST_RECORD = 4 << 20
@@ -273,10 +275,11 @@ class Store:
         return max(0, shutil.disk_usage(self._folder).free - _FREE_BYTES)
 
     def _records(self, pattern: str, shape: type[T]) -> list[T]:
-        with suppress(OSError):  # a damaged folder must not keep the link from starting
-            found = (_read(path, shape) for path in sorted(self._folder.glob(pattern)))
-            return [record for record in found if record is not None]
-        return []
+        for _ in range(_TRIES):
+            with suppress(OSError):
+                found = (_read(path, shape) for path in sorted(self._folder.glob(pattern)))
+                return [record for record in found if record is not None]
+        return []  # a damaged folder must not keep the link from starting
 
     def _path(self, record: Outgoing | Incoming) -> Path:
         if isinstance(record, Outgoing):

@@ -293,15 +293,20 @@ def test_a_damaged_folder_of_transfers_does_not_keep_an_end_from_starting(
     pair = Pair(tmp_path, 0.0)
     pair.send(SATELLITE, file, "down")
 
-    def damaged(path: Path) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+    scandir = os.scandir
 
-    with monkeypatch.context() as disk:
-        disk.setattr(os, "scandir", damaged)
-        pair.kill(SATELLITE)
-    assert not pair.ends[SATELLITE].transfers()
-    pair.kill(SATELLITE)
-    assert len(pair.ends[SATELLITE].transfers()) == 1
+    for failures, transfers in ((100, 0), (1, 1), (0, 1)):
+
+        def damaged(path: Path, left: list[int] = [failures]) -> object:  # noqa: B006 - the count of one disk
+            left[0] -= 1
+            if left[0] >= 0:
+                raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            return scandir(path)
+
+        with monkeypatch.context() as disk:
+            disk.setattr(os, "scandir", damaged)
+            pair.kill(SATELLITE)
+        assert len(pair.ends[SATELLITE].transfers()) == transfers
 
 
 def test_a_file_that_shrinks_or_is_cancelled_ends_at_both_ends(tmp_path: Path, file: Path) -> None:
