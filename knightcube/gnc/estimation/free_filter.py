@@ -781,8 +781,8 @@ class FreeFilter:
         uncertainty of an unknown inertia too small.
         """
         spread = self.covariance[INERTIA, INERTIA]
-        relative = spread.diagonal()[:3] * (self.motion.trace / self.motion.inertia.diagonal()) ** 2
-        return np.asarray(2.0 * CURVATURE * float(relative.max()) * (by_inertia @ spread @ by_inertia.T))
+        relative = _inertia_variance(spread, self.motion)
+        return np.asarray(2.0 * CURVATURE * relative * (by_inertia @ spread @ by_inertia.T))
 
     def rate_noise(
         self,
@@ -796,23 +796,29 @@ class FreeFilter:
 
         The noise density depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the
         standard deviation `doubt` (A m^2) of an uncertain dipole. Errors of the dipole cause no torque along
-        the field, but the error of the field model causes a torque along the field. The noise density is
-        computed for the estimate `then` and the equation of motion `motion`, by default for the present
-        estimate and equation.
+        the field, but the error of the field model causes a torque along the field. The acceleration due to
+        an uncertain dipole also has errors in all directions, because the field's direction and the inertia
+        are not known exactly. The noise density is computed for the estimate `then` and the equation of
+        motion `motion`, by default for the present estimate and equation.
         """
         motion, square = motion or self.motion, float(dipole @ dipole)
         at = then or self
         coils = LASTING * doubt**2 + (self._settings.coil_noise**2 if square else 0.0)
         density = TORQUE_NOISE**2 * motion.by_torque
+        error = max(at.field_error, around.field_sigma)
         if coils:
             field = attitude_matrix(at.quaternion) @ around.field
             across = motion.inverse @ cross_matrix(field) @ self.coil_matrix
             density = density + coils * (across @ across.T)
+            if doubt:
+                relative = _inertia_variance(at.covariance[INERTIA, INERTIA], motion)
+                relative += error**2 / float(field @ field)
+                mean_square = 0.5 * float(np.sum(across**2))
+                density = density + LASTING * doubt**2 * relative * mean_square * _EYE
         if square:
             across = motion.inverse @ cross_matrix(dipole)
             # While the body rotates, the two components of the field error across the rate average out.
             rotated = 1.0 + 0.25 * LASTING**2 * float(at.rate @ at.rate)
-            error = max(at.field_error, around.field_sigma)
             density = density + LASTING * (1.0 + 2.0 / rotated) / 3.0 * error**2 * (across @ across.T)
         return np.asarray(density)
 
@@ -848,6 +854,12 @@ _SCALED: FloatArray = np.zeros(STATES)
 _SCALED[LEARNED[ALL_NAMES]] = 1.0
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
 _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
+
+
+def _inertia_variance(spread: FloatArray, motion: FreeMotion) -> float:
+    """Return the largest relative variance of a moment of inertia from the covariance (6, 6)."""
+    relative = spread.diagonal()[:3] * (motion.trace / motion.inertia.diagonal()) ** 2
+    return float(relative.max())
 
 
 def density_walk(sizes: FloatArray) -> FloatArray:

@@ -105,6 +105,28 @@ def test_late_attitudes_serve_as_well_as_timely_ones() -> None:
     assert sigmas[1] == pytest.approx(sigmas[0], rel=0.2)
 
 
+@pytest.mark.parametrize("axis", [1, 2])
+def test_an_unknown_dipole_turns_a_body_of_another_inertia_within_the_claim(axis: int) -> None:
+    """Torques are perpendicular to the field, but the accelerations depend on the true inertia."""
+    turned = attitude_matrix(from_rotation_vector(np.array([0.05, -0.06, 0.07])))
+    inertia, dipole = turned @ INERTIA @ turned.T, 5.0 * np.eye(3)[axis]
+    found, rng = FreeFilter(INERTIA, FreeFilterSettings()), np.random.default_rng(4)
+    q, w = IDENTITY, np.zeros(3)
+    found.start(q, STAR**2 * np.eye(3), BIAS, by_stars=True)
+    for _ in range(5):  # the gyro and the stars determine the rate
+        found.advance(1.0, np.zeros(3), around(0.0))
+        found.gyro(BIAS + GYRO_SIGMA * rng.standard_normal(3), GYRO_SIGMA**2 * np.eye(3))
+        found.attitude(q, STAR**2 * np.eye(3))
+    for _ in range(60):
+        torque = np.cross(dipole, attitude_matrix(q) @ around(0.0).field) - np.cross(w, inertia @ w)
+        w = w + 0.05 * np.linalg.solve(inertia, torque)
+        q = multiply(from_rotation_vector(0.05 * w), q)
+        found.advance(0.05, np.zeros(3), around(0.0), float(np.abs(dipole).max()))
+    error = to_rotation_vector(multiply(q, conjugate(found.quaternion)))
+    claim = found.covariance[ATTITUDE, ATTITUDE]
+    assert error @ np.linalg.solve(claim, error) < 16.3, "99.9 % of a chi-square of 3"
+
+
 def test_sun_and_nadir_by_differently_misaligned_cameras_give_an_honest_attitude() -> None:
     """The camera of the Sun is misaligned by 0.1 deg, those of nadir are not, and both are 20 deg apart.
 
