@@ -30,8 +30,11 @@ from tests.studies.campaigns.fault_judgement import (
 )
 from tests.studies.campaigns.orbit_fault_flights import DURATION
 
-FIELD_GRACE = 5.0
-"""Longest time (s) to zero current after the last valid field."""
+FIELD_GRACE = 8.2
+"""Longest time (s) to zero current after the last valid field.
+
+The detumbler predicts the field for `SILENT_PERIODS` periods of the schedule in config/orbit.yaml, 8 s.
+"""
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 """Largest errors of an acceptable attitude: in claimed standard deviations, and in rad."""
 DIPOLE_PER_AMPERE = 0.648
