@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
+import gc
 import importlib.util
 import json
 import math
@@ -409,6 +410,9 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
                 error.add_note(f"in case {case.key}:\n{traceback.format_exc()}")
                 answer = None, error
             pipe.send(answer)
+            # A flight leaves reference cycles with large arrays. Because it suspends the collection of older
+            # objects, the automatic collection would not find them for dozens of flights.
+            gc.collect()
 
 
 @contextmanager

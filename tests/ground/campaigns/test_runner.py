@@ -6,12 +6,14 @@ Threads take the place of worker processes, because the start of a process takes
 from __future__ import annotations
 
 import fcntl
+import gc
 import io
 import json
 import os
 import signal
 import threading
 import time
+import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -388,6 +390,30 @@ def test_each_case_runs_once_on_as_many_workers_as_are_allowed(tmp_path: Path, t
     assert len({one.scratch for one in threads}) == 2
     assert not any(Path(one.scratch).exists() for one in threads)
     assert not list(tmp_path.glob("*/temporary"))
+
+
+class Cycle:
+    """An object with a reference to itself, which reference counting does not free."""
+
+    def __init__(self) -> None:
+        self.own = self
+
+
+cycles: weakref.WeakSet[Cycle] = weakref.WeakSet()
+
+
+def leave_a_cycle(case: Case) -> Result:
+    """Return the number of earlier cycles, and leave another one, as a flight in lock-step does."""
+    before = len(cycles)
+    cycles.add(Cycle())
+    gc.freeze()
+    gc.unfreeze()
+    return {"value": before}
+
+
+def test_a_worker_frees_the_garbage_of_each_case(tmp_path: Path) -> None:
+    campaign = Campaign("toy", "", cases, leave_a_cycle, summarise, 4)
+    assert fly(campaign, 3, 1, tmp_path, workers=1).facts == {"values": [0, 0, 0]}
 
 
 def test_the_default_is_one_worker_for_each_core(
