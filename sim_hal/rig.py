@@ -54,7 +54,7 @@ from sim_hal.faults.catalogue import Bench, listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, put, scheduled
 from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
-from sim_hal.settings import CageTruth, FreeBodySection, Simulation, utc_seconds
+from sim_hal.settings import YEARS, CageTruth, FreeBodySection, Simulation, utc_seconds
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
@@ -96,7 +96,9 @@ class SimulationRequest:
         section = configuration.simulation_section(self.text, name, Simulation)
         if section is None:
             raise ConfigError(name, "has no `simulation` section")
-        utc_seconds(section.utc)  # raises ConfigError
+        first, last = YEARS
+        if not utc_seconds(f"{first}-01-01") <= utc_seconds(section.utc) < utc_seconds(f"{last + 1}-01-01"):
+            raise ConfigError("simulation.utc", f"is {section.utc!r}: give a year from {first} to {last}")
         return section
 
 

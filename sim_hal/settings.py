@@ -31,14 +31,12 @@ YEARS = 2001, 2043
 def utc_seconds(utc: str) -> float:
     """Return the time since 1970 (s) of an ISO 8601 time, which is UTC unless the text has a time zone.
 
-    Raises ConfigError for another text, and for a year in which the simulated magnetic field is not known.
+    Raises ConfigError for another text.
     """
     try:
         found = datetime.fromisoformat(utc)
     except ValueError as error:
         raise ConfigError("simulation.utc", f"is {utc!r}: give a UTC such as 2026-03-20T12:00:00Z") from error
-    if not YEARS[0] <= found.year <= YEARS[1]:
-        raise ConfigError("simulation.utc", f"is {utc!r}: give a year from {YEARS[0]} to {YEARS[1]}")
     return (found.replace(tzinfo=UTC) if found.tzinfo is None else found).timestamp()
 
 

@@ -65,7 +65,7 @@ def test_a_stuck_magnetometer_ends_the_braking_and_current_in_spite_of_it_is_fou
     assert found["works"]
     names = ("truth", "imu", "navigation", "mode", "attitude")
     doctored = WritablePackets({name: run[name].copy() for name in names})
-    late = np.abs(run["truth"]["time_ns"] * 1e-9 - (AT + 8.0)) < 0.1
+    late = np.abs(run["truth"]["time_ns"] * 1e-9 - (AT + 9.0)) < 0.1
     doctored["truth"]["current"][late] = 0.05
     blind = judgement.blind_current(cast("Run", doctored), kind, "detumble", AT, AT + SPAN)
     assert blind == pytest.approx(0.05)
