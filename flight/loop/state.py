@@ -521,7 +521,8 @@ class StateKeeper:
     """Keeps the stored state up to date from the start of a boot to its end.
 
     The `record` and the parameters `learned` come from earlier boots. The flag `counted` states whether the
-    number of this boot was written. The attribute `table` is the table of onboard parameters to be used.
+    number of this boot was written. The attribute `table` is the table of onboard parameters to be used. The
+    flag `is_flying` states whether the flight has noted its state, which it does about once a second.
     """
 
     def __init__(
@@ -555,7 +556,7 @@ class StateKeeper:
         self.table = self._begun.table
         self._noted = Noted(self._begun.mode, {}, self.table)
         self._writing = threading.Lock()  # lock held while writing, not acquired by note()
-        self._closed = False
+        self._closed = self.is_flying = False
         self._report_changes(loaded)
         self.counted = store.store(self._begun)
         self._ticker = clock.ticker("state", period_ns, self._write)
@@ -579,6 +580,7 @@ class StateKeeper:
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:
         """Set mode and learned parameters for the next write. Never waits."""
+        self.is_flying = True
         self._noted = replace(
             self._noted, mode=mode, learned=self._noted.learned if learned is None else learned
         )
@@ -650,8 +652,9 @@ def open_state(
 
     The sequence `runs` holds the folders of the newest runs, which contain files with boot numbers. The last
     folder belongs to the present run. When `stack` closes, the final state is written, as a clean end unless
-    an exception was raised. The errors after which a start is retried (DeviceError, KnightCubeError and
-    OSError) count as clean ends, because they are reported, and safe mode would not help.
+    an exception was raised. A DeviceError counts as a clean end, because it is reported as a device error and
+    safe mode would not help. During the start, so do the other errors after which a start is retried,
+    KnightCubeError and OSError.
     """
     folder = state_folder(config, environment)
     if folder is None:
@@ -671,7 +674,8 @@ def open_state(
         note_boot([folder, *runs[-1:]], keeper.record.boot_count)
 
     def close(kind: type[BaseException] | None, *_: object) -> bool:
-        keeper.close(clean=kind is None or issubclass(kind, DeviceError | KnightCubeError | OSError))
+        harmless = DeviceError if keeper.is_flying else DeviceError | KnightCubeError | OSError
+        keeper.close(clean=kind is None or issubclass(kind, harmless))
         return False
 
     stack.push(close)

@@ -272,7 +272,7 @@ def test_an_adis16470_measures_negative_rates_and_averages() -> None:
 
 
 def test_an_adis16470_never_mixes_the_axes_of_two_samples() -> None:
-    """If the sample counter changes in every try, there is no reading."""
+    """If the sample counter changes in every try, NotResponding is raised."""
 
     class Part:
         counter = 0

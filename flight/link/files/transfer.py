@@ -680,7 +680,7 @@ class Entity:
         return _of_sender(self._out[number])
 
     def cancel(self, source: int, number: int) -> None:
-        """Cancel an incoming or outgoing transfer. Raises FileError if there is no such transfer."""
+        """Cancel an incoming or outgoing transfer. Raises FileError for an unknown transfer."""
         side = self._transfer(source, number)
         if isinstance(side, Sender):
             side.cancel()
@@ -688,11 +688,11 @@ class Entity:
             side.stop(Condition.CANCELLED, "cancelled")
 
     def suspend(self, source: int, number: int, suspended: bool) -> None:
-        """Suspend or resume a transfer. Raises FileError if there is no such transfer."""
+        """Suspend or resume a transfer. Raises FileError for an unknown transfer."""
         self._transfer(source, number).suspend(suspended)
 
     def _transfer(self, source: int, number: int) -> Sender | Receiver:
-        """Return an open transfer. Raises FileError if there is no such transfer."""
+        """Return an open transfer. Raises FileError for an unknown transfer."""
         side = self._out.get(number) if source == self.number else self._in.get((source, number))
         if side is None:
             raise FileError(f"no transfer {number} of entity {source} is open")

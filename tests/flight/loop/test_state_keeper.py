@@ -31,8 +31,9 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from ground.telemetry import read_run
 from hal.buses.system import SystemClock
-from hal.interfaces.errors import NotResponding
+from hal.interfaces.errors import DeviceError, NotResponding
 from hal.interfaces.wires import Clock
+from knightcube.errors import KnightCubeError
 from tests.flight.loop.disk import NO_SPACE, Disk
 from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock
@@ -249,6 +250,26 @@ def test_an_exception_that_ends_the_flight_is_not_a_clean_end(tmp_path: Path) ->
         assert keeper is not None
         assert keeper.record.unclean_recent == 1
     assert not stored(folder).running
+
+
+@pytest.mark.parametrize("is_flying", [False, True])
+@pytest.mark.parametrize("error", [OSError, KnightCubeError, DeviceError])
+def test_an_error_after_which_a_start_is_retried_is_an_unclean_end_of_a_flight(
+    tmp_path: Path, error: type[Exception], is_flying: bool
+) -> None:
+    arguments = ("camera", "silent") if error is DeviceError else ("no image",)
+
+    def crash() -> None:
+        with ExitStack() as stack:
+            keeper = open_state(simulated(tmp_path), {}, ManualClock(), stack)
+            assert keeper is not None
+            if is_flying:
+                keeper.note("point")
+            raise error(*arguments)
+
+    with pytest.raises(error):
+        crash()
+    assert stored(tmp_path).running is (is_flying and error is not DeviceError)
 
 
 def test_a_flight_starts_although_its_folder_cannot_be_made(tmp_path: Path) -> None:
