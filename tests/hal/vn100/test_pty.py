@@ -111,18 +111,38 @@ def test_an_open_port_cannot_be_opened_again_until_the_driver_closes_it() -> Non
     os.close(far)
 
 
-def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def cable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cable]:
+    """Yield a cable whose port is opened again within milliseconds."""
     monkeypatch.setattr(linux_wires, "_REOPEN_S", 0.005)
-    clock, name = SystemClock(), tmp_path / "imu"
-    first, second = os.openpty(), os.openpty()
-    name.symlink_to(os.ttyname(first[1]))
-    port = PySerialPort(str(name), 115200, clock)
+    cable = Cable(tmp_path / "imu")
+    yield cable
+    cable.port.close()
+    for end in cable.second:
+        os.close(end)
+
+
+class Cable:
+    """A serial port `port` whose device file can be unplugged, and plugged in again as a second device."""
+
+    def __init__(self, name: Path) -> None:
+        self.name, self.first, self.second = name, os.openpty(), os.openpty()
+        name.symlink_to(os.ttyname(self.first[1]))
+        self.port = PySerialPort(str(name), 115200, SystemClock())
+
+    def unplug(self) -> None:
+        self.name.unlink()
+        for end in reversed(self.first):
+            os.close(end)
+
+    def plug(self) -> None:
+        self.name.symlink_to(os.ttyname(self.second[1]))
+
+
+def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(cable: Cable) -> None:
+    clock, port, second = SystemClock(), cable.port, cable.second
     assert port._thread.daemon, "a thread that waits must not keep the process alive"
-    name.unlink()
-    os.close(first[1])
-    os.close(first[0])
+    cable.unplug()
     words, plugged, sent, deadline_ns = b"", False, False, clock.now_ns() + 20_000_000_000
     while words != b"again" and clock.now_ns() < deadline_ns:
         try:
@@ -132,25 +152,18 @@ def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
             sent = sent or (plugged and os.write(second[0], b"again") > 0)
         except NotResponding:
             if not plugged:
-                name.symlink_to(os.ttyname(second[1]))
+                cable.plug()
             plugged = True
         clock.sleep_until_ns(clock.now_ns() + 1_000_000)
     assert words == b"again"
     port.send(b"answer")
     assert os.read(second[0], 100).endswith(b"answer")
-    port.close()
-    for end in second:
-        os.close(end)
 
 
 def test_a_baud_rate_that_is_set_while_the_port_is_reopened_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cable: Cable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(linux_wires, "_REOPEN_S", 0.005)
-    clock, name = SystemClock(), tmp_path / "imu"
-    first, second = os.openpty(), os.openpty()
-    name.symlink_to(os.ttyname(first[1]))
-    port = PySerialPort(str(name), 115200, clock)
+    clock, port = SystemClock(), cable.port
     opening, changed = threading.Event(), threading.Event()
     open_port = port._open
 
@@ -161,10 +174,8 @@ def test_a_baud_rate_that_is_set_while_the_port_is_reopened_is_kept(
         return opened
 
     monkeypatch.setattr(port, "_open", slowly)
-    name.unlink()
-    os.close(first[1])
-    os.close(first[0])
-    name.symlink_to(os.ttyname(second[1]))
+    cable.unplug()
+    cable.plug()
     assert opening.wait(10.0)
     port.set_baud_rate(57600)
     changed.set()
@@ -172,10 +183,7 @@ def test_a_baud_rate_that_is_set_while_the_port_is_reopened_is_kept(
     while port._failure and clock.now_ns() < deadline_ns:
         clock.sleep_until_ns(clock.now_ns() + 1_000_000)
     assert port._failure == ""
-    assert termios.tcgetattr(second[1])[4:6] == [termios.B57600, termios.B57600]
-    port.close()
-    for end in second:
-        os.close(end)
+    assert termios.tcgetattr(cable.second[1])[4:6] == [termios.B57600, termios.B57600]
 
 
 def test_data_that_nobody_receives_are_dropped_oldest_first_and_counted(
