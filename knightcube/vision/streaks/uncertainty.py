@@ -320,6 +320,8 @@ def _path_light(
     camera: FitProblem, onward: CameraMotion, rest: FloatArray, length: float, width: float
 ) -> _PathLight:
     """Return the sums along the path of a star that starts from rest at the pixel `rest` (2,)."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - few motions are near rest
+
     frame, pinhole = camera.frame, camera.pinhole
     places = np.arange(-_BEFORE, _BEYOND * length + _BEFORE, _STEP)
     path = positions(pinhole, onward, np.repeat(rest[None], len(places), axis=0), places / length)
@@ -330,9 +332,9 @@ def _path_light(
     index = np.unique(y[inside] * pinhole.columns + x[inside])
     index = index[~frame.bad[index]]
     points = np.stack([index % pinhole.columns, index // pinhole.columns], axis=1)
-    apart = np.sum((points[:, None] - path) ** 2, axis=2)
-    nearest = np.argmin(apart, axis=1)
-    apart = apart[np.arange(len(index)), nearest]
+    # A table of all distances would need gigabytes for a streak of 1000 px.
+    nearest = cKDTree(path).query(points)[1]
+    apart = np.sum((points - path[nearest]) ** 2, axis=1)
     # Pixels that are nearest to the first or the last sampled point of a path may lie beyond the path.
     kept = (apart < _ASIDE**2) & (nearest > 0) & (nearest < len(places) - 1)
     index, apart, nearest = index[kept], apart[kept], nearest[kept]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -527,6 +528,23 @@ def test_the_intensity_along_a_streak_shows_a_reversal() -> None:
     assert uncertainty.reversal_improvement(camera, replace(scene, motion=back)) == pytest.approx(
         found, rel=0.2
     )
+
+
+def test_the_memory_for_the_reversal_check_is_proportional_to_the_streak_length() -> None:
+    pinhole = replace(CAMERA.pinhole, columns=1300, rows=40)
+    image = np.random.default_rng(3).normal(100.0, 3.0, (40, 1300))
+    frame = reduce_frame(np.rint(image).astype(np.uint16), SATURATION, 1.0)
+    camera = FitProblem(frame, pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    peaks = []
+    for length in (60.0, 600.0):
+        onward = CameraMotion.steady(length / pinhole.focal_length * np.array([0.0, -1.0, 0.0]))
+        tracemalloc.start()
+        light = uncertainty._path_light(camera, onward, np.array([20.0, 20.0]), length, 1.0)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        # The path is examined over 1.9 times its length, on 5 rows within 3 px.
+        assert light.pixels > 9.0 * length
+    assert peaks[1] < 20.0 * peaks[0]
 
 
 _STARS = 400
