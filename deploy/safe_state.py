@@ -2,11 +2,11 @@
 """Safe state of a board after repeated failures of the flight, with the coils at zero until the next attempt.
 
 The service knightcube-safe.service runs this program, which needs only Python's standard library and the
-script `coils-off` in the same folder. The program ends with status 0 when the flight is to be started again.
-The first start follows after 30 s, and the waiting time doubles with each further failure, up to an hour. The
-command `mode` ends the waiting time at once, and the command `safe` sets the waiting time to one hour from
-the command. The command `ping` is answered. Other commands are refused, and datagrams that are not commands
-get no answer.
+script `coils-off` in the same folder. The program ends with status 0 when the flight software is to be
+started again. The first start follows after 30 s, and the waiting time doubles with each further failure, up
+to an hour. The command `mode` ends the waiting time at once, and the command `safe` sets the waiting time to
+one hour from the command. The command `ping` is answered. Other commands are refused, and datagrams that are
+not commands get no answer.
 
 The environment variable KNIGHTCUBE_COMMANDS holds the path of the command socket; without it, no commands are
 received. The number of tries is stored in the folder RUNTIME_DIRECTORY until the next boot of the board.
@@ -33,7 +33,8 @@ FLEW_S = 600.0
 COILS_S, RETRY_S = 30.0, 1.0
 """Intervals (s) of setting the coils to zero: after an acknowledgement by the PWM chip, and without one.
 
-The script `coils-off` is killed after `COILS_S` as well, so that a hanging bus delays no answer for longer.
+The script `coils-off` is also killed after `COILS_S`, so that a hanging bus delays answers by no more than
+this time.
 """
 
 # Tests compare these packet layouts with those of flight/link, which this program does not import.

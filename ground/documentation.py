@@ -353,7 +353,7 @@ def components(packet: str, field: Field) -> list[str]:
 
 
 def add_components(packets: list[Object]) -> list[Object]:
-    """Extend each field of the packet table by its components' names and by the parameters of its limits."""
+    """Add to each field of the packet table the names of its components and the parameters that limit it."""
     for packet in packets:
         fields = LAYOUTS[packet["name"]].packet.fields
         for entry, field in zip(packet["fields"], fields, strict=True):

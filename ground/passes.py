@@ -40,7 +40,7 @@ that passes over a station is unknown."""
 SENDING = timedelta(minutes=1)
 """Time after the present in which no command is due, because scheduled commands must arrive before."""
 _BETWEEN = timedelta(seconds=1)
-"""Time between two commands of different passes, because scheduled commands are due at whole seconds."""
+"""Shortest time between two commands of different passes: scheduled commands are due at whole seconds."""
 _LOW_PERIOD_S = 9000.0
 """Longest period of an orbit in which each pass is shorter than `_SEARCH_S`."""
 LEAD_S = 120.0

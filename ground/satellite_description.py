@@ -35,7 +35,7 @@ _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
 """Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, solar pressure (Pa)."""
 _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
 """Bound of the simulated current error, and assumed current noise, as fractions of the current limit."""
-_NEED_STARS = ("fine_within", "knowledge_deg", "camera_missed_percent")  # requirements with star camera only
+_NEED_STARS = ("fine_within", "knowledge_deg", "camera_missed_percent")  # requirements for a star camera
 _STRAY_FIELD = 7.4e-5  # field (T) of a coil at the magnetometer at the current limit [configuration `orbit`]
 
 
@@ -512,7 +512,10 @@ def _read_yes(text: str) -> bool:
 
 
 def _read_field_of_view(text: str) -> float | None:
-    """Return a field of view in deg, or None for `none`. Raises ValueError, also for a number of pixels."""
+    """Return a field of view in deg, or None for `none`.
+
+    Raises ValueError for an invalid value, and for a resolution in pixels such as `640 x 480`.
+    """
     if re.fullmatch(r"\d+\s*x\s*\d+", text.lower()):
         pixels = "give the pixels as `camera.columns` and `camera.rows` in the written file"
         raise ValueError(f"give the field of view across the columns, 6 to 40 deg, or none; {pixels}")

@@ -75,7 +75,7 @@ class PacketSource(Protocol):
 class LogTail:
     """Reader of a flight log that may be growing and may end in an incomplete packet."""
 
-    restarts = 0  # each restart of the flight begins another log
+    restarts = 0  # a restart of the flight software begins a new log
 
     def __init__(self, folder: Path) -> None:
         """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""

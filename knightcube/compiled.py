@@ -45,7 +45,7 @@ _COMPILING = (
 _functions: list[HotFunction[Any, Any]] = []
 """All functions of this process that have a compiled form."""
 _helpers: list[Callable[..., Any]] = []
-"""Functions that loop forms call and that are not yet registered for compilation by numba."""
+"""Functions decorated by `loop_helper` that are not yet registered for compilation by numba."""
 
 
 class HotFunction(Generic[Parameters, Result]):

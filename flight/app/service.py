@@ -193,9 +193,9 @@ class SeparationInhibit:
         self._elapsed: float | None = None
 
     def check(self, folder: Path | None, seconds: float) -> None:
-        """Store the time with power in `folder`, unless it is None.
+        """Store the powered-on time in `folder`, unless `folder` is None.
 
-        Raises InhibitedError while the time with power is shorter than `seconds` s.
+        Raises InhibitedError while the powered-on time is shorter than `seconds` s.
         """
         if seconds == 0.0:
             return

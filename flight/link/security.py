@@ -212,7 +212,7 @@ class Vault:
             yield
 
     def read(self, name: int | str) -> Association | None:
-        """Return the newest valid copy of an association, or None if both copies are missing or damaged.
+        """Return the newest valid copy of a security association, or None if no copy is valid.
 
         An association in the reference folder that is newer than both copies is returned instead. For an
         outdated primary command SPI, the result is None, because its counters could be repeated.

@@ -1,4 +1,4 @@
-"""One flight from release to end: starts the tasks, runs the rate groups, and switches the coils off.
+"""The flight loop: starts the tasks, runs the rate groups until the flight ends, and switches the coils off.
 
 The package `flight.app` opens and closes the devices, and assembles the tasks.
 """

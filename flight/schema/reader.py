@@ -505,7 +505,7 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
 def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
     """Return the networks from which link and service sandbox accept frames. Raises ValueError.
 
-    The result is empty without UDP, TCP and KISS.
+    The result is empty if none of UDP, TCP and KISS is configured.
     """
     lines = (link.udp, link.tcp, link.kiss) if link.peers is None else (link.kiss,)
     hosts = [address.rpartition(":")[0] for address in lines if address is not None]

@@ -124,10 +124,11 @@ def noise_of(values: FloatArray) -> FloatArray:
 
 
 def missing_share(change: FloatArray, noise: float) -> float:
-    """Return the fraction of samples without a coil's field, from the changes (k, 3), T, of the field.
+    """Return the fraction of samples in which the coil produced no field.
 
-    The field of a coil is missing in a sample if the change is less than half of the usual change. The
-    fraction is 0 if the usual change does not exceed eight times the `noise` (T) of a sample.
+    The changes of the measured field by the coil are `change` (k, 3), T. The field of the coil is missing in
+    a sample if the change is less than half of the usual change. The fraction is 0 if the usual change does
+    not exceed eight times the `noise` (T) of a sample.
     """
     mean = change.mean(axis=0)
     along = change @ mean / (np.linalg.norm(mean) or 1.0)

@@ -82,7 +82,7 @@ def variation_of(text: str) -> Variation:
 
 
 def _distribution(spread: str) -> tuple[Draw, bool] | None:
-    """Return the attributes `draw` and `relative` of a variation, or None for an unknown distribution."""
+    """Return sampling function (`draw`) and flag `relative` of a variation, or None for an invalid text."""
     if found := re.fullmatch(rf"(log )?({_NUMBER})\.\.({_NUMBER})", spread):
         low, high = float(found[2]), float(found[3])
         return None if not low < high or (found[1] and low <= 0.0) else _between(low, high, bool(found[1]))

@@ -49,7 +49,7 @@ KnightCubeError."""
 _TIMEOUT_S = 3.0  # longest time (s) to wait for an answer from a socket
 _LISTEN_S = 0.02  # longest time (s) for which one read of a link waits
 _RESTART_NS = 10 * SECOND_NS
-"""Smallest fall of the mission time that is a restart of the flight; packets of one flight are less late."""
+"""Decrease of the mission time (ns) that shows a restart of the flight; delayed packets are less late."""
 _RUN, *_OF_THE_LINK = (
     LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (RUN, LINK, VERIFICATION, TRANSFER)
 )
@@ -229,7 +229,7 @@ class LinkFeed:
     def new(self) -> dict[str, PacketArray]:
         """Return the packets by name received since the last call. Raises KnightCubeError.
 
-        At a restart of the flight, only the packets after the restart are returned.
+        If the flight software was restarted since then, only the packets after the restart are returned.
         """
         with self.lock:
             now = time.monotonic()

@@ -95,7 +95,7 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
 
 
 def draw_comparison(first: Run, second: Run, folder: Path) -> Path:
-    """Draw attitude, rate and power of two runs into one picture and return its file. Raises OSError."""
+    """Plot attitude, rate and power of two runs in one figure, and return its path. Raises OSError."""
     figure = Figure(figsize=TALL, layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
     for run, letter, colour in ((first, "A", panels.BLUE), (second, "B", panels.ORANGE)):

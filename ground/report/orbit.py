@@ -433,8 +433,8 @@ def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArr
     """Return start and end times (n,), s, of the camera's intervals, and whether the body rotates slowly.
 
     The body rotates slowly if its rate is below `camera.max_rate`. As in flight, an instant at which the body
-    rotates too fast for a frame does not delay the next instant. The intervals before the oldest packets of a
-    log whose oldest segments were deleted are omitted.
+    rotates too fast for a frame does not delay the next instant. If the oldest segments of the log were
+    deleted, the intervals before the oldest remaining packets are omitted.
     """
     names = ("truth", "orbit_truth", "navigation")
     oldest = max(float(seconds(run[name])[0]) for name in names if len(run[name]))

@@ -108,8 +108,8 @@ def last_time(run: Run) -> float:
 def true_quaternions(truth: PacketArray, packets: PacketArray) -> FloatArray:
     """Return the true quaternion (n, 4) at the time of each packet, NaN where the truth is not known.
 
-    In a flight in real time, the times of the packets lie between those of the truth records. The truth is
-    interpolated between two records that are at most `_TRUTH_GAP_NS` apart.
+    In real time, packets and truth records are not written at the same times. The truth is interpolated
+    between two records that are at most `_TRUTH_GAP_NS` apart.
     """
     found = np.full((len(packets), 4), np.nan)
     if not len(truth):

@@ -439,7 +439,7 @@ class PwmTorqueCoils:
         self._served = -1  # number of the last written request
         # The newest command (A), its signed PWM counts, and whether any current was limited.
         self._converted: tuple[tuple[float, ...], Counts, bool] = ((), (), False)
-        # Newest state of the driver, and the values of which this state consists.
+        # Newest state of the driver, and the values from which this state was made.
         self._state: CoilState
         self._state_key: tuple[object, ...] = ()
 

@@ -372,7 +372,10 @@ class StreamParser:
         self._unknown += self._buffer[begin:end]
 
     def _count_foreign(self) -> None:
-        """Count the packets with unknown fields, each of which extends to the next packet with its header."""
+        """Count the packets with unknown fields, whose length is unknown.
+
+        Such a packet is assumed to end where its header occurs again.
+        """
         unknown, start, pending = self._unknown, self._unknown.find(SYNC), -1
         while 0 <= start < len(unknown) - _FOREIGN_HEADER:
             header = unknown[start : start + _FOREIGN_HEADER]

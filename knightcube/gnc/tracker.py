@@ -18,8 +18,9 @@ orbit radius.
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
 not straight lines. For example, the ratio (range rate) / range changes by the squared angular rate per second
-for an object that moves along a great circle at a constant angular rate. The additional noise density along
-the line of sight is (`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
+for an object that moves along a great circle at a constant angular rate. The spectral density of the process
+noise along the line of sight is therefore increased by (`bend` rate^2)^2 / rate, where rate is the angular
+rate of the object.
 
 Each sighting is assigned to at most one track, first to confirmed and then to tentative tracks, in order of
 increasing cost: the chi-square of direction and brightness plus the logarithm of the determinant of the

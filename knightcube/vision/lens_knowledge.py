@@ -349,8 +349,8 @@ _ROBUST_ROUNDS, _MOST_ROUNDS, _SETTLED = 5, 8, 1e-4
 def axes_turn(configured: CameraModel, learned: CameraModel) -> FloatArray:
     """Return the quaternion (4,) from the camera axes of the configured lens to those of the estimated lens.
 
-    The boresight of each lens is its optical axis. The pixel on the optical axis of the configured lens shows
-    the same direction through both lenses, so that an estimated optical axis does not change the mounting.
+    The boresight of each lens is its optical axis. Both lens models assign the same direction to the pixel on
+    the optical axis of the configured lens, so that an estimated optical axis does not change the mounting.
     """
     x, y, _ = learned.unit_vectors(np.array([configured.centre]))[0].tolist()
     sine = math.hypot(x, y)

@@ -358,8 +358,9 @@ class FieldAndStrings:
     def _misfits(
         self, base: FloatArray, shares: FloatArray, axis: FloatArray, tilt: float, sky: KnownDirections
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the chi-squares of currents `shares` (n,), in units of the peaks, for t trial rotations.
+        """Return the chi-squares of the currents of the solar strings for t trial rotations.
 
+        The currents `shares` (n,) are divided by the peak currents of their strings.
         The first returned array (t,) uses all strings, and each row of the second array (n, t) omits one.
         """
         strings = self._strings

@@ -681,8 +681,8 @@ def sun_of_cameras(
     """Return the Sun direction in body axes from the first camera that finds it, or from the solar strings.
 
     The images (rows, columns), by camera index, were taken at one instant. A camera is not read if, according
-    to the solar strings, the Sun cannot be in its field of view. A measured Sun that contradicts the solar
-    strings is rejected. Raises ValueError for another image size or non-finite pixels.
+    to the solar strings, the Sun cannot be in its field of view. A Sun direction that contradicts the
+    currents of the solar strings is rejected. Raises ValueError for another image size or non-finite pixels.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}

@@ -653,7 +653,7 @@ class ComparedFeed:
         return self._feed.accept(reading)
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start the flight filter from a star fix, which the compared method does not use."""
+        """Start the flight filter from a star fix; the method under comparison uses no star fixes."""
         return self._feed.begin(attitude)
 
     def compare(

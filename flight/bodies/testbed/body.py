@@ -307,7 +307,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 
 
 def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
-    """Return the object that computes the rotation about the thread for the parameters of `plant`."""
+    """Return the `ThreadReader` for the stiffness and the damping of the suspension thread of `plant`."""
     return ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
 
 

@@ -1,20 +1,20 @@
-"""Guidance and control of the testbed: rotation about the thread, targets, path planning and control laws.
+"""Guidance and control of the testbed: targets, path planning, and control of the rotation about its thread.
 
 Paths are planned by one of three strategies. The strategy GOAL plans the whole step when a target is set, and
 every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
 continuation of the step. Near the goal time, the last path is followed to its end. After the end of this
 path, each plan holds the target for one replanning period. If the body is displaced from its path, a new path
-is planned. The strategy RECEDING is described in the thesis: each plan reaches the target one whole planning
-horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan: the controller
-tracks the target itself.
+is planned. The strategy RECEDING is described in the thesis: each plan reaches the target one full planning
+horizon after the time of planning (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan:
+the controller tracks the target itself.
 
-The control laws are B-dot detumbling and a controller of the rotation about the thread. A Helmholtz cage
-reproduces the magnetic field along an orbit, which the flight software predicts. The cage produces the field
-that a satellite would measure in its local orbital frame: x along the flight direction, z down, and y, the
-axis of the thread, opposite to the orbit normal. The rotation about the thread is therefore the pitch of an
-Earth-pointing satellite, in a field that rotates once per revolution and varies in strength. The cage
-produces only the two field components normal to the thread, multiplied by `scale`. The component along the
-thread would cause no torque about the thread.
+The control laws are B-dot detumbling and a controller of the rotation about the suspension thread. A
+Helmholtz cage reproduces the magnetic field along an orbit, which the flight software predicts. The cage
+produces the field that a satellite would measure in its local orbital frame: x along the flight direction, z
+down, and y, the axis of the thread, opposite to the orbit normal. The rotation about the thread is therefore
+the pitch of an Earth-pointing satellite, in a field that rotates once per revolution and varies in strength.
+The cage produces only the two field components normal to the thread, multiplied by `scale`. The component
+along the thread would cause no torque about the thread.
 
 Both the cage's control computer and the flight software predict the field as a function of UTC, by the World
 Magnetic Model along the orbit of the two-line elements. The coil on body x has no torque while the field is

@@ -83,7 +83,10 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
 
 
 def mean_density(distance: float) -> float:
-    """Return the mean air density of day and night at a geocentric distance (m), relative to 500 km."""
+    """Return the air density, averaged over day and night, at a geocentric distance (m).
+
+    The density is divided by the density at an altitude of 500 km.
+    """
     return math.exp((_HEIGHT - distance) / _SCALE_HEIGHT)
 
 

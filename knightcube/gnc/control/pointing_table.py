@@ -278,8 +278,8 @@ def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> Pl
 
 
 LEAST_PART = 1.0 / 3.0
-"""Minimum fraction of a table that is used if the remainder of the table is unusable. If the usable part of a
-new table is shorter than this fraction, the previous table is kept."""
+"""Minimum usable fraction of a new table. A table of which only the beginning is usable is followed if the
+usable part is at least this fraction of the table. Otherwise the previous table is kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -191,7 +191,7 @@ class SunAcquisition:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin the first pause without knowledge of the field."""
+        """Begin the first pause of the coils; no magnetic field has been measured yet."""
         self._begun_ns = self._time_ns = now_ns
         self._field: FloatArray | None = None
         self._agrees = False

@@ -796,10 +796,10 @@ class FreeFilter:
 
         The noise density depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the
         standard deviation `doubt` (A m^2) of an uncertain dipole. Errors of the dipole cause no torque along
-        the field, but the error of the field model causes a torque along the field. The acceleration due to
-        an uncertain dipole also has errors in all directions, because the field's direction and the inertia
-        are not known exactly. The noise density is computed for the estimate `then` and the equation of
-        motion `motion`, by default for the present estimate and equation.
+        the field, but the error of the field model causes a torque along the field. The angular acceleration
+        due to an uncertain dipole also has errors parallel to the field, because the field's direction and
+        the inertia are not known exactly. The noise density is computed for the estimate `then` and the
+        equation of motion `motion`, by default for the present estimate and equation.
         """
         motion, square = motion or self.motion, float(dipole @ dipole)
         at = then or self

@@ -669,7 +669,7 @@ class PropagationModel:
         return correct(state, covariance, found, gate, rate_gate, considers_age=is_aged), found.value
 
     def apply(self, then: Checkpoint, measurement: Measurement) -> Checkpoint:
-        """Return the next checkpoint after `then`, for a later measurement that is not a mean rate."""
+        """Return the checkpoint after `then` that includes a later measurement; mean rates are excluded."""
         state, covariance = self.propagate(then.state, then.covariance, then.time_ns, measurement.time_ns)
         done, value = self.correct(state, covariance, measurement)
         return Checkpoint(

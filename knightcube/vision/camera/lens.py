@@ -302,7 +302,7 @@ class Lens:
         return rays
 
     def _tangential(self, tangent: FloatArray) -> FloatArray:
-        """Return the tangential distortion (..., 2) of undistorted tangents (..., 2)."""
+        """Return the tangential distortion (..., 2) at undistorted normalised image coordinates (..., 2)."""
         x, y = tangent[..., 0], tangent[..., 1]
         cross, square = 2.0 * x * y, x * x + y * y
         right = self.p1 * cross + self.p2 * (square + 2.0 * x * x)

@@ -382,9 +382,9 @@ def _normal_equations(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @loop_helper
 def _inverted(normal: FloatArray, inverse: FloatArray) -> bool:
-    """Write the inverse (p, p) of the first p rows and columns of `normal`, which is overwritten.
+    """Write the inverse of the leading (p, p) block of `normal` into `inverse`, and overwrite `normal`.
 
-    Returns whether the matrix is regular. Gauss-Jordan elimination without pivoting is stable, because the
+    Returns whether the block is regular. Gauss-Jordan elimination without pivoting is stable, because the
     matrix is positive definite.
     """
     count = len(inverse)

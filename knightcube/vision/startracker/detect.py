@@ -298,9 +298,10 @@ _FARTHEST = 2.0
 
 
 def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detections:
-    """Return the sources of a frame (rows, columns), the brightest first; `Detections.stars` selects stars.
+    """Return the sources of a frame (rows, columns), the brightest first.
 
-    Raises ValueError unless the pixels are finite real numbers and the frame has at least 16 x 16 pixels.
+    The attribute `Detections.stars` of the result marks the sources that are stars. Raises ValueError unless
+    the pixels are finite real numbers and the frame has at least 16 x 16 pixels.
     """
     return measure_areas(survey(pixels, settings))
 

@@ -512,8 +512,8 @@ def _star_ratios(
 ) -> FloatArray:
     """Return the logarithms of the likelihood ratios (..., d) of stars for each of `_DIMMER`.
 
-    The stars (...) are `above`, mag, brighter than a star with a signal-to-noise ratio of one. Stars that are
-    too faint have zero.
+    The stars (...) are `above`, mag, brighter than a star with a signal-to-noise ratio of one. The
+    logarithms are zero for stars that are too faint.
     """
     step = np.rint((0.4 * math.log(10.0) * above - _LN_PREDICTED[0]) / _LN_STEP).astype(np.int64)
     column, row = _pixels(place)

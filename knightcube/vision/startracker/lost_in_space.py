@@ -89,7 +89,7 @@ class TriangleMatches:
         )
 
 
-# Binary logarithm of the number of scales, in the units of `TriangleMatches.scale`, that count as similar.
+# Binary logarithm of the width of a bin of similar scales, in the units of `TriangleMatches.scale`.
 _SCALE_BITS = 10
 # Factors of a multiplicative hash. They are below 2^31, so that products fit into 64 bits.
 _OF_STAR, _OF_PAIR, _OF_CODE = 1021, 257, 1_640_531_527

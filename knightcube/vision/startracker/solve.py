@@ -197,7 +197,7 @@ SHAPE_DOUBT = 0.05
 """
 # Minimum position error (px) of a star, due to residual lens distortion and to the colour of the star.
 _LEAST_SIGMA_PX = 0.005
-# Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
+# Minimum position error (px) of a star due to its colour, if the accuracy of the lens is stated.
 _COLOUR_PX = 0.002
 # Significant chi-square per degree of freedom above which the positions contradict their uncertainties.
 _CONTRADICTED = 1.5
@@ -525,8 +525,8 @@ def star_field(
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * (seen.covariance[:, 0, 0] + seen.covariance[:, 1, 1]) + least**2)
-    # At an angle a from the boresight, the angle of a pixel is proportional to cos^2 a along the radius.
-    # Across the radius, the angle of a pixel is proportional to cos a.
+    # At an angle a from the boresight, the angle that a pixel subtends is proportional to cos^2 a in the
+    # radial direction, and to cos a in the tangential direction.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     magnitude = None if flux is None else -2.5 * np.log10(flux)

@@ -414,9 +414,10 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
 def motions_by_length(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, most: int, growth: float = 0.0
 ) -> Iterator[MotionGuess]:
-    """Yield initial guesses from the lengths of regions, by descending likelihood, with up to `most` stars.
+    """Yield initial guesses of the rotation from the lengths of bright regions, the most likely first.
 
-    The argument `growth` is the relative change of the rate over the exposure, see `measured_rate_change`.
+    Each guess contains at most `most` stars. The argument `growth` is the relative change of the rate over
+    the exposure, see `measured_rate_change`.
     """
     for wide, contradicted in _angles(guess, regions):
         # A changing rate slightly increases the second moment of a streak.

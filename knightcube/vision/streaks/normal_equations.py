@@ -257,8 +257,9 @@ def _sum_products_numpy(
     The weights (b, p), and the residuals in the last of the `images` (b, i + 1, p), are computed from the
     modelled counts `total` of all fitted pixels. Products of the residual with the other images give the
     gradient, and the squared residual gives chi-square. The pair `of_blocks` contains the star of each block
-    (b,), and coefficients (b, i, SHARED + ALONE) that combine the images into derivatives. The coefficients
-    of images that are zero on a block of pixels are set to zero.
+    (b,), and coefficients (b, i, SHARED + ALONE). The derivatives of the modelled counts with respect to the
+    parameters are linear combinations of the images with these coefficients. The coefficients of images that
+    are zero on a block of pixels are set to zero.
     """
     star, matrix = of_blocks
     weight[:], images[:, -1] = residuals(total, of_pixels, limits)

@@ -432,8 +432,9 @@ class RotationUncertainty:
 def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: StreakFit) -> RotationUncertainty:
     """Return the rotation of the camera over the exposure from the fit `whole`, with its uncertainty.
 
-    The argument `result` contains the stars of the fit. If the fit omits faint stars on the pixels of the
-    streaks, the rotation is taken from a fit of the brightest streaks with all faint stars on their pixels.
+    The argument `result` contains the stars of the fit. The fit may omit faint stars that overlap fitted
+    streaks. In that case, the rotation is taken from a second fit, which contains the brightest streaks and
+    all faint stars that overlap them.
     """
     camera, whole, lens = _corrected_lens(camera, whole, result.exposure)
     brightest = brightest_fit(camera, whole)
