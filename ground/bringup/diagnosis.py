@@ -629,12 +629,17 @@ def _usual_size(response: FloatArray, expected: FloatArray) -> float:
 
 
 def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict[int, int]:
-    """Return the pairs (j, k) of coils for which command j produces the fields of both coils."""
+    """Return the pairs (j, k) of coils for which command j produces the fields of both coils.
+
+    Coils whose expected fields are nearly parallel are omitted, because their shares cannot be separated.
+    """
     found, size = {}, np.linalg.norm(response, axis=1)
+    units = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    parallel = np.abs(units @ units.T) > math.cos(RECOGNISED)
     for j in np.flatnonzero(live).tolist():
         for k in range(len(response)):
             alike = abs(float(response[j] @ response[k])) > math.cos(ASKEW) * size[j] * size[k]
-            if k == j or (live[k] and not alike):
+            if parallel[j, k] or (live[k] and not alike):
                 continue
             pair = expected[[j, k]].T
             shares, *_ = np.linalg.lstsq(pair, response[j], rcond=None)

@@ -630,6 +630,23 @@ def test_two_coils_on_one_bridge_are_named_by_their_current(drawn: float, says: 
     assert cure in found.findings[0].cure
 
 
+@pytest.mark.parametrize(("apart", "error"), [(0.0, 0.0), (20.0, 6.0)])
+def test_healthy_coils_with_nearly_parallel_fields_are_not_reported_as_connected(
+    apart: float, error: float
+) -> None:
+    def fields(third: float, fourth: float) -> FloatArray:
+        """Return the fields of coils along x, along y, and at two angles (deg) from z towards y."""
+        angles = np.radians([90.0, third, fourth])
+        rows = np.stack([np.zeros(3), np.sin(angles), np.cos(angles)], axis=1)
+        return 1e-4 * np.vstack([[1.0, 0.0, 0.0], rows])
+
+    measured, current = fields(error, apart - error), np.full((4, 2), 0.1)
+    test = CoilTest(np.full(4, 0.1), measured, measured, current, 0.0, 1e-7, np.zeros((4, 2)))
+    found = diagnose_coils(test, fields(0.0, apart), "xyzw")
+    assert found.findings == []
+    assert found.joined == {}
+
+
 def test_the_result_states_coil_strength_and_angle_of_each_command() -> None:
     swapped = np.array([[0.0, -0.9, 0.0], [1.1, 0.0, 0.0], [0.0, 0.0, 1.0]])
     found = coils(field=swapped)
