@@ -729,7 +729,7 @@ class CoilCorrection:
         if len(recent) >= _MOST_CHANGES:
             return False
         recent.append(now_ns)
-        self._multiply(axis, -1.0)
+        self._set(axis, -float(self.factors[axis]))
         if in_tumble:
             self._unreviewed.add(axis)
         else:
@@ -737,12 +737,15 @@ class CoilCorrection:
         return True
 
     def weigh(self, axis: int, gain: float, sigma: float = 0.0) -> bool:
-        """Multiply a coil's gain by `gain` +- `sigma`, up to a gain of 1; return whether the gain changed."""
-        size = abs(float(self.factors[axis]))
-        factor = min(gain, 1.0 / size)
-        if factor == 1.0:
+        """Multiply a coil's gain by `gain` +- `sigma`; return whether the gain changed.
+
+        The resulting gain is limited to the range from `LEAST_GAIN` to 1, which `restore` accepts.
+        """
+        before = float(self.factors[axis])
+        size = min(max(gain * abs(before), LEAST_GAIN), 1.0)
+        if size == abs(before):
             return False
-        self._multiply(axis, factor)
+        self._set(axis, math.copysign(size, before))
         self.deviations = self.deviations.copy()
         self.deviations[axis] = sigma / gain
         return True
@@ -768,9 +771,9 @@ class CoilCorrection:
         """Return the factor of a coil as text."""
         return f"used with {self.factors[axis]:+.2f} of its configured dipole"
 
-    def _multiply(self, axis: int, factor: float) -> None:
+    def _set(self, axis: int, factor: float) -> None:
         self.factors = self.factors.copy()
-        self.factors[axis] *= factor
+        self.factors[axis] = factor
         self.sizes = tuple(np.abs(self.factors).tolist())
 
 

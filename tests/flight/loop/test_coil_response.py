@@ -415,6 +415,16 @@ def test_the_gain_of_a_weak_coil_is_known_as_well_as_it_was_estimated() -> None:
     assert correction.deviations.tolist() == pytest.approx([0.0, 0.2, 0.0])
 
 
+def test_the_gain_of_a_coil_that_weakens_repeatedly_stays_one_that_the_next_boot_accepts() -> None:
+    correction, next_boot = CoilCorrection(), CoilCorrection()
+    assert correction.reverse(0, 5, in_tumble=False)
+    assert correction.weigh(0, 0.3)
+    assert correction.weigh(0, 0.2)
+    assert correction.factors.tolist() == [-0.1, 1.0, 1.0]
+    assert not correction.weigh(0, 0.5)
+    assert next_boot.restore(correction.factors, correction.deviations) == ""
+
+
 @pytest.mark.parametrize(("since_ns", "kept"), [(199_999_999, True), (200_000_000, False)])
 def test_samples_that_are_200_ms_apart_begin_a_new_fit(since_ns: int, kept: bool) -> None:
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
