@@ -474,9 +474,18 @@ def test_exchanged_coils_exchange_their_channels_and_keep_their_resistance() -> 
 def test_a_wrong_resistance_is_multiplied_by_its_factor() -> None:
     found = changes(fault(2, "wrong resistance", 1.5))
     assert changed(found, "resistance") == [20.0, 30.0, 60.0]
-    swapped = changes(fault(0, "exchanged"), fault(1, "exchanged"), fault(0, "wrong resistance", 1.23456),
-                      serves=(1, 0, 2))  # fmt: skip
-    assert changed(swapped, "resistance") == [20.0, 37.037, 40.0]
+
+
+def test_exchanged_coils_of_different_resistance_keep_their_resistance() -> None:
+    """The command of coil x drives coil y, of 30 ohm, with the duty cycle for 20 ohm, and vice versa."""
+    swapped = changes(
+        fault(0, "exchanged"),
+        fault(1, "exchanged"),
+        fault(0, "wrong resistance", 30.0 / 20.0),
+        fault(1, "wrong resistance", 20.0 / 30.0),
+        serves=(1, 0, 2),
+    )
+    assert changed(swapped, "resistance") == [20.0, 30.0, 40.0]
 
 
 def test_a_tilted_coil_changes_its_axis_unless_its_field_is_not_along_its_axis() -> None:
