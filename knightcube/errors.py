@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from typing import Any
 
 _REMEDIES = {
     errno.EACCES: "change the owner or the permissions, or give another path",
@@ -21,6 +22,10 @@ class KnightCubeError(Exception):
 
     The message of an error states the value and the remedy.
     """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts for pickling; `args` has only the text, not the arguments of `__init__`."""
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
 class UsageError(KnightCubeError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import TracebackType
+from typing import Any
 
 
 class DeviceError(Exception):
@@ -13,6 +14,10 @@ class DeviceError(Exception):
         super().__init__(f"{device}: {message}")
         self.device = device
         self.message = message
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts for pickling; `args` has only the text, not the arguments of `__init__`."""
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
 class NotResponding(DeviceError):
