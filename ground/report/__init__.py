@@ -56,7 +56,7 @@ def draw_path(plan: StepPlan, plant: SingleAxisPlant, file: Path) -> None:
 def draw_day(
     prediction: OrbitPrediction, stations: Sequence[Station], targets: Sequence[tuple[float, str]], file: Path
 ) -> None:
-    """Draw passes and eclipses of a span as a PNG, with the targets (start in s, name). Raises UsageError."""
+    """Draw passes, eclipses and targets (pairs of start, s, and name) as a PNG. Raises UsageError."""
     with drawing(file):
         from ground.report.figures import day_figure, save  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""Pictures of a run on the testbed or in orbit, of planned paths, slews and days, a fit and a bench session.
+"""Pictures of a run, of planned paths, slews and days, of an identification, and of a bench session.
 
 The pictures of the testbed are those of Sease (2013), Figures 5.4 to 5.6 and 5.9 to 5.11. The pictures are
 drawn with matplotlib's Figure objects, without the global state of pyplot.
@@ -53,7 +53,7 @@ _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the figure of the coil cage is drawn."""
 _BENCH_SAMPLES = 400
 _FOCUS_SIDE = 128  # side (px) of the section of the focus frame around its brightest pixel
-_FIELD_STRIDE = 40  # number of magnetometer readings (one second) of which only the first is drawn
+_FIELD_STRIDE = 40  # interval, in magnetometer readings, between the drawn readings: one per second
 
 
 def save(figure: Figure, file: Path) -> None:
@@ -621,7 +621,7 @@ def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) 
 
 
 def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patch]:
-    """Draw the exclusion cones (shaded at the first time, dashed at the second), and yield their legends."""
+    """Draw the exclusion cones (shaded at the first time, dashed at the second); yield legend entries."""
     longitude, latitude = np.meshgrid(np.radians(np.arange(-180, 181)), np.radians(np.arange(-90, 91)))
     level = np.cos(latitude)
     grid = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2)

@@ -192,7 +192,7 @@ def camera_errors(run: Run) -> AttitudeErrors:
 
 
 def star_camera_knowledge(run: Run) -> Object | None:
-    """Return rms error with stars and NEES (normalised squared error) of the star camera's attitude per axis.
+    """Return rms error with stars and NEES per axis (normalised squared error) of the star camera's attitude.
 
     Returns None without a star attitude, and without description packets of the estimate and of the truth.
     """
@@ -359,8 +359,8 @@ def requirements(
     """Return the comparisons of the results with the limits in the configuration's section `requirements`.
 
     The arguments `detumbled`, `known`, `pointed` and `seen` are the report's results on detumbling, attitude
-    knowledge, pointing and the star camera. A time limit that had not passed at the end of the log, `end_s`,
-    is neither kept nor exceeded.
+    knowledge, pointing and the star camera. If the log ended, at `end_s`, before an event and before the time
+    limit of this event, the verdict is "unknown".
     """
     limits = config.requirements
 
@@ -459,7 +459,7 @@ def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArr
 def _outside_cones(
     run: Run, instants: FloatArray, boresight: FloatArray, cones: dict[str, float]
 ) -> BoolArray:
-    """Return flags (n,): whether the boresight (3,), body axes, is outside the cones of Sun and Earth."""
+    """Return flags (n,) that are true if the boresight (3,), body axes, is outside both cones."""
     body, around = run["truth"], run["orbit_truth"]
     to_body = attitude_matrix(body["quaternion"][_rows(body, instants)].astype(float))
     shown = np.einsum("nij,i->nj", to_body, boresight)

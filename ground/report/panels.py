@@ -41,7 +41,7 @@ PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 DASHED = (0, (5, 2))
 MAX_SHORT = 100.0
-"""Ratio of the ends of a short logarithmic axis, below which 2 and 5 times powers of ten are labelled."""
+"""Ratio of the ends of a logarithmic axis below which 2 and 5 times the powers of ten are labelled too."""
 _MAX_ERROR = 1e9
 """Largest plausible rate error (mrad/s).
 
@@ -287,7 +287,7 @@ def _error_bars(ax: Axes, time: FloatArray, rate: FloatArray, sigma: FloatArray,
 
 
 def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
-    """Draw the fraction of values above x for each set of times, s, by name, and a line at `bound` s.
+    """Draw for each named set of times (s) the fraction that exceeds x, and a line at `bound` s.
 
     Both axes are logarithmic, so that one late cycle in thousands is as visible as the median. Times of zero,
     such as the lateness in lock-step, cannot be drawn on logarithmic axes and are stated in the legend.

@@ -98,8 +98,8 @@ def seconds(packets: PacketArray) -> FloatArray:
 def last_time(run: Run) -> float:
     """Return the mission time (s) at which the flight log of a run ends, or 0 for a log without packets.
 
-    A satellite in orbit writes no control packets, so the result is the latest time of four packet types.
-    Packets before the start of the mission time count as 0.
+    The result is the latest time of four packet types, because a satellite in orbit writes no packets
+    `control`. The result is at least 0, even if all packets have negative mission times.
     """
     names = ("control", "attitude", "health", "event")
     return max([0.0, *(float(seconds(run[name])[-1]) for name in names if len(run[name]))])
@@ -318,7 +318,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def _error_figures(error: FloatArray, packed: FloatArray) -> Object:
-    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3 for definite covariances P."""
+    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3 over positive definite P."""
     found: Object = {"compared": len(error), "rms_error": None, "normalised": None}
     if len(error):
         found["rms_error"] = np.sqrt(np.mean(error**2, axis=0)).tolist()

@@ -63,15 +63,15 @@ class StepCommand:
 
     @property
     def rise_is_judged(self) -> bool:
-        """Whether the thesis's limit of the rise time applies to this step, which must start at a target."""
+        """Whether the thesis limits the rise time: for steps after the first that start at a held target."""
         return self.index > 0 and self.from_target
 
 
 @dataclass(frozen=True, slots=True)
 class StepResponse:
-    """Figures of one step.
+    """Performance measures of one step.
 
-    Performance measures of a step: NaN if not applicable, and infinity if never reached.
+    A measure is NaN if it is not applicable, and infinite if its level was never reached.
     """
 
     steady_state_deg: float = math.nan
@@ -99,8 +99,9 @@ def commanded_steps(
 def flown_steps(
     commanded: Sequence[StepCommand], time: FloatArray, q2: FloatArray, stops: FloatArray
 ) -> list[StepCommand]:
-    """Return the executed steps, which start at the body's attitude and may end early by a mode change.
+    """Return the executed steps, which a mode change may have ended early.
 
+    A step starts at the previous target if the body held that target, otherwise at the body's attitude.
     The attitude `q2` (n,) is sampled at `time` (n,), s. The `stops` are ascending times, s, at which a mode
     ended the step in progress.
     """

@@ -264,7 +264,7 @@ def _health(packets: PacketArray) -> Object | None:
 
 
 def _events(packets: PacketArray) -> list[Object]:
-    """Return the events by name in order of first appearance, with their numbers including throttled ones."""
+    """Return the events by name in order of first appearance, with counts that include throttled events."""
     found: dict[str, Object] = {}
     for row, time in zip(packets, signals.seconds(packets), strict=True):
         name, text = text_of(row["name"]), text_of(row["text"])
