@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     kept = {} if options.again else _kept(options.out / REPORT, key)
-    # A device that was missing may be connected now; the steps that were skipped for it are not kept.
+    # A device that was missing may be connected now. Steps that were skipped without it are not stored.
     if "find" in kept and kept["find"].findings:
         del kept["find"]
     wanted = options.only or [name for name in steps_of(config) if name not in kept]
@@ -166,7 +166,7 @@ def _coil_field(path: Path, text: str, config: Config) -> Any:
     return coil_fields(config) if rows is None else np.array(rows).T
 
 
-# Results that are kept.
+# Stored results.
 
 
 def _kept(path: Path, key: str) -> dict[str, Outcome]:

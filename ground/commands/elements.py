@@ -362,7 +362,7 @@ def run_passes(options: argparse.Namespace) -> int:
         cure = f"{NEWER}, or a longer lead"
         raise UsageError(f"--schedule: {problem}, which exceeds --lead {options.lead:g}: {cure}")
     found = prediction.passes(stations)
-    # The commands of a prediction from now on must still be sent.
+    # If the prediction begins now, there must be time to send its commands.
     earliest = prediction.begin + (SENDING if options.begin is None else timedelta(0))
     commands = _commands(found, options.lead, earliest) if options.schedule else [[] for _ in found]
     if options.json:
@@ -379,7 +379,7 @@ def run_passes(options: argparse.Namespace) -> int:
 
 
 def _commands(found: list[Pass], lead: float, earliest: datetime) -> list[list[str]]:
-    """Return the commands of each pass as typed, and print a warning for a pass without commands."""
+    """Return the commands of each pass as a user types them, and warn about passes without commands."""
     from ground.passes import scheduled_targets  # noqa: PLC0415
 
     made: list[list[str]] = []

@@ -1,8 +1,8 @@
 """Command `knightcube identify`, which estimates the constants of a body from a flight.
 
 For the testbed, the command executes a flight with current pulses in a coil and fits the constants of the
-plant. The attitude filter of a satellite estimates the constants of inertia, coils and sensors in every
-flight, so for a satellite the command only reads the folder of a run.
+plant. The attitude filter of a satellite estimates the inertia and the properties of coils and sensors in
+every flight, so for a satellite the command only reads the folder of a run.
 """
 
 from __future__ import annotations

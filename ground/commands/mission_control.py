@@ -166,7 +166,7 @@ def _first_packets(
 
 
 def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
-    """Start a process that writes to a new log file, and that `stack` ends, and return the process."""
+    """Start a process whose output goes to a new log file, and return it. The process ends with `stack`."""
     file = stack.enter_context(log.open("w", encoding="utf-8"))
     process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     stack.callback(_end, process)

@@ -88,7 +88,7 @@ def exposure_of(options: argparse.Namespace, configured: float | None) -> tuple[
     """Return the exposure time (s) of a picture, or None if it is unknown, and a line about its source.
 
     The option `--exposure` has precedence over the metadata of the picture, and the metadata have precedence
-    over the `configured` exposure time. The line is empty unless two of them differ by more than 1 %.
+    over the `configured` exposure time. The line is empty unless two of these times differ by more than 1 %.
     """
     given, stated = options.exposure, None if options.raw else stated_exposure(options.image)
     found = given or stated or configured
@@ -105,9 +105,9 @@ _MOST_ASIDE, _MOST_RATIO = 60.0, 3.0
 
 
 def prior_contradiction(prior: Sequence[float] | None, rate: FloatArray | None) -> str:
-    """Return how a rough rate (3,) contradicts a measured rate (3,), rad/s, or no text.
+    """Return how a rough rate (3,) contradicts a measured rate (3,), rad/s, or an empty text.
 
-    Such a rough rate does not determine the sign of the measured rate.
+    A rough rate that contradicts the measured rate does not determine its sign.
     """
     if prior is None or rate is None or not np.any(prior):
         return ""
@@ -181,7 +181,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check_picture(option: str, path: Path | None, *read: Path | None) -> None:
-    """Raise UsageError if a PNG file to be written would replace a file that is read, or no PNG file."""
+    """Raise UsageError if a new PNG file would replace a file that is read, or a file that is not a PNG."""
     if path is None:
         return
     if any(one is not None and one.resolve() == path.resolve() for one in read):
