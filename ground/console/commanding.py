@@ -254,10 +254,11 @@ class LinkFeed:
         return scan(b"".join(self._since_restart(live))).packets
 
     def _since_restart(self, packets: list[bytes]) -> list[bytes]:
-        """Return the packets after the last restart of the flight, or all packets without a restart.
+        """Return the packets after the last restart of the flight, or all packets if there was no restart.
 
-        At a restart, another packet `run` arrives and the mission time falls. A packet `run` alone may state
-        a correction of UTC, and the link repeats packets of the flight when the link process restarts.
+        A restart is shown by a different packet `run` that is followed by a decrease of mission time. Either
+        alone shows no restart: a packet `run` may correct the UTC, and a link process that restarts repeats
+        packets of the flight.
         """
         first = 0
         for place, packet in enumerate(packets):
@@ -286,7 +287,7 @@ class LinkFeed:
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
             lists = bool(reports) and reports[-1].name == LIST.name
-            # A list command is answered by one report of its start per line, before the report of completion.
+            # A list command is answered by one report `started` per line, and then by `completed`.
             awaited = {Stage.ACCEPTED, Stage.STARTED} if lists else {Stage.ACCEPTED}
             if reports and reports[-1].stage not in awaited:
                 listed = reports[1:] if lists else reports[-1:]

@@ -89,7 +89,7 @@ class Console:
         utc_ns: UTC at mission time zero, ns, or None while unknown.
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: camera frames that the flight has kept.
-        trouble: reason why the last read failed, or the `doubts` on the flight, or an empty text.
+        trouble: reason why the last read failed, or the texts of `doubts`, or an empty text.
         doubts: functions that describe damage of the log or the end of the flight process, or return "".
         files: files of the satellite, or None if the files are not accessible.
         stations: ground stations in the panel of passes until the operator enters other stations.
@@ -253,7 +253,7 @@ def application(console: Console, access: Access) -> web.Application:
 
 
 def _is_not_a_malformed_request(record: logging.LogRecord) -> bool:
-    """Return whether a record is not a traceback about bytes of another program that are not HTTP."""
+    """Return False for the traceback of bytes that are not HTTP, which another program has sent."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 

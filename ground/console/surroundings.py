@@ -35,8 +35,8 @@ class FlightSurroundings:
     """Orbit and devices from the configuration of a flight.
 
     Attributes:
-        elements: two-line elements, or None on a testbed or without elements in the configuration.
-        lines: text of the two-line elements, or None without elements.
+        elements: two-line elements, or None if the configuration has none.
+        lines: text of the two-line elements, or None if the configuration has none.
         camera: mounting (4,) of the star camera, body into camera, and its field of view, rad.
         coil_dipole: largest dipole moment along a body axis, A m^2.
         body: kind of body, or None if the configuration cannot be read.
@@ -74,7 +74,10 @@ class FlightSurroundings:
         return cls(elements, view, dipole, body, config.coils.resistance, currents, lines)
 
     def at(self, utc_ns: int) -> Object | None:
-        """Return subsatellite and subsolar points (deg), height (km), field (T), and ICRS directions (3,)."""
+        """Return subsatellite and subsolar points (deg), height (km), field (T), and ICRS directions (3,).
+
+        Returns None if the orbit at this time is unknown.
+        """
         state = self._state(_julian_date(utc_ns))
         if state is None:
             return None
@@ -130,7 +133,7 @@ def _direction(vector: FloatArray) -> list[float]:
 
 
 class FrameFolder:
-    """Folder of kept camera frames, or None for a flight without kept frames."""
+    """Camera frames that a flight has kept in a folder, which is None if the flight keeps no frames."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder

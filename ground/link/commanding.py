@@ -342,7 +342,7 @@ class FileSession:
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
-        self._failed: list[tuple[Progress, int]] = []  # failed transfers; when (ns) to stop waiting
+        self._failed: list[tuple[Progress, int]] = []  # failed transfers with timeout (ns)
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
         self._credit, self._credit_ns = 0.0, now_ns  # transmission capacity at the last call of `transmit`

@@ -223,7 +223,7 @@ class Terminal:
                 reported = True
 
     def learn_counters(self, seconds: float) -> None:
-        """Receive telemetry for at most `seconds` s, until it has raised counters that are too low."""
+        """Receive telemetry until a packet `link` raises counters that are too low, at most `seconds` s."""
         self._learned = False
         for _ in self.packets(seconds):
             if self._learned:
@@ -270,7 +270,7 @@ class Terminal:
 
 
 def report_of(packet: bytes) -> Report | None:
-    """Return the report in a verification packet, or None for a version or stage of other software."""
+    """Return the report in a verification packet, or None if its version or its stage is unknown."""
     row = row_of(VERIFICATION, packet)
     if row is None:
         return None
