@@ -29,7 +29,7 @@ from knightcube.errors import UsageError
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 _SEARCH_S = 3600.0
-"""Time (s) by which the search extends beyond the span, so that passes at its ends are found completely."""
+"""Time (s) by which the search extends beyond the span, so that passes that overlap its ends are complete."""
 _STEP_S = 10.0  # interval (s) between computed positions; begin and end of an eclipse are interpolated
 _SPEED = 7.6e3  # typical speed (m/s) in a low orbit, which converts an along-track error to a timing error
 NEWER = "give newer elements (`knightcube elements` with --fixes or --read)"
@@ -38,13 +38,13 @@ _KNOWN_SHARE = 0.25
 """Standard deviation of the predicted times, as a fraction of the orbital period, above which the revolution
 that passes over a station is unknown."""
 SENDING = timedelta(minutes=1)
-"""Time after the present in which no command is due, because scheduled commands must arrive before."""
+"""Shortest time from now until a scheduled command is due, because the satellite must receive it first."""
 _BETWEEN = timedelta(seconds=1)
 """Shortest time between two commands of different passes: scheduled commands are due at whole seconds."""
 _LOW_PERIOD_S = 9000.0
 """Longest period of an orbit in which each pass is shorter than `_SEARCH_S`."""
 LEAD_S = 120.0
-"""Default time (s) for the slew, from the command to point to the station until the rise."""
+"""Default time (s) for the slew, between the command to point to the station and the rise."""
 _RISE, _CULMINATION, _SET = range(3)
 """Codes of the events rise, culmination and set in the results of `EarthSatellite.find_events`."""
 
@@ -226,8 +226,8 @@ class OrbitPrediction:
     def passes(self, stations: Sequence[Station]) -> list[Pass]:
         """Return the passes over all stations that overlap the span, in order of rise.
 
-        Raises UsageError if the satellite does not set at a station, as a geostationary satellite, and if the
-        elements are too old to predict which revolution passes over a station.
+        Raises UsageError if the satellite never sets at a station, such as a geostationary satellite, and if
+        the elements are too old to predict which revolution passes over a station.
         """
         self.check_age()
         found = [one for station in stations for one in self._over(station)]

@@ -153,7 +153,7 @@ def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_len
 
 
 def write_truth(path: Path, truth: dict[str, Any]) -> None:
-    """Write a truth as JSON. Raises UsageError."""
+    """Write the true parameters of a picture as JSON. Raises UsageError if the file cannot be written."""
     try:
         path.write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
     except OSError as error:

@@ -104,7 +104,10 @@ def _in_file(points: FloatArray, rows: int) -> FloatArray:
 def _polynomials(
     names: tuple[str, str], places: FloatArray, shift: FloatArray, least: int
 ) -> dict[str, str | int | float | bool]:
-    """Return FITS coefficients, from order `least` on, of polynomials in `places` (n, 2) that fit `shift`."""
+    """Return the FITS coefficients of polynomials in `places` (n, 2) that fit `shift` (n, 2).
+
+    The terms have orders from `least` to `_ORDER`.
+    """
     powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i) if least <= i + j]
     size = float(np.abs(places).max())
     x, y = (places / size).T

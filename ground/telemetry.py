@@ -50,7 +50,7 @@ def named(states: States, number: Any) -> str:
 
 @dataclass(frozen=True)
 class ScanResult:
-    """Packets found in a sequence of bytes, and the numbers of bytes in and outside packets.
+    """Packets found in a sequence of bytes, and the numbers of bytes inside and outside packets.
 
     Attributes:
         packets: structured array of each packet type in order of arrival, which may be empty.
@@ -85,8 +85,8 @@ class ScanResult:
 def scan(data: bytes, whole: bool = False) -> ScanResult:
     """Return the packets in `data` and the account of all bytes.
 
-    If `whole` is true, the data begin with the first packets of a flight, whose sequence counts are zero, so
-    packets before the first found packet are missing too.
+    If `whole` is true, the data are those from the start of a flight, where the sequence counts begin at
+    zero, so packets that are missing before the first found packet are counted too.
     """
     found = {name: bytearray() for name in LAYOUTS}  # a list of packets would need twice as much memory
     claimed = other_versions = last = 0
@@ -191,7 +191,7 @@ def read_run(folder: Path) -> Run:
     for stem in ("flight", "truth", "performance"):
         try:
             paths = segments if stem == "flight" else find_segments(folder, stem)
-            # The first packets of a log whose oldest segments were deleted are not missing by damage.
+            # If the oldest segments of a log were deleted, their packets are not counted as missing.
             whole = stem == "flight" and is_first(paths[0])
             logs.append(scan(b"".join(path.read_bytes() for path in paths), whole))
         except OSError as error:
@@ -221,7 +221,7 @@ def tables(run: Run) -> Iterator[tuple[str, list[PacketColumn]]]:
 
 
 def _dates(run: Run) -> PacketColumn:
-    """Return the column with the UTC of each event, by the newest label of the flight."""
+    """Return the column with the UTC of each event, computed from the newest packet `run`."""
     label, times = run["run"], run["event"]["time_ns"].tolist()
     start_ns = int(label["utc_ns"][-1]) if len(label) else 0
     meaning = "UTC by the newest packet run; empty if the flight knew no UTC"

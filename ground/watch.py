@@ -43,18 +43,18 @@ if TYPE_CHECKING:
 
 STREAMS = ("imu", "field", "coils", "power", "camera")
 LISTED_EVENTS = 12
-SILENT_S = 3.0  # time (s) without a packet of a flight that is shown
+SILENT_S = 3.0  # time (s) without a packet of a flight above which the silence is reported
 _KEPT_EVENTS = 200
 _MAX_TIME = 1e15  # mission time (s) above which a packet is assumed to be damaged
 _TIMEOUT_S = 2.0  # longest time (s) to wait for the answer to a ping
-_FROM_START_S = 0.1  # mission time (s) up to which the first packet of a complete log arrives
-_REPEATED = frozenset({"run", "parameters"})  # packets of the start that a flight sends again later
+_FROM_START_S = 0.1  # latest mission time (s) of the first packet of a complete log
+_REPEATED = frozenset({"run", "parameters"})  # packets that a flight sends at its start and again later
 _OF_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name, "run"})
-"""Packets that the link process sends also without a flight."""
+"""Packets that the link process sends even if no flight runs."""
 _OF_EACH_FLIGHT = frozenset({ATTITUDE.name, HEALTH.name})
 """Periodic packets of a flight; a decrease of their times by more than `_REORDERED_S` shows a restart."""
 _REORDERED_S = 5.0
-"""Largest decrease (s) of packet times because a network reordered the frames of a link."""
+"""Largest decrease (s) of packet times that is attributed to frames that a network has reordered."""
 _BAD_STAGES = frozenset({Stage.REFUSED, Stage.FAILED})
 
 
@@ -199,7 +199,7 @@ def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAn
 class LoggedEvent:
     """An event of the flight log at mission time `time` (s).
 
-    The number `suppressed` counts events of the same kind since the preceding one that were not recorded.
+    `suppressed` is the number of events of the same kind that were not recorded since the last recorded one.
     """
 
     time: float
@@ -218,8 +218,8 @@ class FlightState:
         mode: label of the flight's mode, or an empty text until the mode is known.
         ended: reason for the end of the flight, or an empty text before the end.
         events: newest events.
-        faults: number of received events whose severity is fault, including the events before them that were
-            not recorded.
+        faults: number of received events whose severity is fault, including the unrecorded events that they
+            count as `suppressed`.
         since: mission time of the first packet, s, or None before the first packet. No packet contains the
             number of faults since the start, so faults before this time are not counted.
         newest: newest packets by name.
@@ -279,7 +279,7 @@ class FlightState:
 
     @property
     def silence(self) -> float:
-        """Time (s) since the last packet of the flight itself; the link process also sends packets."""
+        """Time (s) since the last packet of the flight; packets of the link process do not count."""
         return time.monotonic() - self._received
 
     def value(self, packet: str, name: str) -> Any:
@@ -300,7 +300,7 @@ class FlightState:
 
     @property
     def counted_faults(self) -> str:
-        """Number of received faults, and the beginning of the count if it is later than the start."""
+        """Text with the number of received faults, and the start of the count if the flight began earlier."""
         if self.since is None or self.since <= _FROM_START_S:
             return f"faults {self.faults}"
         return f"faults received {self.faults} since {self.since:.1f} s"

@@ -50,7 +50,7 @@ UNUSED = "_spare"
 """Suffix of the name of a parameter for the unused bits of a bit field."""
 _DEGREES = "deg"  # unit of an angle argument, which is encoded in rad
 _NAN = struct.pack(">d", math.nan).hex()
-"""Encoding (NaN, hexadecimal) of an unused number of the command `point`."""
+"""Hexadecimal encoding of NaN, the value of an unused number of the command `point`."""
 _PRIMARY = (
     ("VERSION", 3),
     ("TYPE", 1),
@@ -67,7 +67,7 @@ _VERIFIERS = (
     ("Complete", "PT1H", (Stage.COMPLETED,)),
     ("Failed", "PT1H", (Stage.REFUSED, Stage.FAILED)),
 )
-"""Stages of a command, with XTCE name, Yamcs's timeout after the release, and name in this software."""
+"""Verifiers of a command: XTCE name, Yamcs's timeout after the release, and stages in this software."""
 _SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"  # Yamcs's name for the sequence count of a sent command
 
 
@@ -352,7 +352,7 @@ def _add_condition(parent: Element, name: str, value: int | str) -> None:
 
 
 def _add_fixed(entries: Element, name: str, value: str) -> None:
-    """Add fixed bytes, which the gateway overwrites with sequence count, time and CRC."""
+    """Add fixed bytes. The sender replaces the sequence count, and the gateway replaces time and CRC."""
     size = {"sizeInBits": str(4 * len(value)), "binaryValue": value}
     SubElement(entries, "FixedValueEntry", {"name": name, **size})
 

@@ -82,7 +82,7 @@ def run_alone(module: str, function: str, case: dict[str, Any]) -> Any:
 
 
 def archive_of(root: Path) -> bytes:
-    """Return the packages below a folder as a zip file, with identical bytes for identical files."""
+    """Return the packages below a folder as a zip file. Identical files give identical bytes."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
         for top in FOLDERS:

@@ -32,7 +32,7 @@ from sim_hal.settings import Simulation
 _DRAWS = 100
 """Maximum number of draws per case.
 
-A draw is repeated if its configuration is invalid (impossible inertia).
+A draw is repeated if its configuration is invalid, for example because of an impossible inertia.
 """
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _FORMS = (
