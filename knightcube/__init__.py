@@ -117,7 +117,8 @@ def _public(name: str) -> Any:
 
 
 if not TYPE_CHECKING:
-    # A type checker would accept every name, and export none by `import *`: it cannot evaluate `__all__`.
+    # Hidden from type checkers: because of `__getattr__`, they would accept any name, and they cannot
+    # evaluate this `__all__`.
     __all__ = list(_MODULE_OF)
     __getattr__ = _public
 

@@ -35,9 +35,10 @@ Result = TypeVar("Result")
 
 _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
-"""LLVM options for functions that loop forms call: any order of sums, which permits vector instructions."""
+"""LLVM options for functions that loop forms call: sums in any order, which permits vector instructions."""
 _UNWRAPPED = {"error_model": "numpy", "no_cfunc_wrapper": True}
-"""Options without a C wrapper, because only Python and other compiled forms call compiled forms."""
+"""Options of numba: numpy's rules for division by zero, and no C wrapper, which no caller needs.
+"""
 _COMPILING = (
     "numba compiles the functions in use for this machine; this takes one to three minutes, once "
     f"({_SWITCH}=0 avoids it)"
@@ -97,8 +98,8 @@ class HotFunction(Generic[Parameters, Result]):
         """
         numba = importlib.import_module("numba")
         _announce_compilation()
-        # Without inlining, a process that compiles a helper would call another compiled form of it than the
-        # processes that load the cache file, with sums in another order.
+        # Without inlining, the process that compiles a helper and the processes that load it from the cache
+        # file would use different compiled forms of the helper, with sums in different orders.
         options = {**_UNWRAPPED, "no_cpython_wrapper": True, "fastmath": _ANY_ORDER, "forceinline": True}
         while _helpers:
             numba.extending.register_jitable(**options)(_helpers.pop())
@@ -140,8 +141,8 @@ def _nothing(_: Any) -> None:
 def load(*packages: str) -> None:
     """Load numba, and the stored compiled forms of the functions of `packages`, if compiled forms are in use.
 
-    Otherwise, the first call of a function would load its compiled form, which takes some milliseconds, and
-    the first call of all functions would load numba, which takes half a second.
+    Otherwise, the first call of each function would load its compiled form, which takes some milliseconds,
+    and the very first call would also load numba, which takes half a second.
     """
     _nothing(importlib.import_module("numpy").zeros(1))
     for function in _functions if in_use() else ():
@@ -176,7 +177,7 @@ def _numba_is_usable() -> bool:
 
 @dataclass(slots=True)
 class _Compilation:
-    """Compilation in this process: time spent (ns), nesting depth, start (ns), and receiver of names."""
+    """Compilations in this process: total time (ns), nesting depth, start (ns), and callback for names."""
 
     spent_ns: int = 0
     depth: int = 0
@@ -202,7 +203,7 @@ def report_compilations(report: Callable[[str], None] | None) -> None:
 
 @functools.cache
 def _announce_compilation() -> None:
-    """Measure and report compilations, but not cached functions, and log a warning before the first one."""
+    """Measure and report compilations, but not cache loads, and log a warning before the first one."""
     event = importlib.import_module("numba.core.event")
 
     class Compilations(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types
@@ -225,7 +226,7 @@ def _announce_compilation() -> None:
 
 
 def use_numpy_forms() -> None:
-    """Make this process and its child processes use the numpy form of each function not yet called."""
+    """Make this process and its child processes use the numpy form of every function not called before."""
     os.environ[_SWITCH] = "0"
 
 

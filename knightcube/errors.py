@@ -37,7 +37,7 @@ class UsageError(KnightCubeError):
 
 
 class InputError(UsageError):
-    """Error raised for a file, or a value in a file, that cannot be used.
+    """Error raised for an unusable file, or for an unusable value in a file.
 
     Attributes:
         where: path of the file, or dotted name of the configuration value.
@@ -51,7 +51,7 @@ class InputError(UsageError):
 
 
 class ArgumentError(InputError, ValueError):
-    """Error raised for an argument of a library function that cannot be used.
+    """Error raised if an argument of a library function has an unusable value.
 
     The attribute `where` is the name of the argument. The error is also a ValueError.
     """
@@ -66,7 +66,7 @@ class PlanningError(UsageError):
 
 
 def reason_of(error: OSError) -> str:
-    """Return the reason of a failed file operation and, for frequent reasons, its remedy."""
+    """Return the reason why a file operation failed and, for frequent reasons, the remedy."""
     reason, remedy = str(error.strerror or error), _REMEDIES.get(error.errno or 0)
     return f"{reason}; {remedy}" if remedy else reason
 
