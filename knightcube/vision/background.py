@@ -121,7 +121,7 @@ def _interpolate(out: Image, above: Image, below: Image, share: np.float32) -> N
         out[column] = above[column] + share * (below[column] - above[column])
 
 
-# Minimum fraction of blocks with a smooth, significant change of the level if the frame has stray light.
+# Fraction of blocks with a smooth, significant change of the level above which a frame has stray light.
 _LEAST_UNEVEN = 0.25
 # Largest ratio of second to first difference of the levels of neighbouring blocks that counts as smooth.
 _SMOOTH = 0.5
@@ -148,7 +148,7 @@ def estimate_background(
 
 
 def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None) -> Background:
-    """Return the background in blocks; if `coarse` is given, from the pixels minus this background."""
+    """Return the background in blocks. If `coarse` is given, the moments are relative to this background."""
     rows, columns = pixels.shape
     down, across = max(1, rows // block), max(1, columns // block)
     above = np.zeros((0, 0)) if coarse is None else np.ascontiguousarray(coarse.level)
@@ -342,7 +342,7 @@ def _share_uneven(level: FloatArray, noise: FloatArray) -> float:
 
 @loop_helper
 def _changes(before: float, own: float, after: float, noise: float) -> bool:
-    """Return whether three successive levels change smoothly by more than the noise per level."""
+    """Return whether three successive levels change smoothly, and on average by more than the noise."""
     slope = abs(0.5 * (after - before))
     return slope > noise and abs(after - 2.0 * own + before) < _SMOOTH * slope
 
@@ -407,7 +407,7 @@ def _sorted_moments(ordered: Float32Array) -> tuple[FloatArray, FloatArray]:
 
 @loop_helper
 def _ranked(ordered: Float32Array, middle: np.float32, rank: int) -> np.float32:
-    """Return the deviation from `middle` with the given rank, from 0, of ascending values (k,)."""
+    """Return the deviation from `middle` of given rank, counted from 0, among ascending values (k,)."""
     # The `rank` + 1 smallest deviations belong to the values from `low` to `low` + `rank`.
     low, high = 0, len(ordered) - 1 - rank
     while low < high:
@@ -420,10 +420,10 @@ def _ranked(ordered: Float32Array, middle: np.float32, rank: int) -> np.float32:
 
 
 def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
-    """Return the index (n,) of the last block centre before each `pixel` (n,), and its distance in blocks.
+    """Return the index (n,) of the last block centre before each `pixel` (n,), and the distance from it (n,).
 
-    A side of the frame of length `pixels` is divided into `blocks` of equal length. A pixel beyond the
-    outermost block centres gets the value of the nearest centre.
+    A side of the frame of length `pixels` is divided into `blocks` of equal length. The distance is in
+    blocks. A pixel beyond the outermost block centres gets the value of the nearest centre.
     """
     width = pixels // blocks
     place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)

@@ -425,7 +425,7 @@ LEAST_SIDE = 16
 _FLOATING_NOISE = 16.0
 # Minimum noise (electrons) of a pixel of any camera, also of the mean of many images.
 _LEAST_NOISE = 0.1
-# Counts from which on a float32, the type in which frames are processed, does not hold each integer.
+# Count above which a float32, the data type of processed frames, cannot represent every integer.
 _INEXACT = 1 << 24
 # Largest number of counts of an image of floating-point numbers.
 _MOST_COUNTS = float(1 << 31)
@@ -438,7 +438,7 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
     floating-point numbers. Colours (rows, columns, 3) in the order red, green and blue, with or without a
     fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the same type; transparency
     is ignored. A third axis of length 1, or of 2 for grey and transparency, is removed. Raises ArgumentError
-    for an array of any other shape, and as `check_pixels`.
+    for an array of any other shape, for masked pixels, and for pixels that `check_pixels` rejects.
     """
     if isinstance(pixels, (str, Path)):
         raise ArgumentError(
@@ -454,7 +454,7 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
     except ValueError as error:
         raise ArgumentError("image", f"{error}: give an array (rows, columns)") from None
     if image.dtype.kind == "f" and image.itemsize not in (4, 8):
-        # The noise of a float16 image overflows its type, and compiled code knows no long double.
+        # The noise of a float16 image overflows its type, and compiled code does not support long double.
         image = image.astype(np.float32 if image.itemsize < 4 else np.float64)
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim == 3 and image.shape[2] in (1, 2):
@@ -487,14 +487,14 @@ def check_pixels(image: Image) -> None:
 
 
 def count_of_floats(image: Image) -> float:
-    """Return the size of a count for floating-point pixels whose noise is to be `_FLOATING_NOISE` counts."""
+    """Return the size of a count at which the noise of floating-point pixels is `_FLOATING_NOISE` counts."""
     sample = image[::4, ::4].astype(float)
     spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - np.median(sample))))
     return (spread or float(sample.std()) or 1.0) / _FLOATING_NOISE
 
 
 def gain_in_counts(gain: float, unit: float) -> float:
-    """Return a `gain` in electrons per unit of the pixel values as electrons per count of `raw_counts`.
+    """Convert a `gain` from electrons per unit of the pixel values to electrons per count of `raw_counts`.
 
     If an image was divided by its maximum, a gain of about 1 would mean a noise far below one electron, since
     the pixel values are not counts. In this case, one electron per count is assumed.
@@ -554,7 +554,7 @@ def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> 
     some, most = pixels[::8, ::8], _DEAD_FRACTION * pixels.size
     # A comparison in the integer type of the frame is four times as fast as in floating point.
     usual = np.median(some).astype(pixels.dtype)
-    # Most frames have more different pixels in the sample than a dead frame has in total.
+    # In most frames, more pixels of the sample differ from the median than in a whole dead frame.
     if np.count_nonzero(some != usual) <= most and np.count_nonzero(pixels != usual) <= most:
         return FrameState.BLACK
     return FrameState.USABLE

@@ -84,7 +84,7 @@ _KNOWN_PX = 0.3
 # Scatter (px, per axis) of identified points about their predicted positions above which the stars may be
 # defocused. Without defocus, the scatter is below 0.2 px (campaign `resting`).
 _SCATTERED_PX = 0.25
-# Standard deviation (px) of the direction above which stars may be images of several points each.
+# Standard deviation (px) of the boresight above which each star may have been detected as several points.
 _UNCERTAIN_PX = 0.5
 # Minimum number of bins in a row and in a column.
 _LEAST_BINNED = 64
@@ -214,7 +214,7 @@ class FrameFound:
         objects: points that may be space objects instead of stars, or None if not measured.
         lens: estimated lens parameters after the frame, or None if they are not estimated.
         field: points of light for the search for objects without a star catalogue, or None if not measured.
-        problem: reason why no sky index could be used; empty if there is none.
+        problem: reason why the sky index could not be used, or an empty string.
         turn: quaternion (4,) from the camera axes of the configured lens to the camera axes of the lens with
             which the frame was solved, or None if the axes are the same.
     """
@@ -301,7 +301,7 @@ def run_with_lens(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> Fra
 
 
 def _sky(tracker: TrackerSettings | None) -> tuple[SkyIndex | None, str]:
-    """Return the sky index, or None, and the reason; the reason is empty if stars need not be identified."""
+    """Return the sky index, or None and the reason, which is empty if no stars are to be identified."""
     if tracker is None:
         return None, ""
     try:
@@ -440,8 +440,9 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
 def _is_better(one: FrameSolution, other: FrameSolution) -> bool:
     """Return whether the attitude of `one`, after binning, is more credible than that of `other`.
 
-    The points of `one` scatter half as much, its attitude is more certain, or the two attitudes contradict
-    each other: parts of stars, but not whole stars, may all be displaced in the same direction.
+    It is more credible if the points of `one` scatter less than half as much, if its attitude is more
+    certain, or if the two attitudes contradict each other, because the parts of defocused stars, unlike whole
+    stars, may all be displaced in the same direction.
     """
     assert one.fix is not None
     assert other.fix is not None
@@ -528,7 +529,7 @@ def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion:
     """Return the attitude from a frame of streaks, computed by the method of the job's streak estimator."""
     if isinstance(motion, MotionResult):
         return _from_streaks(job, tracker, sky, motion)
-    assert not isinstance(job.estimator, LikelihoodSettings)  # it makes a MotionResult
+    assert not isinstance(job.estimator, LikelihoodSettings)  # the motion is not a MotionResult
     solution, refined = job.estimator.solve(
         motion, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior
     )
@@ -577,7 +578,7 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         return FrameFound(motion, solution)
     from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
-    assert isinstance(job.estimator, LikelihoodSettings)  # it made a MotionResult
+    assert isinstance(job.estimator, LikelihoodSettings)  # the motion is a MotionResult
     better = refit_with_catalogue(job.pixels, solution, sky, settings, job.estimator)
     return FrameFound(motion if better.motion is None else better.motion, better)
 

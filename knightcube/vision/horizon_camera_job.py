@@ -1,10 +1,10 @@
 """Job of the worker process `wide`: Sun and nadir in body axes from the images of the horizon cameras.
 
-The currents of the solar strings determine which camera is read first. If no camera finds the Sun, the Sun
-direction is computed from the currents of the solar strings (strings of solar cells). The nadir direction is
-fitted to the limbs in all images at once. If no image shows a limb, the brightness of all images gives a
-coarse nadir direction, because the Earth may fill one camera while the others are dark. The modules of the
-estimators are imported at their first use, because the control process does not need them.
+The currents of the solar strings (strings of solar cells) determine which camera is read first. If no camera
+finds the Sun, the Sun direction is computed from these currents. The nadir direction is fitted to the limbs
+in all images at once. If no image shows a limb, the brightness of all images gives a coarse nadir direction,
+because the Earth may fill one camera while the others are dark. The modules of the estimators are imported at
+their first use, because the control process does not need them.
 
 The spacecraft's own structure is masked in the images. A mask is configured (polygons or an image file), or
 is estimated from successive frames. While the limb moves over the image, the brightness of the scene changes
@@ -109,7 +109,7 @@ class StructureMap:
 
     @property
     def mask(self) -> BoolArray | None:
-        """The mask (rows, columns) of the pixels that show the spacecraft's structure, or None if none do.
+        """The mask (rows, columns) of the pixels that show the spacecraft itself, or None if there are none.
 
         The estimated structure is widened by one block, because a block at the border of the structure shows
         partly the spacecraft and partly the scene. An unchanged block counts as structure only if at least

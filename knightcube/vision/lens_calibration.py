@@ -364,7 +364,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
 
 
 def _sixth_power(frames: Sequence[MatchedFrame], found: Calibration, prior: LensPrior) -> FloatArray:
-    """Return the changes (10,) of PARAMETERS and of the sixth-power distortion if the latter is fitted, too.
+    """Return the changes (10,) of PARAMETERS and sixth-power distortion in a fit that includes the latter.
 
     The sixth-power distortion is the displacement of an image corner, as a fraction of its distance from the
     image centre. The changes are zero unless the stars show this distortion.
@@ -457,7 +457,7 @@ def calibrate_one_lens(
     1 %, or if a fit rejects more than half of its matches. Raises CalibrationError for the same reasons as
     `calibrate`.
     """
-    # The middle value, of an even number the upper one, so that at least one frame is kept.
+    # The median (of an even number, the upper middle value), so that at least one frame is kept.
     usual = float(np.sort(focal_lengths)[len(focal_lengths) // 2])
     different = np.abs(focal_lengths - usual) > np.maximum(5.0 * sigmas, 0.01 * usual)
     excluded = {
@@ -608,7 +608,7 @@ def _grey_images(images: Sequence[Image]) -> list[Image]:
 
 
 def _repeated(images: Sequence[Image]) -> dict[int, str]:
-    """Return why images with the pixels of an earlier image are excluded, by their index.
+    """Return the reasons, by image index, for excluding images with the same pixels as an earlier image.
 
     The errors of such images are not independent.
     """

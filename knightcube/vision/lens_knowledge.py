@@ -271,7 +271,7 @@ def residual_lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[Float
 def residual_spread(lengths: Sequence[FloatArray]) -> float:
     """Return the standard deviation per axis of the residuals, estimated from their median.
 
-    It is at least one. Raises CalibrationError if half of the stars are behind the camera.
+    The result is at least one. Raises CalibrationError if half of the stars are behind the camera.
     """
     median = float(np.median(np.concatenate(lengths)))
     if not median < np.inf:
@@ -327,7 +327,7 @@ _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
 _SECOND_TERM = 1.0 / 3.0
 """Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
 _FOURTH_AS = -0.3, 1.2
-"""Coefficients of the least-squares fit of 1 and r^2 to r^4 over an image, with r = 1 at the corners."""
+"""Coefficients (a, b) of the least-squares fit of a + b r^2 to r^4 over an image; r = 1 at the corners."""
 _FOURTH_LEFT = 0.058
 """RMS error, over the image, of the approximation of a fourth power by a constant and a quadratic term."""
 _PSF_PRIOR, _PSF_NOISE = 0.3, 0.05
@@ -557,7 +557,7 @@ class LensKnowledge:
     def _with_psf(self, measured: float) -> LensKnowledge:
         """Return the estimate updated with a measured point-spread width, px, which is NaN if unknown.
 
-        If the measured width contradicts the estimated width, the configured width is estimated again.
+        If the measured width contradicts the estimate, the estimation starts again from the configured width.
         """
         if not measured > 0.0:
             return self

@@ -216,7 +216,7 @@ def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[Fl
 
 @lru_cache(maxsize=8)
 def _constants(strings: SolarStringModel) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the earthlight (n,) and information (n, n) without nadir, and the matrix (3, n) of the guess.
+    """Return earthlight (n,) and information (n, n) for an unknown nadir, and a matrix (3, n) for the guess.
 
     The earthlight is a fraction of the peak currents; the information is the inverse of the covariance. The
     product of the matrix and the sunlight (n,) is the initial guess of the Sun direction, not normalised.
@@ -360,8 +360,8 @@ class FieldAndStrings:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the chi-squares of the currents of the solar strings for t trial rotations.
 
-        The currents `shares` (n,) are divided by the peak currents of their strings.
-        The first returned array (t,) uses all strings, and each row of the second array (n, t) omits one.
+        The currents `shares` (n,) are divided by the peak currents of their strings. The first returned array
+        (t,) uses all strings, and each row of the second array (n, t) omits one string.
         """
         strings = self._strings
         sunlight, slopes = _sunlight(_rotated_about(base @ sky.sun, axis) @ strings.normals.T)

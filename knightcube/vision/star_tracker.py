@@ -70,7 +70,8 @@ class MatchedStars:
             is the number of the brightest star.
         magnitude: Johnson V magnitudes (m,), combined for stars that the image does not resolve.
         directions: unit vectors (m, 3) to the stars, ICRS, at the epoch of the image.
-        points: measured positions (m, 2), x and y, px, of streaked stars at mid-exposure.
+        points: measured positions (m, 2) of the stars, x and y, px. The position of a streak is that at
+            mid-exposure.
         residuals: measured minus predicted positions of the stars (m, 2), px.
     """
 
@@ -117,7 +118,8 @@ class StarSolution:
             is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
         rate_sign_known: whether the sign of `rate` is known, which requires a predicted rate.
-        sky_map: conversion between pixels of the image and ICRS directions; None unless solved.
+        sky_map: conversion between pixels of the image and ICRS directions, or None if the image was not
+            solved.
         frame: all results of the star tracker, including the points that are not catalogue stars. Attitude
             and rate of `frame` are in the axes of `frame.camera`, which is the estimated lens with `learn`.
         index: sky index (catalogue of guide stars) at the epoch of the image. The star indices in
@@ -194,8 +196,8 @@ class StarTracker:
             `fov_error_deg` is None, the error is 5 % of `fov_deg`, or zero for a given `camera`. An error of
             `fov_deg` below 0.1 % is taken as 0.1 %, because the lens is not calibrated.
         camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`) instead of `fov_deg`.
-        settings: settings of detection, identification and attitude estimation. None: the defaults.
-        index: a sky index, or the path of a sky index file. None: the default index.
+        settings: settings of detection, identification and attitude estimation, or None for the defaults.
+        index: a sky index, the path of a sky index file, or None for the default index.
         learn: whether the lens parameters are estimated from the solved images, which must be taken by one
             camera. The attribute `lens` contains the estimated lens parameters. The accuracy of the given
             field of view or camera is `settings.lens`, by default the accuracy of an uncalibrated camera.
@@ -267,11 +269,11 @@ class StarTracker:
             image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger.
                 Larger values are brighter. The luminance of a colour image (rows, columns, 3) is used; the
                 colours are red, green and blue, and a fourth channel of transparency is ignored.
-            exposure: exposure time, s. The exposure time is only needed for the rate of streaked stars, and
-                with a predicted rate.
-            utc: date of the image, from 1900 to 2099, which is UTC if it has no time zone. The date is used
-                for proper motion and for aberration by the Earth's velocity, which is at most 20.5". If `utc`
-                is None, the epoch of the index is used, without aberration.
+            exposure: exposure time, s. The exposure time is only needed to determine the rate from streaks,
+                and if a rate is predicted.
+            utc: date of the image, from 1900 to 2099. A date without a time zone is UTC. The date is used for
+                proper motion and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is
+                None, the epoch of the index is used, without aberration.
             attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
                 predicted positions, which is faster than a search of the whole sky. If the search near the
                 predicted positions does not succeed, the whole sky is searched.
@@ -281,7 +283,7 @@ class StarTracker:
 
         Raises:
             ArgumentError: if the image has another shape, another size than the camera, fewer than 16 x 16
-                pixels, masked or non-finite values, or if another argument has a value that it cannot have.
+                pixels, masked or non-finite values, or if the value of another argument is not valid.
         """
         image = grey_image(image)
         seconds = 1.0 if exposure is None else checked_number("exposure", exposure, "seconds")
@@ -422,7 +424,7 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
 
 
 def _turned(solution: StarSolution, back: FloatArray) -> StarSolution:
-    """Return a solution in the axes of the given camera, which `back` (4,) turns from those of the used lens.
+    """Return a solution in the axes of the given camera, into which `back` (4,) rotates the used lens's axes.
 
     The axes of an estimated lens change from image to image, and the axes of the given camera do not.
     """

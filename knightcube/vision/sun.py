@@ -49,7 +49,7 @@ class SunSettings:
             linear camera, the threshold is slightly below saturation, such as 60,000 for 16 bits or 0.9 for
             pixel values up to 1.
         stride: distance between the rows that are read first, px.
-        least_radius: radius below which a bright patch is a hot pixel, rad; the Sun's is 0.0047 rad.
+        least_radius: radius below which a bright patch is a hot pixel, rad (the Sun: 0.0047 rad).
         greatest_radius: radius above which a bright patch counts as a cloud or the Earth, rad.
         tolerance: largest rms distance of the rim of the Sun's disc from a circle, px.
         least_agreement: minimum fraction of the disc's edge points within the image that lie on the circle.
@@ -155,7 +155,7 @@ class SunSolution:
     Attributes:
         status: the outcome.
         reason: short reason why no Sun was found. If the Sun was found, `reason` is empty.
-        sun: the measurement; The measurement is None unless the status is FOUND or PARTIAL.
+        sun: the measurement, or None unless the status is FOUND or PARTIAL.
         pixels_read: number of pixels that were read.
     """
 
@@ -180,7 +180,7 @@ class SunSolution:
 _MOST_PATCHES = 4
 """Maximum number of bright patches that are examined, starting with the largest."""
 _LEAST_PATCH = 3
-"""Minimum number of bright pixels of a patch on the rows that are read, by which hot pixels are excluded."""
+"""Minimum number of bright pixels of a patch on the rows that are read, which excludes hot pixels."""
 _SPOKES = 48
 """Number of spokes along which the rim of a bright patch is traced."""
 _STEP = 0.5
@@ -377,7 +377,7 @@ def _disc(
 def _trace(
     strip: Image, first_row: int, camera: CameraModel, axis: FloatArray, level: float, reach: float
 ) -> _Rim:
-    """Return the rim within `reach` rad around `axis` (3,), from image rows `strip` from `first_row` on."""
+    """Return the rim within `reach` rad around `axis` (3,); `strip` has the image rows from `first_row`."""
     basis = tangent_basis(axis)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
     ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -529,7 +529,7 @@ class Circle:
 
 
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
-    """Return the circle through rim `points` (n, 2), which are in order around it; None if there is none.
+    """Return the circle through `points` (n, 2) in order along a rim, or None if no circle fits the points.
 
     The argument `scale` is the standard deviation of a point that is not an outlier.
     """
@@ -571,7 +571,7 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the best circle (x, y, radius) through three of the points, or None if they give none.
+    """Return the best circle (x, y, radius) through three of the points, or None if there is no such circle.
 
     The best circle is the smallest of the circles that have nearly the most points within the distance
     `gate`. The three points of a circle have equal spacings, between an eighth and a third of the rim.
