@@ -118,8 +118,8 @@ class StarMatch:
 # Rotation step (rad) below which the iteration ends. After a step d, the error is about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition number of the normal equations.
-# Stars that all lie within 1e-6 rad of one direction reach the minimum condition number.
+# Minimum reciprocal condition number of the normal equations. If all stars lie within 1e-6 rad of one
+# direction, the reciprocal condition number has this value.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -424,7 +424,7 @@ def _turn(matrix: FloatArray, turn: FloatArray) -> None:
 
 
 def _summed_cross(gram: list[list[float]], at: int) -> list[float]:
-    """Return the sum of p x q over the stars; p is columns 0 to 2 of their rows, and q begins at `at`."""
+    """Return the sum of p x q over the stars. In each row, p is in columns 0 to 2, and q begins at `at`."""
     return [gram[1][at + 2] - gram[2][at + 1], gram[2][at] - gram[0][at + 2], gram[0][at + 1] - gram[1][at]]
 
 
@@ -510,7 +510,7 @@ def fit_with_distortion(
         if len(within) < len(observed):
             break
         observed, star = within, expected[nearest]
-    assert fitted is not None  # there was a round
+    assert fitted is not None  # the loop runs at least once
     squares = fitted[2]
     spread = max(1.0, math.sqrt(median(squares)) / _RAYLEIGH_MEDIAN)
     kept = squares <= (_OUTLIER * spread) ** 2
@@ -540,7 +540,7 @@ def _agreeing_numpy(
     distortion: float,
     corner: float,
 ) -> tuple[IntArray, IntArray]:
-    """Return the observed points that match guide stars, and the indices in `reference` (e, 3), both (k,).
+    """Return the indices (k,) of points that match guide stars, and those (k,) of the stars in `reference`.
 
     A point and a guide star match if they are nearest to each other and within the gate.
     """

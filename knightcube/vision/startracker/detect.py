@@ -213,7 +213,7 @@ def _worth_measuring(
         if seen[side] == _MOST_COMPARED:
             continue
         seen[side] += 1
-        # Peaks beyond the last that is selected are compared only with peaks of the other kind.
+        # If enough peaks of this kind are selected, the peak serves only for comparison with the other kind.
         if kept[side] < most and not _is_hidden(place, height, core, compared[:count], peak):
             row, column = place[peak, 1] * _CELLS // rows, place[peak, 0] * _CELLS // columns
             cell = row * _CELLS + column
@@ -314,7 +314,7 @@ def measure_areas(seen: Survey) -> Detections:
         return Detections.none(settings.psf_sigma or np.nan)
     flags = _flags_of_areas(seen.sky, areas, peaks)
     open_sky = (flags & Quality.CLUTTER) == 0
-    # Particle tracks, which are long areas with many peaks, may not displace the stars from the selection.
+    # Particle tracks, which are long areas with many peaks, must not displace the stars from the selection.
     track = (flags == 0) & is_streak(areas)[peaks.area] & (np.bincount(peaks.area)[peaks.area] > _MOST_IN_ROW)
     most = int(_MEASURED_FOR_ONE * settings.most_stars)
     chosen = worth_measuring(peaks, open_sky & ~track, pixels.shape, most)
@@ -410,10 +410,10 @@ def _among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
 
 
 def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:
-    """Return which sources (n,) are significant, with a determined place near their peak inside the frame."""
+    """Return which sources (n,) are significant and have a known position near their peak, in the frame."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
-    # The place is undetermined if, for instance, all pixels of the source are saturated.
+    # The position is unknown if, for instance, all pixels of the source are saturated.
     near &= found.covariance[:, 0, 0] + found.covariance[:, 1, 1] < 2.0 * far[:, 0] ** 2
     limits = np.array(targets.pixels.shape)[::-1] - 0.5
     inside = ((found.points > -0.5) & (found.points < limits)).all(axis=1)

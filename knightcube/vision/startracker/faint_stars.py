@@ -1,9 +1,10 @@
 """Identification of a frame in which too few stars are detected, from the light of faint stars.
 
-If only two to four of the detected points are stars, their positions do not determine the attitude beyond
-chance. Two points that are stars determine a candidate attitude and an image scale for each pair of guide
-stars with the same distance and brightness ratio. If a candidate is correct, the image is brighter at the
-predicted positions of other guide stars than elsewhere, even where no star is detected.
+If only two to four of the detected points are stars, their positions alone do not distinguish the true
+attitude from a chance match. Two points that are stars determine a candidate attitude and an image scale for
+each pair of guide stars that has the same distance and brightness ratio as the points. If a candidate is
+correct, the image is brighter at the predicted positions of other guide stars than elsewhere, even where no
+star is detected.
 
 The significance is a likelihood ratio: the probability of the light at the predicted positions if there are
 stars of the predicted brightness, divided by its probability if the positions are random. The distribution of
@@ -33,20 +34,20 @@ from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.survey import Surface
 from knightcube.vision.startracker.verification import expected_stars, log10_choice
 
-# Pairs are formed only from the brightest guide stars, on average this many in a field of view.
+# Mean number, per field of view, of the brightest guide stars, from which the pairs are formed.
 _PER_FIELD = 20.0
-# Largest expected number of pairs of guide stars. A field of 4 x 3 deg has as many pairs; a narrow strip of
-# the sky would have several times as many, whose search took a minute.
+# Largest expected number of pairs of guide stars. A field of 4 x 3 deg has about this number of pairs. A
+# narrow strip of the sky would have several times as many pairs, and their search would take a minute.
 _MOST_PAIRS = 4e6
-# Number of the brightest points of which pairs are formed, and the minimum distance of the points of a pair
-# as a fraction of the frame's diagonal.
+# Number of the brightest points, from which pairs are formed, and minimum distance between the points of a
+# pair, as a fraction of the frame's diagonal.
 _BRIGHTEST, _LEAST_APART = 5, 0.1
 # Largest difference (mag) between the magnitude difference of two points and that of two guide stars.
 _MOST_UNLIKE = 1.5
 # Tolerance (px) of the distance of two points, because of their errors and of a distortion of the lens.
 _APART_TOLERANCE = 1.0
 # Largest ratio of the highest to the lowest image scale for which a search is made. Largest number of
-# candidates of a frame; pairs of points that would exceed it are not searched.
+# candidates of a frame; a pair of points that would exceed this number is not searched.
 _WIDEST_SCALE, _MOST_CANDIDATES = 1.15, 600_000
 # Number of candidates in one batch, and number of further iterations that determine their image scales.
 _TOGETHER, _SCALE_STEPS = 20_000, 3
@@ -59,16 +60,16 @@ _SMOOTHING, _FINER = 1.0, 100.0
 # Lowest and highest signal of a pixel, in standard deviations of the noise; values beyond them are set to the
 # limit. Number of bins between the two.
 _LEAST_LIGHT, _MOST_LIGHT, _LEVELS = -3.0, 13.0, 240
-# Logarithms of the predicted signal-to-noise ratios; fainter stars are left out.
+# Logarithms of the tabulated signal-to-noise ratios; stars below the lowest of them are omitted.
 _LN_PREDICTED = np.linspace(math.log(0.5), math.log(20.0), 38)
 _LN_STEP = float(_LN_PREDICTED[1] - _LN_PREDICTED[0])
-# Steps by which all stars may be dimmer than predicted from the two points, for instance because the camera
-# does not respond linearly. All are equally likely.
+# Attenuations, in steps of `_LN_STEP`, by which all stars may be dimmer than predicted from the two points,
+# for instance because the camera does not respond linearly. All attenuations are equally likely.
 _DIMMER = np.array([0, 4, 8, 12])
-# Relative error of the predicted brightness of a star, because of its colour, and the share of stars that are
-# not seen.
+# Relative error of the predicted brightness of a star, because of its colour, and fraction of the stars that
+# are not visible.
 _BRIGHTNESS_ERROR, _UNSEEN = 0.35, 0.1
-# Distance (px) from the frame's edge and from the points of the pair within which a star is left out, and
+# Distance (px) from the frame's edge and from the points of the pair within which a star is omitted, and
 # distance within which the same pixels may be counted for two predicted stars.
 _EDGE, _BESIDE, _OVERLAPPING = 4, 10, 5.0
 # Standard deviation (px) of a predicted position, and side (px) of the square whose highest light is used.
@@ -123,7 +124,7 @@ class FrameLight:
         return cls(ideal, signal, level, _log_ratios(count / count.sum()))
 
     def without(self, points: FloatArray) -> npt.NDArray[np.uint8]:
-        """Return `level` (rows, columns) without the pixels around points (n, 2), px, which are not used."""
+        """Return `level` (rows, columns) with the pixels around points (n, 2), px, marked as not used."""
         level = self.level.copy()
         for x, y in np.rint(points).astype(np.int64).tolist():
             level[max(y - _BESIDE, 0) : y + _BESIDE + 1, max(x - _BESIDE, 0) : x + _BESIDE + 1] = _LEVELS
@@ -134,7 +135,8 @@ def _log_ratios(share: FloatArray) -> FloatArray:
     """Return the table `FrameLight.log_ratio` for the share of the pixels in each bin (`_LEVELS`,).
 
     Without a star, the light has the distribution of the whole frame. With a star, the mean increases towards
-    the predicted signal-to-noise ratio. Some stars are not seen, for instance behind a cloud.
+    the predicted signal-to-noise ratio. Some stars are not visible, for instance because they are behind a
+    cloud.
     """
     from scipy.special import ndtr  # noqa: PLC0415
 
@@ -156,7 +158,7 @@ class LightMatch:
     Attributes:
         matrix: attitude matrix (3, 3), ICRS to camera axes.
         scale: factor by which the observed tangents x/z and y/z must be multiplied, because the true focal
-            length differs from the assumed one.
+            length differs from the assumed focal length.
         log10_chance: log10 of an upper bound on the expected number of chance matches.
     """
 
@@ -237,7 +239,7 @@ class _Search:
         across, down = (width * field.scale[1] for width in field.half_width)
         area = 4.0 * math.atan(across) * math.atan(down)
         longest = 2.0 * math.atan(math.hypot(across, down))
-        # The share of all pairs of directions that are at most `longest` apart is (1 - cos) / 2.
+        # Of all pairs of directions, the fraction (1 - cos(longest)) / 2 is at most `longest` apart.
         most = 2.0 * math.sqrt(_MOST_PAIRS / (1.0 - math.cos(longest)))
         count = min(int(_PER_FIELD * 4.0 * math.pi / area), int(most), len(sky.stars))
         self.guide = _guide_pairs(sky, count, longest)
@@ -286,7 +288,7 @@ class _Search:
         promising = np.flatnonzero(ratio > 0.0)
         if not len(promising):
             return None
-        # Each number of brighter stars, 0, 1, 2, ..., has its share of the accepted chance matches.
+        # The accepted chance matches are divided among the numbers of brighter stars, 0, 1, 2, ...
         ranks, count = brighter[promising], np.bincount(brighter)
         chance = np.log10(count[ranks]) + np.array([log10_choice(rank) for rank in ranks.tolist()])
         first = np.argsort(chance - ratio[promising] / math.log(10.0), kind="stable")[:_FINALISTS]
@@ -341,7 +343,7 @@ def _evidence_numpy(
     A candidate is a pair of the guide stars with the directions `guide` (n, 3) and indices `stars` (c, 2),
     for the two points with the directions `seen` (2, 3). The image scale is between `lowest` and `highest`.
     Only the `neighbours` (n, k) of the first guide star are predicted. On average, the two points are
-    `bright`, mag, brighter than a point with a signal-to-noise ratio of one. The brighter stars are the
+    brighter by `bright` mag than a point with a signal-to-noise ratio of one. The brighter stars are the
     predicted stars in the frame that are brighter than the fainter of the two guide stars.
     """
     ratios, brighter = np.zeros(len(stars)), np.zeros(len(stars), dtype=np.int64)
@@ -510,9 +512,9 @@ def _pixels(place: FloatArray) -> tuple[IntArray, IntArray]:
 def _star_ratios(
     above: FloatArray, place: FloatArray, level: npt.NDArray[np.uint8], log_ratio: FloatArray
 ) -> FloatArray:
-    """Return the logarithms of the likelihood ratios (..., d) of stars for each of `_DIMMER`.
+    """Return the logarithms of the likelihood ratios (..., d) of stars, for d attenuations `_DIMMER`.
 
-    The stars (...) are `above`, mag, brighter than a star with a signal-to-noise ratio of one. The
+    The stars (...) are brighter by `above` mag than a star with a signal-to-noise ratio of one. The
     logarithms are zero for stars that are too faint.
     """
     step = np.rint((0.4 * math.log(10.0) * above - _LN_PREDICTED[0]) / _LN_STEP).astype(np.int64)
@@ -523,7 +525,7 @@ def _star_ratios(
 
 
 def _mean_ratio(ratio: FloatArray) -> FloatArray:
-    """Return the logarithm of the mean likelihood ratio over the `_DIMMER`, for ratios (..., n, d)."""
+    """Return the logarithm of the mean likelihood ratio over d attenuations, from logarithms (..., n, d)."""
     return np.asarray(np.logaddexp.reduce(ratio.sum(axis=-2), axis=-1) - math.log(len(_DIMMER)))
 
 
@@ -541,7 +543,8 @@ def _chord(pair: FloatArray) -> FloatArray:
 def _axes(pair: FloatArray) -> FloatArray:
     """Return matrices (c, 3, 3) of three orthonormal axes (columns) that rotate with a pair of unit vectors.
 
-    The pairs are (c, 2, 3). The first axis is in the middle of a pair, and the second along its difference.
+    The pairs are (c, 2, 3). The first axis lies midway between the two vectors, and the second is parallel to
+    their difference.
     """
     middle, across = pair[:, 0] + pair[:, 1], pair[:, 0] - pair[:, 1]
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)

@@ -222,7 +222,7 @@ class _Seen:
         return self._pose(*self._sound(_fitted, *given, weight, steps))
 
     def _given(self, start: _FittedPose) -> tuple[Any, ...]:
-        """Return the arguments of `_fitted` up to the kind of the scale."""
+        """Return the arguments of `_fitted` up to `free_scale`."""
         bends, known = len(self.unknowns.bend), self.before
         return (
             self.observed,
@@ -285,7 +285,7 @@ def _whiteners(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """See `_whiteners_numpy`."""
     out, across = np.empty((len(slopes), 2, 3)), np.empty((2, 3))
     for star in range(len(slopes)):
-        # The columns of the product of slopes and Cholesky factor.
+        # The rows of `across` are the columns of the product of slopes and Cholesky factor.
         first = math.sqrt(covariance[star, 0, 0])
         below = covariance[star, 1, 0] / first
         second = math.sqrt(covariance[star, 1, 1] - below * below)
@@ -712,7 +712,7 @@ def _surprise(seen: _Seen, pose: _FittedPose, agree: BoolArray, factor: float) -
 def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
-    Bright points that disagree with the fit given their own variances may agree given the larger ones.
+    Bright points that disagree with the fit given their own variances may agree given the larger variances.
     The common variance is estimated again with all points that agree. Excluded streaks remain excluded.
     """
     own = seen

@@ -66,8 +66,8 @@ class TriangleMatches:
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint16.
         star: indices of the guide stars at the corresponding corners (k, 3), uint16.
-        scale: logarithm (k,), int32, in 1 / `OCTAVE` of log 2, of the factor on the observed tangents for
-            which both triangles have equal longest sides.
+        scale: binary logarithm (k,), int32, in units of 1 / `OCTAVE`, of the factor on the observed tangents
+            that makes the longest sides of both triangles equal.
     """
 
     observed: npt.NDArray[np.uint16]
@@ -174,7 +174,7 @@ def _look_up_numpy(
     usable = np.flatnonzero((slack <= _LARGEST_SLACK) & (ratio[:, 0] + slack >= least_ratio))
     corners, ratio, slack, left = corners[usable], ratio[usable], slack[usable], left[usable]
     begin, end = begin[usable], end[usable]
-    # The logarithms of the longest sides at scale 1, and of the limits at the limits of the scale.
+    # Logarithms of the longest sides at scale 1, and of their limits at the lowest and the highest scale.
     side = np.log2(size[usable] / middle[usable]) * OCTAVE + SIZES
     lowest = side + (np.log2(scales) * OCTAVE)[2 * begin] - slack * (OCTAVE / math.log(2.0))
     highest = side + (np.log2(scales) * OCTAVE)[2 * end] + slack * (OCTAVE / math.log(2.0))
@@ -382,7 +382,7 @@ def _matches(
 
 @loop_helper
 def _sort_sides(direction: FloatArray, scale: float, corner: IntArray, side: FloatArray) -> None:
-    """Sort the corners of a triangle by the lengths of their opposite sides, and write these to `side`."""
+    """Sort the corners of a triangle by the lengths of the opposite sides; write the lengths to `side`."""
     i, j, k = corner[0], corner[1], corner[2]
     squared = scale * scale
     a = 1.0 / math.sqrt(squared + (1.0 - squared) * direction[i, 2] * direction[i, 2])
@@ -430,8 +430,8 @@ def _joined_steps(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Return ranges of scale steps in which the side ratios of t triangles are nearly constant.
 
-    The ratios change by at most 2 `distortion` in a range, except in a single step. For each range, the
-    result contains the number of the triangle, the first step, and the step after the last.
+    The ratios change by at most 2 `distortion` in a range, unless the range is a single step. For each range,
+    the result contains the number of the triangle, the first step, and the step after the last.
     """
     steps = len(scales) // 2
     if steps == 1:

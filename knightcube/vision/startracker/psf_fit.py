@@ -165,7 +165,7 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
     `offset` and with respect to `sigma`. The position of the star relative to the centre of the middle pixel
     is `offset` (n,), px, and the standard deviation of the PSF is `sigma` (n,), px.
     """
-    from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
+    from scipy.special import ndtr  # noqa: PLC0415 - scipy occupies memory
 
     edges = (np.arange(-half, half + 2) - 0.5 - offset[:, None]) / sigma[:, None]
     whole = ndtr(edges)
@@ -244,8 +244,8 @@ def measure_noise(
     """Return the noise model from the residuals of a fit of stars; a given gain (e/count) is kept.
 
     The residuals (n, k, k), counts, have the assumed variances (n, k, k), which are infinite for unused
-    pixels. The fit has absorbed the fraction `leverage` (n, k, k) of each variance, and `light` (n, k, k) is
-    the fitted counts. The squared residual minus the squared sky noise (n,) is modelled as a sum of
+    pixels. The fit has absorbed the fraction `leverage` (n, k, k) of each variance, and `light` (n, k, k)
+    contains the fitted counts. The squared residual minus the squared sky noise (n,) is modelled as a sum of
     non-negative multiples of light and light^2, found by least squares. Each squared residual is weighted
     with the reciprocal of its variance, which is computed for normally distributed residuals.
     """

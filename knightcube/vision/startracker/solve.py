@@ -107,7 +107,7 @@ class FrameSolution:
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution with `by` (3, 3), rad^2, added to the attitude covariance if there is one."""
+        """Return the solution with `by` (3, 3), rad^2, added to the covariance; unchanged if not solved."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
@@ -221,8 +221,8 @@ _SPLIT_PX = 10.0
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference of two attitudes that agree (1 false rejection in 100,000 frames).
 _NEAR = 25.9
-# In a frame in which few stars are detected without a prediction: minimum height of a star near its predicted
-# position, in standard deviations, and minimum number of such stars.
+# Minimum height (standard deviations) of a star near its predicted position, and minimum number of such
+# stars, for a frame in which few stars are detected without a prediction.
 _FAINT_SIGMAS, _FEWEST_FAINT = 3.5, 3
 # Number of guide stars that the tracking mode searches near their predicted positions.
 _LOOKED_FOR = 30
@@ -482,7 +482,7 @@ def _identify(
     settings: SolveSettings,
     prior: AttitudePrior | None,
 ) -> FrameSolution:
-    """Return the solution with identified stars; the search near the prior precedes that of the whole sky."""
+    """Return the solution with stars identified near the prior or, if that fails, in the whole sky."""
     stars = star_field(seen, flux, scale)
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)

@@ -69,8 +69,10 @@ class Chance:
         deviations, both in order of brightness. Only expected stars down to a brightness limit are compared,
         and the limit with the most significant match is selected. The bound is therefore multiplied by j^2
         pi^2/6, where j - 1 is the number of expected stars down to the limit without a match. Either all
-        observed stars are compared, or only those down to the faintest match, with the same factor for their
-        limit. The choice between the two divides the bound by `_ALL_OBSERVED` or by 1 - `_ALL_OBSERVED`.
+        observed stars are compared, or only those down to the faintest match. In the second case, the bound
+        is also multiplied by the factor for this limit, in which j - 1 is the number of compared observed
+        stars without a match. The choice between the two divides the bound by `_ALL_OBSERVED` or by 1 -
+        `_ALL_OBSERVED`.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -273,7 +275,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 
 
 def _bright_matched(expected: npt.NDArray[np.integer[Any]], star: npt.NDArray[np.integer[Any]]) -> list[bool]:
-    """Return a mask of the matches of the expected stars that are brighter than the median matched star."""
+    """Return whether each expected star, in order of brightness down to the median match, has a match."""
     known = set(star.tolist())
     matched = [number in known for number in expected.tolist()]
     places = [place for place, found in enumerate(matched) if found]
@@ -503,7 +505,7 @@ def _first_match_numpy(
 def _pair_numpy(
     seen: FloatArray, variance: FloatArray, matrix: FloatArray, guide: FloatArray
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Return each star's nearest guide star and squared distance, infinite if not mutually nearest."""
+    """Return each star's nearest guide star and its squared distance, or infinity if not mutually nearest."""
     cosines = seen @ (matrix @ guide.T)
     nearest = cosines.argmax(axis=1)
     rows = np.arange(len(nearest))

@@ -14,11 +14,12 @@ the matched directions on board.
 The index contains only triangles whose stars are among the brightest in a circle of the triangle's size. The
 distance from a star to the `rank`-th nearest of all brighter stars is called the reach of the star. The index
 contains a triangle if its longest side is at most the reach of each of its three stars. Each star of a
-triangle in the index is therefore one of the `rank` brightest stars in the circle around the star with the
-longest side as radius. Frames of any field of view, in dense and in sparse regions of the sky, therefore
-contain about the same number of triangles that are in the index. Near a cluster of bright stars, the reach of
-all stars is so short that there would be too few triangles. The sky is therefore also covered by circles of
-several radii, and the triangles of the `few` brightest stars of each circle are added to the index.
+triangle in the index is therefore one of the `rank` brightest stars in a circle that is centred on the star
+and has the longest side as its radius. Frames of any field of view, in dense and in sparse regions of the
+sky, therefore contain about the same number of triangles that are in the index. Near a cluster of bright
+stars, the reach of all stars is so short that there would be too few triangles. The sky is therefore also
+covered by circles of several radii, and the triangles of the `few` brightest stars of each circle are added
+to the index.
 
 The sides of a triangle are chords of the unit sphere. The form of a triangle consists of the orientation
 (left or right) of its corners, ordered by the lengths of the opposite sides, and of the cells that contain
@@ -333,9 +334,9 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
     """Return the index of the triangles of stars, whose unit vectors (n, 3) begin with the brightest star.
 
     Triangles are sorted by their longest side into b bands with the limits `sizes` (b + 1,), which are
-    chords. A star is a corner of triangles of a band only if fewer brighter stars than the limit `ranks` (b,)
-    of the band are closer to the star than the triangle's longest side. The sky is also covered by circles
-    with the radii `sizes`, and the triangles of the `few` brightest stars of each circle are added.
+    chords. A triangle is included only if, for each of its stars, the number of brighter stars closer than
+    the longest side is below the limit `ranks` (b,) of the band. The sky is also covered by circles with the
+    radii `sizes`, and the triangles of the `few` brightest stars of each circle are added.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
