@@ -257,7 +257,10 @@ def _coil_field(config: Config, section: Simulation) -> FloatArray:
 
 
 def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> Callable[[int], BodyMotion]:
-    """Return the motion at the inertial unit, whose magnetometer also measures the field of the coils."""
+    """Return a function from a time (ns) to the motion that the inertial unit senses.
+
+    The magnetic field includes the bias of the magnetometer and the field of the coils.
+    """
     errors, known = description_errors(config, section), config.inertial_unit.calibration
     gyro_matrix, field_matrix = np.array(known.gyro_matrix), np.array(known.field_matrix)
     coil_field, bias = _coil_field(config, section), np.array(section.imu.field_bias) + errors.field_bias
@@ -268,7 +271,7 @@ def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> C
     gyro_matrix, field_matrix = gyro_matrix @ errors.gyro, field_matrix @ errors.field
 
     def sense(time_ns: int) -> BodyMotion:
-        # The unit averages its magnetometer over one control period, so the mean coil currents are used.
+        # The unit averages the field over one control period, so the coils' mean currents are used.
         motion = world.motion(time_ns)
         # The method `dot` takes half the time of the operator `@`.
         total: FloatArray = coil_field.dot(circuit.currents())
@@ -315,8 +318,8 @@ def emulated_camera(
 def _between_axes(camera: Camera, true: CameraLens) -> FloatArray:
     """Return the rotation (4,) from the camera axes of the configuration to the axes of the true lens.
 
-    The mounting of a camera is measured with the true lens: it holds for the direction in which the pixel on
-    the configured optical axis looks.
+    A mounting is measured with the true lens. The configured boresight is therefore the direction from which
+    the true lens images a star onto the configured image centre.
     """
     lens = lens_model(true, camera.columns, camera.rows)
     x, y, z = lens.unit_vectors(np.array([lens_of(camera).centre]))[0]

@@ -135,7 +135,7 @@ class SimClock:
         return ticker
 
     def utc_ns(self) -> int:
-        """Return the simulated UTC in ns, which only labels telemetry."""
+        """Return the simulated UTC, ns since 1970."""
         return self._utc_start_ns + self._now_ns
 
     def _advance_world(self, time_ns: int) -> None:

@@ -172,7 +172,7 @@ def visible_share(scene: EarthScene) -> float:
 
 
 def darkening(share: FloatArray) -> FloatArray:
-    """Return the brightness (mean 1) of the Sun at squared radii (...), 0 at the centre, 1 at the limb."""
+    """Return the brightness (...) of the Sun's disc at squared radii from 0 to 1 (limb), with the mean 1."""
     rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
     return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
 
@@ -470,7 +470,7 @@ def _spread_numpy(
 
 @compiled_form_of(_spread_numpy)
 def _spread(image: Float32Array, weights: Float32Array, share: float, bins: Float32Array) -> Float32Array:
-    """Return an image (rows, columns) after a blur and with scattered light.
+    """Return a blurred image (rows, columns) with added scattered light.
 
     Args:
         image: radiance (rows, columns), which continues with its edge pixels beyond the edges.

@@ -118,11 +118,11 @@ _CELLS = 96
 _SLOPE = -2.3
 """Exponent of the noise amplitude as a power of the wave number, as for the spectrum of clouds."""
 _MODULO = np.arange(16 * _CELLS) % _CELLS
-"""Cells of the noise volume at whole coordinates up to the largest magnified coordinate and beyond."""
+"""Whole coordinates modulo the period, as a table that includes the largest magnified coordinates."""
 _RADIUS = 0.42 * _CELLS
 """Radius (grid cells) of the Earth's sphere in the noise volume."""
 _MAGNIFICATION, _FINE = 11.0, 0.5
-"""Magnification of the coordinates, and amplitude, of the fine noise relative to the coarse noise."""
+"""Magnification of the fine noise's coordinates, and its amplitude relative to the coarse noise."""
 _RESOLUTION = 2.0**-12
 """Resolution of the stored noise, in standard deviations."""
 _SOFT = 0.1
@@ -130,7 +130,7 @@ _SOFT = 0.1
 
 
 def albedo(directions: Float32Array, noise: npt.NDArray[np.int64]) -> Float32Array:
-    """Return the ground's albedo (n,) below Earth-fixed unit directions (3, n), for a `map_noise`."""
+    """Return the ground's albedo (n,) in Earth-fixed unit directions (3, n), from the noise `map_noise`."""
     places = directions * np.float32(_RADIUS)
     places += np.float32(0.5 * _CELLS)
     heights = _read(noise, places * np.float32(_MAGNIFICATION))
@@ -143,7 +143,7 @@ def albedo(directions: Float32Array, noise: npt.NDArray[np.int64]) -> Float32Arr
 
 
 def _covered(heights: Float32Array, share: float) -> Float32Array:
-    """Return the cover (n,), from 0 to 1 with mean `share`, by land or cloud for noise values (n,)."""
+    """Return the fraction (n,), with the mean `share`, that land or cloud covers at noise values (n,)."""
     above = (heights - np.float32(ndtri(1.0 - share))) / np.float32(_SOFT) + np.float32(0.5)
     return np.asarray(np.clip(above, 0.0, 1.0))
 
@@ -510,7 +510,7 @@ def _trace(
     sun: FloatArray,
     traced: Float32Array,
 ) -> None:
-    """Store what `light` needs of `size` lines of sight (3, n) from the column `start` on.
+    """Store the quantities of `size` lines of sight (3, n), from the column `start` on, that `light` needs.
 
     The array `traced` (6 x `_BLOCK`) has, for each line of sight, the column number of `AirTables.sight`, the
     column number of `AirTables.sun` (-1 for a line of sight without light), the cosine of the scattering
@@ -634,7 +634,7 @@ def _add_noise(
         cells[n], cells[_BLOCK + n] = np.uint32((i + j) * _SIDE + k), np.uint32((i + row) * _SIDE + k)
         cells[2 * _BLOCK + n] = np.uint32((layer + j) * _SIDE + k)
         cells[3 * _BLOCK + n] = np.uint32((layer + row) * _SIDE + k)
-    # The loops before and after this loop have vector instructions, because they read no scattered numbers.
+    # This loop is separate, because only loops without scattered reads are compiled to vector instructions.
     for first in range(0, 4 * _BLOCK, _BLOCK):
         for n in range(first, first + count):
             pairs[n] = noise[cells[n]]

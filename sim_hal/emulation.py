@@ -52,7 +52,7 @@ _LINE_STREAM = 0x11E
 ORBIT_STREAM = 0x0B17
 """Second number, after the simulation's seed, in the seeds of the devices that need an orbit."""
 _LINE_KEYS = {"inertial_unit": (), "gps": (1,)}
-"""Last numbers in the random seeds for the faults of the serial lines of two devices."""
+"""Last numbers of the random seed for line faults, by section; other lines use a checksum of their name."""
 
 
 class EmulatedWires:
@@ -82,7 +82,7 @@ class EmulatedWires:
         return in_memory.device
 
     def line_of(self, kind: str) -> EmulatedSerialLine | PtyLine | None:
-        """Return the serial line of the device of section `kind`, or None without such a line."""
+        """Return the serial line of the device of section `kind`, or None if it has no serial line."""
         return self.lines.get(self._kinds.get(kind, ""))
 
     def i2c(self, bus: int | str | None = None) -> EmulatedI2cBus:
@@ -149,7 +149,7 @@ NO_EMULATOR = (
     "which registers no emulator: give its Driver the argument `emulate` (docs/extending/device.md), or omit "
     "the section `simulation` to fly the real device"
 )
-"""Problem of a driver that is used in a simulation but has no emulator."""
+"""Text about a driver that is used in a simulation but has no emulator."""
 
 
 def emulated(emulation: Emulation) -> object | None:

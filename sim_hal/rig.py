@@ -1,8 +1,8 @@
 """Interface of the simulator to the flight application, which opens emulated devices with their faults.
 
-In lock-step the devices run in the flight process and advance while the flight loop sleeps. In lock-step, the
-clock jumps from event to event, and repeated runs are identical. In real time the devices run in a server
-process (`sim_hal.serving.server`), with bus and cameras on a socket and the serial lines on pseudo-terminals.
+In lock-step the devices run in the flight process and advance while the flight loop sleeps. The clock jumps
+from event to event, and repeated runs are identical. In real time the devices run in a server process
+(`sim_hal.serving.server`), with bus and cameras on a socket and the serial lines on pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) ->
     """Return the emulated star camera of a configuration, without other devices and with a known motion.
 
     The camera starts at the attitude at which the body is released and rotates at `rate` (3,), rad/s, camera
-    axes. The faults of the camera in the section `simulation` begin at their times after the opening. Raises
+    axes. The times of the camera faults in the section `simulation` are counted from this call. Raises
     ConfigError for an invalid world, and UsageError for a fault that would have no effect in a flight.
     """
     section = request.section()
@@ -305,7 +305,7 @@ def with_host_faults(rig: Rig, section: Simulation) -> Rig:
 class LockStep:
     """Emulated devices in lock-step. The flight uses only `rig`; faults and tests also use other attributes.
 
-    The attribute `line` is the serial line of the inertial unit, if it has one.
+    The attribute `line` is the serial line of the inertial unit, or None for a unit without a serial line.
     """
 
     clock: SimClock
@@ -322,7 +322,7 @@ class LockStep:
 
 
 def utc_ns(label: str) -> int:
-    """Return the time since 1970 (ns) of an ISO 8601 time, UTC without a time zone. Raises ConfigError."""
+    """Return the time since 1970 (ns) of an ISO 8601 time, as `utc_seconds` does. Raises ConfigError."""
     return round(utc_seconds(label)) * 1_000_000_000
 
 
@@ -392,7 +392,7 @@ class RemoteFrameSource:
     def poll(self) -> Frame | None:
         """Return the newest frame announced since the last call, or None if none was announced.
 
-        Raises NotResponding.
+        Raises NotResponding if the server has ended or reports an error.
         """
         newest: Frame | None = None
         try:
@@ -419,7 +419,7 @@ class ServedWires:
     def __init__(
         self, clock: SystemClock, path: Path, lines: dict[str, str], coil_bus: str, stack: ExitStack
     ) -> None:
-        """Use the socket `path` of the server, and the pseudo-terminals `lines` by device file."""
+        """Use the server's socket `path`; `lines` maps device files to the names of pseudo-terminals."""
         self._clock, self._path, self._lines, self._stack = clock, path, lines, stack
         self._coil_bus = coil_bus
         self._open: dict[str, Any] = {}
@@ -434,7 +434,7 @@ class ServedWires:
         return port
 
     def i2c(self, bus: int | str | None = None) -> RemoteI2cBus:
-        """Return the emulated I2C bus with a number or device file; None is the bus of the coil driver.
+        """Return the emulated I2C bus with the number or device file `bus`; None means the coil driver's bus.
 
         Raises NotResponding.
         """

@@ -31,7 +31,7 @@ YEARS = 2001, 2043
 def utc_seconds(utc: str) -> float:
     """Return the time since 1970 (s) of an ISO 8601 time, which is UTC unless the text has a time zone.
 
-    Raises ConfigError for another text.
+    Raises ConfigError if the text is not an ISO 8601 time.
     """
     try:
         found = datetime.fromisoformat(utc)
@@ -75,10 +75,11 @@ class CraftSection(Section, frozen=True, kw_only=True):
 
 
 class TipOff(Section, frozen=True, kw_only=True):
-    """The release of a free body, with `speed` (rad/s) about a random axis or `rate` (3,), rad/s, body axes.
+    """The release of a free body.
 
-    `attitude` is the quaternion from ICRS to body axes, scalar last; if it is omitted, the attitude is
-    random.
+    At release the body rotates at `speed` (rad/s) about a random axis or, if `rate` is given, at `rate` (3,),
+    rad/s, body axes. `attitude` is the quaternion from ICRS to body axes, scalar last; if it is omitted, the
+    attitude is random.
     """
 
     speed: Annotated[float, Meta(ge=0.0, le=3.5, description="rad/s")] = 0.1745
@@ -94,12 +95,13 @@ class Disturbances(Section, frozen=True, kw_only=True):
     `craft.accuracy.centre_of_mass`. The worst case of `residual_dipole` is a constant part of 1e-3 A m^2, a
     part of 3e-4 A m^2 in sunlight and a random walk of 5e-5 A m^2. The worst case of `ring_current` is a
     field of 20 nT that varies over hours.
+
     `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
     of air density and residual dipole. The angle between body axes and principal axes is at least a third of
     `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
-    deviations of the coils' scale errors and axis tilts. `coil_variation` is the standard deviation of the
-    dipole of each coil, as a fraction of the dipole, which changes every 20 s, for example with the supply
-    voltage.
+    deviations of the coils' scale errors and axis tilts. Every 20 s the dipole of each coil changes at
+    random, as it does with the supply voltage. `coil_variation` is the relative standard deviation of these
+    changes.
     """
 
     gravity_gradient: Multiple = 1.0
@@ -200,9 +202,9 @@ class SkySection(Section, frozen=True, kw_only=True):
 
     The model of Sease 2013, chapter 2, corresponds to `psf: bilinear` and `noise: uniform`. In orbit, stray
     light saturates a frame if the boresight is within `sun_exclusion_deg` of the Sun or within
-    `earth_exclusion_deg` of sunlit ground, and whenever one of them is in the field of view. The default
-    exclusion angles are typical of a star tracker with a baffle that fits into a CubeSat. The value `lens`
-    describes the true lens, by default that of the camera section.
+    `earth_exclusion_deg` of sunlit ground, and also if the Sun or sunlit ground is in the field of view. The
+    default exclusion angles are typical of a star tracker with a baffle that fits into a CubeSat. The value
+    `lens` describes the true lens, which by default is the lens in the camera section.
     """
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
@@ -253,7 +255,7 @@ class ObjectState(Section, frozen=True, kw_only=True):
 class SkyObject(Section, frozen=True, kw_only=True):
     """An object in the sky of the star camera, with either a `line_of_sight` or the `state` of an orbit.
 
-    `magnitude` is the Johnson V magnitude; for an object in orbit, it applies to full sunlight.
+    `magnitude` is the Johnson V magnitude. For an object in orbit, it is the magnitude in full sunlight.
     """
 
     magnitude: Annotated[float, Meta(ge=-10.0, le=20.0), Meta(description="Johnson V magnitude")]

@@ -166,7 +166,7 @@ class Parameter:
 
     Attributes:
         default: default value, or None for a parameter that is drawn at random by default.
-        low, high: its bounds.
+        low, high: smallest and largest allowed value.
         unit: physical unit of the value, or an empty text for a number without unit.
         whole: whether the value must be an integer.
         choices: allowed values, or empty if all values between the bounds are allowed.
@@ -292,7 +292,7 @@ _PARTS: dict[str, Callable[[Hardware], Sequence[object]]] = {
     "battery-monitor": lambda hardware: (hardware.power and hardware.power.rails[0],),
     "bus-monitor": lambda hardware: (hardware.power and hardware.power.rails[1],),
 }
-"""Emulated parts of each device whose faults set an attribute; None for a part that is not configured."""
+"""Emulated parts of the devices with faults that set an attribute; None for a part that is not configured."""
 
 
 def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
@@ -424,14 +424,14 @@ class AlteredPart:
         write: Callable[[int, bytes], None] | None = None,
         read: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        """Pass written data to `write` instead of the chip; the function `read` alters the data read."""
+        """Pass written data to `write` instead of the chip, and alter the data from the chip by `read`."""
         self._part = part
         self._write = write or part.write
         self._read = read or (lambda data: data)
         self.answers = part.answers
 
     def write(self, address: int, data: bytes) -> None:
-        """Process a write. Data of one byte are only a register pointer and are not altered."""
+        """Process a write. A single byte is a register pointer and is not altered."""
         (self._part.write if len(data) == 1 else self._write)(address, data)
 
     def read(self, count: int) -> bytes:

@@ -27,7 +27,7 @@ from sim_hal.settings import Simulation
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A worker's job: function as MODULE:NAME, argument, and name of the fault (empty without a fault)."""
+    """A worker's job: function as MODULE:NAME, argument, and name of the fault (empty if there is none)."""
 
     function: str
     argument: Any
@@ -70,7 +70,7 @@ DEVICES = ("planner", "vision", "clock", "disk")
 
 
 class ProcessFaults:
-    """Faults inside the flight process; in real time, jobs can also hang and be killed."""
+    """Faults inside the flight process. In lock-step, a worker that hangs or is killed is only modelled."""
 
     def __init__(self, faults: Sequence[ScheduledFault], clock: Clock, realtime: bool) -> None:
         self._faults = [fault for fault in faults if fault.kind.device in DEVICES]

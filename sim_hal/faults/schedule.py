@@ -43,7 +43,7 @@ class ScheduledFault:
 
     @property
     def end(self) -> float:
-        """Mission time (s) of the fault's end, which is infinity for a fault without end."""
+        """Mission time (s) of the fault's end, which is infinite for a fault without a duration."""
         if self.kind.momentary:
             return self.at
         return math.inf if self.span is None else self.at + self.span
@@ -192,7 +192,7 @@ def _rail_key(device: str) -> str:
 
 
 def other_driver(device: str, config: Config) -> str:
-    """Return the reason why a fault cannot act on a device with a different driver, or an empty text."""
+    """Return the reason why a fault cannot act on a device with its driver, or an empty text if it can."""
     kind, driver = _EMULATED.get(device.partition("-")[0], ("", ""))
     section = getattr(config, kind, None)
     if device in RAILS and config.power is not None:

@@ -13,8 +13,8 @@ gradient (Wertz 1978, eq. 17.28). The error of a step in which the body rotates 
 code uses Python floats, because numpy takes ten times as long for three components.
 
 The rotation is integrated when the state is read and when the currents change. Reading the state at other
-times changes the attitude by less than a microradian. Drag torque, solar radiation torque and residual dipole
-are kept constant in body axes for 0.1 s.
+times would change the attitude by less than a microradian. Drag torque, solar radiation torque and residual
+dipole are kept constant in body axes for 0.1 s.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _stepped(
 ) -> State:
     """Return the state of `Rotation.step`.
 
-    The factors `of_rates` and `of_torques` (1/(kg m^2)) map products of rates, and torques, to accelerations.
+    `of_rates` maps products of rates, and `of_torques` (1/(kg m^2)) maps torques, to angular accelerations.
     """
     middle = (0.5 * (begin[0] + end[0]), 0.5 * (begin[1] + end[1]), 0.5 * (begin[2] + end[2]))
     half = 0.5 * dt
@@ -187,7 +187,10 @@ def turned(turn: Matrix, vector: Floats) -> Floats:
 
 
 def steps_within(span: float, rate: float, longest: float) -> int:
-    """Return the number of steps, of at most `longest` s each, for `span` s at the rate `rate` rad/s."""
+    """Return the number of steps for `span` s at the rate `rate` rad/s.
+
+    A step lasts at most `longest` s and rotates the body by at most `TURN_PER_STEP`.
+    """
     return max(1, math.ceil(span / longest - 1e-9), math.ceil(span * rate / TURN_PER_STEP))
 
 
@@ -276,7 +279,7 @@ class TrueCraft:
 
 
 def coil_frames(dipoles: FloatArray) -> FloatArray:
-    """Return rotations (n, 3, 3) from body axis x, y or z (in cyclic order) to the axis of each coil."""
+    """Return the rotation matrix (n, 3, 3) of each coil, from body axis x, y or z (in turn) to its axis."""
     frames = []
     for index, dipole in enumerate(dipoles.T):
         start, end = np.eye(3)[index % 3], dipole / np.linalg.norm(dipole)
@@ -777,7 +780,7 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
 
 
 def _true_coils(coils: Coils, windings: Sequence[Winding] | None) -> Coils:
-    """Return the coils with other `windings`, if any. Raises ConfigError for windings that cannot be."""
+    """Return the coils, with `windings` unless that is None. Raises ConfigError for impossible windings."""
     if windings is None:
         return coils
     key = "simulation.free_body.craft.windings"

@@ -65,7 +65,7 @@ from sim_hal.worlds.world import Floats, OrbitEnvironment
 
 DEVICE = "orbit"
 _TOLERANCE = 1e-12
-"""Relative tolerance of the orbit integration, with errors of centimetres after ten low orbits."""
+"""Relative tolerance of the orbit integration, which causes errors of centimetres after ten low orbits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,7 +206,7 @@ def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
 
 
 def julian_date(utc: str) -> float:
-    """Return the Julian date of an ISO 8601 time, UTC without a time zone. Raises ConfigError."""
+    """Return the Julian date (UTC) of an ISO 8601 time, as `utc_seconds` does. Raises ConfigError."""
     return UNIX_EPOCH + utc_seconds(utc) / DAY
 
 
@@ -246,11 +246,11 @@ def misfit(
 ) -> str:
     """Return how two-line elements differ from the orbit in the section `key`, or an empty text if they fit.
 
-    The mean elements of both orbits over the first revolution after `utc` are compared, and their largest
-    distance in this revolution is limited. The tolerances also hold for an orbit that is described by mean
-    elements instead of osculating ones: J2 varies the semi-major axis by the fraction k = 3/2 J2 (R/p)^2 and
-    the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid elements, and OrbitError if
-    SGP4 cannot propagate them to the first revolution.
+    The mean elements of both orbits over the first revolution after `utc` are compared, and the largest
+    distance between the orbits in this revolution is limited. The tolerances also hold for an orbit that is
+    described by mean elements instead of osculating ones: J2 varies the semi-major axis by the fraction k =
+    3/2 J2 (R/p)^2 and the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid
+    elements, and OrbitError if SGP4 cannot propagate them to the first revolution.
     """
     date = julian_date(utc)
     start, known = elements(orbit, date, key), TwoLineElements(*lines)
@@ -301,7 +301,7 @@ _LOWEST_PERIGEE = 150e3
 An orbit with a lower perigee decays within a revolution.
 """
 _NIGHT, _DAY = 0.4, 1.6
-"""Factors of the air density: opposite to the diurnal bulge, and at the apex of the diurnal bulge."""
+"""Factors of the air density on the side opposite to the diurnal bulge, and at its apex."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
 """Mean density factor of the diurnal bulge over all directions."""
 _LAG = math.radians(30.0)
@@ -479,7 +479,7 @@ def magnetic_field(julian_date: npt.ArrayLike, position: FloatArray) -> FloatArr
 
     The field is evaluated at Julian dates UTC (...) and positions (..., 3), m, ICRS.
 
-        Raises OutOfRange for a date outside the epochs of the table.
+    Raises OutOfRange for a date before the first or more than `EXTRAPOLATION` years after the last epoch.
     """
     to_ground = celestial_to_terrestrial(julian_date)
     there = np.einsum("...ij,...j->...i", to_ground, position)

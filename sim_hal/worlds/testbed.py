@@ -66,7 +66,7 @@ class TestbedModel:
         supply_voltage: voltage across a coil that is fully on, V.
     """
 
-    __test__ = False  # prevents that pytest collects the class as a test
+    __test__ = False  # prevents pytest from collecting the class as a test
 
     inertia: float
     dipole_per_ampere: float

@@ -97,7 +97,7 @@ class World(Protocol):
     """Protocol of a world: a body and its environment, advanced in time under the coil currents."""
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body, which is held still before, at the present or a later time `time_ns`."""
+        """Release the body at the present or a later time `time_ns`, until which it is held still."""
 
     def advance_to(self, time_ns: int) -> None:
         """Advance the state to `time_ns` under the present coil currents."""
@@ -116,7 +116,7 @@ class WorldInputs:
     Attributes:
         config: flight configuration, used for values that the `simulation` section does not give.
         section: `simulation` section of the configuration.
-        currents: function that returns the present coil currents (3,), A.
+        currents: function that returns the present coil currents (n,), A.
         start_ns: simulation time at the start, ns.
     """
 
@@ -129,7 +129,7 @@ class WorldInputs:
 def make_world(inputs: WorldInputs) -> World:
     """Return the world that a configuration names.
 
-    Raises ConfigError if the name does not belong to a world.
+    Raises ConfigError if the name is neither a key of `WORLDS` nor a factory.
     """
     named = inputs.section.world
     factory = imported("simulation.world", named, WORLDS, os.environ)
