@@ -145,7 +145,7 @@ class EmulatedCamera:
         self._exposure = None
 
     def _alter(self, frame: Frame) -> Frame:
-        """Return the frame as changed by the present fault."""
+        """Return the frame with the changes that the present fault makes."""
         if self.fault == "frozen" and self._last is not None:
             return replace(frame, sequence=self._last.sequence, pixels=self._last.pixels)
         if self.fault == "torn" and self._last is not None:
@@ -190,4 +190,4 @@ SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }
-"""Functions that return changed pixels (rows, columns) of a frame, given its number, by name of the fault."""
+"""For each fault, function that returns changed pixels from the pixels (rows, columns) and frame number."""

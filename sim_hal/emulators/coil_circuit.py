@@ -57,7 +57,7 @@ class Bridge(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _driven(bridge: Bridge) -> tuple[tuple[int, int], ...]:
-    """Return the spans of `Bridge.driven`, which are kept because commands last for seconds."""
+    """Return the spans of `Bridge.driven`, which are cached because a command lasts for seconds."""
     if bridge.a == bridge.b:
         return ()
     edges = {0, COUNTS}
@@ -156,8 +156,7 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
     CoilCondition.B_HIGH: (None, _HIGH),
     CoilCondition.B_LOW: (None, _LOW),
 }
-"""Constant output of the bridge legs A and B for each fault; None is for a bridge leg that follows its
-input."""
+"""Constant outputs of the bridge legs A and B for each fault, or None for a leg that follows its input."""
 
 
 def _uniform_draws(generator: np.random.Generator) -> Iterator[float]:
@@ -274,7 +273,7 @@ _BUS_32V = 0x2000
 _SHUNT_STEP_V = 10e-6
 _BUS_STEP_V = 4e-3
 _READY, _OVERFLOW = 0b10, 0b01
-_RESERVED = 0x4000  # of Config; reads zero
+_RESERVED = 0x4000  # reserved bit of Config, which reads zero
 _CALIBRATION_BITS = 0xFFFE
 _REMEMBERED_NS = 60_000_000_000
 
@@ -364,7 +363,7 @@ class EmulatedIna219:
             self._calibration = word & _CALIBRATION_BITS
 
     def read(self, count: int) -> bytes:
-        """Return the big-endian word at the register pointer; bytes after the word read 0xFF."""
+        """Return the big-endian word at the register pointer, and 0xFF for each further byte."""
         word = self.register(self._pointer)
         if self._pointer == POWER:
             self._ready = False

@@ -172,7 +172,7 @@ class EmulatedGps:
         self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
 
     def _set_values(self, pairs: bytes) -> None:
-        """Apply the settings, pairs of key and value, of a CFG-VALSET message."""
+        """Apply the settings of a CFG-VALSET message, which contains pairs of key and value."""
         while len(pairs) > 4:
             key = int.from_bytes(pairs[:4], "little")
             size = VALUE_SIZES[key >> 28]

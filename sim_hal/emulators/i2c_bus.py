@@ -57,7 +57,7 @@ class Registers(ABC):
             self._pointer += 1
 
     def read(self, count: int) -> bytes:
-        """Return registers from the pointer on."""
+        """Return the contents of `count` registers, beginning at the register pointer."""
         self.latch()
         self._pointer += count
         return bytes(self.load(register) for register in range(self._pointer - count, self._pointer))
@@ -160,7 +160,7 @@ class EmulatedI2cBus:
         self.send(address, bytes((register, *values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+        """In one transaction, write `data` unless it is empty and read `count` bytes unless that is 0."""
         messages = [Message(address, data)] if data or not count else []
         return b"".join(self.transfer([*messages, Message(address, count=count)] if count else messages))
 
@@ -175,8 +175,8 @@ class EmulatedI2cBus:
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
         """Send messages joined by repeated STARTs, and return the data of each read.
 
-        At most one fault acts on a chip in a transaction. A bit flip changes the data that are read. In a
-        transaction without reads, a bit flip changes the data that are written after the register byte.
+        At most one fault acts on a chip in a transaction. A bit flip changes the data that are read. If the
+        transaction only writes, a bit flip changes the data that are written after the register byte.
         """
         given: list[bytes] = []
         parts: list[I2cPart] = []

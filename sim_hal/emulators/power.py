@@ -55,7 +55,7 @@ class Rail:
     Attributes:
         stuck: whether a fault holds the measured values constant.
         gain: gain of the measured values, which a fault sets to a value other than 1.
-        monitor: emulated current monitor, and `bus` the I2C bus to which it is connected.
+        monitor, bus: emulated current monitor, and the I2C bus to which it is connected.
     """
 
     def __init__(self) -> None:
@@ -175,8 +175,10 @@ LAMP = 0.2
 _RINGS, _SPOKES = 16, 32
 """Numbers of rings and of radial directions of the sampling points on the visible ground."""
 _DISTANCE_STEP = 100.0
-"""Step (m) to which the distance from the centre of the Earth is rounded for the visible ground. The rounding
-changes the reflected light by less than 0.02 %."""
+"""Step (m) to which the distance from the Earth's centre is rounded when the visible ground is computed.
+
+The rounding changes the reflected light by less than 0.02 %.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -294,11 +296,11 @@ def _irradiance(
         normals: unit normals (n, 3) of the strings, ICRS.
         local: rotation matrix (3, 3) from ICRS to axes whose third axis points to the centre of the Earth.
         to_sun: unit vector (3,) to the Sun, ICRS.
-        light: intensity of the sunlight.
+        light: intensity of the sunlight relative to that at one astronomical unit.
         rays: directions (m, 3) to ground points in the axes of `local`.
         ground: unit verticals (m, 3) at the ground points.
         reflected: intensity of the light from each ground point if the Sun is at the zenith there.
-        grazing: cosine.
+        grazing: cosine of the incidence angle beyond which part of the light is reflected.
     """
     count = len(normals)
     used, turned = np.zeros(count), normals @ local.T

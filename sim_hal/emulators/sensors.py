@@ -69,7 +69,7 @@ class EmulatedLis3mdl(Registers):
     _SLOW_HZ = (0.625, 1.25, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
     _FAST_HZ = (1000.0, 560.0, 300.0, 155.0)
     _NOISE_T = 0.35e-6
-    """RMS noise (T) in the mode ultra-high performance at 12 gauss; each lower mode doubles the noise."""
+    """RMS noise (T) in ultra-high-performance mode with 12 gauss range; each lower mode doubles the noise."""
 
     def __init__(self, address: int, measured: Measurements) -> None:
         super().__init__(address)

@@ -37,7 +37,7 @@ class LineFaults:
         cut_probability: probability that a message loses a random run of its bytes.
         flip_probability: probability that a bit arrives inverted.
         delay_ns: additional delay of each byte.
-        thinned: number n of messages of which one arrives; the other messages are lost.
+        thinned: number n; only every n-th message arrives, and the other messages are lost.
     """
 
     silent: bool = False
@@ -193,7 +193,7 @@ class HostEnd:
         self._line, self._now_ns = line, now_ns
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return the bytes that have arrived since the last call. Raises NotResponding."""
+        """Return the bytes that have arrived since the last call. Raises NotResponding if unplugged."""
         self._check()
         return self._line.to_host.pull(self._now_ns())
 

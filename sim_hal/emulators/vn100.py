@@ -45,7 +45,7 @@ from sim_hal.emulators.vn100_sensors import (
 from sim_hal.worlds.world import BodyMotion
 
 Rule = Callable[[str], str]
-"""Function that returns the text that the unit stores for a field, or raises ValueError if it is invalid."""
+"""Function from the written text of a field to the stored text. Raises ValueError for an invalid text."""
 
 BAUD_RATES = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600)
 ASYNC_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)

@@ -48,7 +48,7 @@ class NoiseProfile:
             axes.
         rate_bound: bound of the uniform rate noise, rad/s.
         rate_density, field_density, acceleration_density: white noise densities, rad/s, T and m/s^2 per
-        sqrt(Hz).
+            sqrt(Hz).
         static_attitude: standard deviations (3,) of the static attitude error about north, east and down,
             rad.
         gyro_bias: standard deviation of the gyro bias on each axis, rad/s.
@@ -286,7 +286,14 @@ def readers(fields: Iterable[tuple[int, int]]) -> tuple[Reader, ...]:
 
 @dataclass(frozen=True, slots=True)
 class AsciiOutput:
-    """An ASCII output: header after `$VN`, its number for register 6, register with the data, quantities."""
+    """An ASCII output.
+
+    Attributes:
+        header: name of the sentence after `$VN`.
+        async_type: value of register 6 that selects this output.
+        register: number of the register with the same data, or None.
+        quantities: names of the quantities in the sentence.
+    """
 
     header: str
     async_type: int

@@ -4,8 +4,8 @@ Programs access the bus through a preload library (`i2c_preload.c`) instead of a
 device needs a kernel module, a device node and privileges, which containers and shared machines lack. Each
 version of the library is compiled once by a C compiler. Programs that are linked statically or run
 set-user-id do not load the library. The library sends requests over a Unix socket. A request consists of its
-length and its content, which is of one of three kinds. An answer consists of an errno, a length and data. All
-numbers are in native byte order, because client and server are on the same computer.
+length and its content, which starts with the kind of the request. An answer consists of an errno, a length
+and data. All numbers are in native byte order, because client and server are on the same computer.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-/* Lets unchanged programs open an emulated I2C bus as /dev/i2c-N. Loaded by LD_PRELOAD.
+/* Library for LD_PRELOAD with which unchanged programs can open an emulated I2C bus as /dev/i2c-N.
  *
- * An open of the device becomes a connection to the server's socket (sim_hal/serving/emulate_i2c.py); read, write
- * and the ioctls of linux/i2c-dev.h on that descriptor become requests. All other files go to the C library.
- * Descriptors are recognised by their socket's inode, so copies by dup and fork work, and nothing is left behind
- * by a close. A program that looks for the device by stat or access finds it; a listing of /dev does not show it.
- * Environment: KNIGHTCUBE_I2C_SOCKET, the socket; KNIGHTCUBE_I2C_BUS, the bus's number, or its device file if that
- * has another name, such as one made by udev.
+ * If a program opens the device, the library connects to the server's socket (sim_hal/serving/emulate_i2c.py). On
+ * this descriptor, read, write and the ioctls of linux/i2c-dev.h become requests to the server. Calls for all other
+ * files are passed to the C library. A descriptor is recognised by the inode of its socket, so duplicates made by
+ * dup and fork work, and close needs no wrapper. The functions stat and access find the device, but a listing of
+ * /dev does not show it. The environment variable KNIGHTCUBE_I2C_SOCKET contains the path of the socket.
+ * KNIGHTCUBE_I2C_BUS contains the number of the bus, or its device file if udev has given it another name.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -27,9 +27,9 @@
 
 enum { FUNCTIONS = 1, SMBUS = 2, MESSAGES = 3 };
 
-#define BUSES 64          /* openings at one time */
-#define ROOM (1 << 16)    /* bytes of one request or answer */
-#define UNION 34          /* bytes of union i2c_smbus_data */
+#define BUSES 64          /* maximum number of simultaneous openings */
+#define ROOM (1 << 16)    /* maximum length of a request or an answer, bytes */
+#define UNION 34          /* size of union i2c_smbus_data, bytes */
 
 struct bus {
     dev_t device;
@@ -40,7 +40,7 @@ struct bus {
 static struct bus buses[BUSES];
 static unsigned opened;
 static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
-static uint8_t room[ROOM]; /* guarded by the mutex, as all above */
+static uint8_t room[ROOM]; /* the mutex protects this buffer and the variables above */
 
 static void *next(const char *name) { return dlsym(RTLD_NEXT, name); }
 
@@ -57,7 +57,7 @@ static int is_bus(const char *path)
     snprintf(name, sizeof name, "/dev/i2c-%s", number);
     if (strcmp(path, name) == 0)
         return 1;
-    name[8] = '/'; /* the older name, /dev/i2c/N */
+    name[8] = '/'; /* older name of the device file, /dev/i2c/N */
     return strcmp(path, name) == 0;
 }
 
@@ -84,7 +84,7 @@ static int open_bus(int flags)
     strncpy(place.sun_path, getenv("KNIGHTCUBE_I2C_SOCKET"), sizeof place.sun_path - 1);
     if (connect(fd, (struct sockaddr *)&place, sizeof place) != 0 || fstat(fd, &status) != 0) {
         close(fd);
-        errno = ENODEV; /* the server is gone */
+        errno = ENODEV; /* the server has ended */
         return -1;
     }
     pthread_mutex_lock(&mutex);
@@ -107,10 +107,11 @@ static int move(int fd, uint8_t *data, size_t length, int sending)
     return 0;
 }
 
-/* Send room[0..length) as one request; the answer's bytes are then in room. Returns their number, or -1. */
+/* Send the first `length` bytes of `room` as one request, store the answer in `room`, and return the length of the
+ * answer, or -1 after an error. */
 static ssize_t ask(int fd, uint32_t length)
 {
-    int32_t head[2]; /* errno or zero, bytes that follow */
+    int32_t head[2]; /* errno or 0, and number of bytes that follow */
     if (move(fd, (uint8_t *)&length, sizeof length, 1) || move(fd, room, length, 1) ||
         move(fd, (uint8_t *)head, sizeof head, 0) || head[1] > ROOM || move(fd, room, head[1], 0)) {
         errno = ENODEV;
@@ -145,7 +146,7 @@ static int smbus(int fd, uint16_t address, struct i2c_smbus_ioctl_data *transfer
     memcpy(room + 7, &address, sizeof address);
     if (data == NULL)
         memset(room + 9, 0, UNION);
-    else /* only a block is longer than a word */
+    else /* only blocks are longer than a word */
         memcpy(room + 9, data, size > I2C_SMBUS_PROC_CALL ? UNION : 2);
     ssize_t given = ask(fd, 9 + UNION);
     if (given < 0)
@@ -197,7 +198,7 @@ static int control(int fd, struct bus *bus, unsigned long request, void *argumen
         bus->address = value;
         return 0;
     case I2C_TENBIT:
-    case I2C_PEC: /* neither is offered */
+    case I2C_PEC: /* ten-bit addresses and packet error checking are not supported */
         if (value != 0)
             break;
         return 0;

@@ -141,7 +141,7 @@ class DeviceServer:
         self._selector.register(descriptor, selectors.EVENT_READ, answer)
 
     def serve(self, patience_ns: int | None = None) -> None:
-        """Advance the devices and answer requests, until stopped or for `patience_ns` without clients."""
+        """Advance the devices and answer requests, until `stop` or `patience_ns` after the last client."""
         left_ns: int | None = None
         while not self._stopped:
             now_ns = self._clock.now_ns()
@@ -180,7 +180,7 @@ class DeviceServer:
         self.hardware.simulation.advance_to(now_ns)
 
     def close(self) -> None:
-        """Release everything."""
+        """Close all connections, lines and files, and end the rendering process."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
         for connection in self._connections.values():

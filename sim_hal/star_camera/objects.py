@@ -1,8 +1,8 @@
 """Effects of the star camera's orbit: moving objects, aberration, stray light, and the Earth in view.
 
 An object without an orbit, which is configured by a line of sight, moves along a great circle among the
-stars. An object in orbit is lit by the Sun and can be hidden by the Earth. The magnitude of an object in
-orbit changes only when the Earth covers part of the Sun as seen from the object.
+stars. An object in orbit is lit by the Sun and can be hidden by the Earth. Apart from tumbling, its magnitude
+changes only while the Earth covers part of the Sun as seen from the object.
 
     camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
     orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
@@ -60,7 +60,7 @@ _RINGS, _SPOKES = 46, 120
 
 
 def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
-    """Return whether (m,) the Earth is between `position` (m, 3) and `target` (m, 3), both geocentric, m."""
+    """Return whether the Earth hides each `target` (m, 3) from its `position` (m, 3), both geocentric, m."""
     way = target - position
     length = np.sum(way * way, axis=-1)
     nearest = np.clip(-np.sum(position * way, axis=-1) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
@@ -143,7 +143,7 @@ def _track_times(camera: BodyTrajectory, orbit: Orbit, start: float, end: float)
 
 
 class SkyObjects:
-    """Moving objects of a simulated sky; mission time counts from `start_ns` until `begin` is called."""
+    """Moving objects of a simulated sky. Until `begin` is called, mission time counts from `start_ns`."""
 
     def __init__(self, entries: Sequence[SkyObject], utc: str, start_ns: int, world: World) -> None:
         """Store the objects.
@@ -259,7 +259,7 @@ def _on_circle(line: LineOfSight, magnitude: float, mission: float, times: Float
 
 
 def _dimming(tumble: Tumble, start: float, end: float) -> float:
-    """Return the change of magnitude of a tumbling object's mean flux between two mission times (s)."""
+    """Return how much fainter (mag) a tumbling object is on average between two mission times (s)."""
     middles = start + (end - start) * (np.arange(64) + 0.5) / 64
     phase = 2.0 * np.pi * middles / tumble.period + math.radians(tumble.phase_deg)
     return float(-2.5 * math.log10(np.mean(10.0 ** (-0.4 * tumble.amplitude * np.sin(phase)))))
@@ -306,9 +306,9 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera, sky: SkySec
 
 
 def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return rotated attitudes (k, 4), which shift the stars at the boresight by the aberration.
+    """Return attitudes (k, 4), rotated so that the stars at the boresight are shifted by the aberration.
 
-    The stars are shifted towards `velocity` (3,), m/s.
+    The aberration shifts the stars towards `velocity` (3,), m/s.
     """
     boresights = quaternion.attitude_matrix(attitudes)[:, 2, :]
     # Aberration moves the stars towards the velocity, so the equivalent rotation of the camera is opposite.
