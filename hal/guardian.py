@@ -13,10 +13,11 @@ blocks: a heartbeat is one byte, which is dropped if it cannot be written at onc
 
 The flight process starts the guardian by the following command:
 
-    python -S -E -m hal.guardian DESCRIPTOR OPENER WHERE ADDRESS
+    python -S -E -m hal.guardian DESCRIPTOR OPENER WHERE NUMBER...
 
 DESCRIPTOR is the descriptor of the socket to the flight process. OPENER is the function (`module:function`)
-that opens the bus, and WHERE is the function's argument. ADDRESS is the address of the PWM chip.
+that opens the bus, and WHERE is the function's argument. The numbers are the address, register and value of
+each I2C write that switches the coils off.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ class Guardian:
     def __init__(self, flight: socket.socket, switch: CoilSwitch, now_ns: Callable[[], int]) -> None:
         self._flight, self._switch, self._now_ns = flight, switch, now_ns
         self._watch = Watch(now_ns())
-        self._reported = 0  # number of reported interruptions of the heartbeats
+        self._reported = 0  # number of reported outages of the heartbeats
         self._failing = self._is_ready = False
 
     def serve(self) -> None:
@@ -163,7 +164,7 @@ class Guardian:
                 self._zero()
 
     def _listen(self) -> bool:
-        """Wait for messages until zero currents are due; return whether the flight process said goodbye."""
+        """Wait for messages until a write of zero is due; return whether the goodbye message arrived."""
         left = max(0, self._watch.due_ns - self._now_ns()) * 1e-9
         sockets = [] if self._watch.orphaned else [self._flight]
         if not select.select(sockets, [], [], left)[0]:
@@ -253,8 +254,8 @@ class GuardianLine:
     def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
         """Wait until the guardian has set the coils to zero.
 
-        Raises NotResponding after `patience` seconds, unless `patient` is true. The guardian's later report
-        that the coils are at zero is returned by `tend`.
+        Raises NotResponding after `patience` seconds, unless `patient` is true. In that case, `tend` later
+        returns the guardian's report that the coils are at zero.
         """
         received = b""
         if select.select([self._line], [], [], patience)[0]:
@@ -280,7 +281,7 @@ class GuardianLine:
         if self._lost and now_ns >= self._retry_ns:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
-            # The end of the killed guardian is not awaited.
+            # The killed guardian may end later.
             self._process.kill()
             self._ended.append(self._process)
             self._line.close()

@@ -64,8 +64,8 @@ class PySerialPort:
         """Open the port.
 
         Raises NotResponding if the port cannot be opened. If `patient` is true, a missing port counts as
-        lost, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is short
-        enough for the thread that drives the coils.
+        lost instead, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is
+        short enough for the thread that drives the coils.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
@@ -239,8 +239,7 @@ class LinuxI2cBus:
         Args:
             device: number N of the bus /dev/i2c-N, or a device file, for example with a udev name.
             timeout_ns: timeout of a transaction (ns), rounded up to the kernel's steps of 10 ms.
-            patient: whether a bus that does not exist yet is opened by a later transaction instead of raising
-                an error.
+            patient: whether a missing bus is accepted, and opened by a later transaction.
             exclusive: whether the bus is locked, so that two flight processes cannot drive the same coils.
 
         Raises NotResponding if the bus does not exist. Raises Refused if the permission to open the bus is
@@ -297,7 +296,7 @@ class LinuxI2cBus:
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """Write `data`, if any, and read `count` bytes, if any, after a repeated START."""
+        """In one transaction, write `data` unless it is empty and read `count` bytes unless that is 0."""
         messages = [i2c_msg.write(address, data)] if data or not count else []
         if count:
             messages.append(i2c_msg.read(address, count))
@@ -448,7 +447,7 @@ class LinuxWires:
     ) -> None:
         """Open no device yet. The bus `coil_bus` is locked for this process if `exclusive` is true.
 
-        If `patient` is true, a missing port or bus is opened later instead of raising an error.
+        If `patient` is true, a missing port or bus raises no error and is opened later.
         """
         self._clock, self._stack, self._coil_bus = clock, stack, coil_bus
         self._patient, self._exclusive = patient, exclusive
@@ -457,16 +456,16 @@ class LinuxWires:
         self._spi: dict[tuple[str, int, int], LinuxSpiDevice] = {}
 
     def serial(self, device: str, baud_rate: int) -> PySerialPort:
-        """Return the serial port of a device file. Raises NotResponding."""
+        """Return the serial port of a device file. Raises NotResponding if the port cannot be opened."""
         if device not in self._ports:
             self._ports[device] = PySerialPort(device, baud_rate, self._clock, self._patient)
             self._stack.callback(self._ports[device].close)
         return self._ports[device]
 
     def i2c(self, bus: int | str | None = None) -> LinuxI2cBus:
-        """Return the I2C bus with a number or device file, or for None the bus of the coils.
+        """Return the I2C bus with the number or device file `bus`, or the coils' bus if `bus` is None.
 
-        Raises DeviceError.
+        Raises DeviceError if the bus cannot be opened.
         """
         name, coils = device_file(self._coil_bus if bus is None else bus), device_file(self._coil_bus)
         if name not in self._buses:
@@ -476,8 +475,8 @@ class LinuxWires:
         return self._buses[name]
 
     def spi(self, device: str, speed_hz: int, mode: int) -> LinuxSpiDevice:
-        """Return a device on an SPI bus. Raises NotResponding."""
-        # A sensor that does not answer is started again and again, and must not open a file each time.
+        """Return a device on an SPI bus. Raises NotResponding if the device cannot be opened."""
+        # A sensor that does not answer is started repeatedly, and must not open a file each time.
         if (device, speed_hz, mode) not in self._spi:
             opened = self._spi[device, speed_hz, mode] = LinuxSpiDevice(device, speed_hz, mode)
             self._stack.callback(opened.close)

@@ -1,4 +1,4 @@
-"""Writes one byte to an I2C register on Linux; usable as module and as command, without other packages.
+"""Module and command that writes one byte to an I2C register on Linux, without other packages.
 
 The guardian switches the coils off through this module. If the program i2cset is not installed, the script
 `deploy/coils-off` runs this file as a command:

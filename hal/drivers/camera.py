@@ -239,7 +239,7 @@ class FrameNumbers:
         self._offset = self._last + 1
 
     def number(self, count: int) -> int:
-        """Return the continued frame number for the camera's frame number `count`."""
+        """Return the increasing frame number that corresponds to the camera's frame number `count`."""
         number = count + self._offset
         if number < self._last - self._modulus // 2:
             self._offset += self._modulus
@@ -293,8 +293,8 @@ class PixelCoding:
     def image(self, data: npt.NDArray[np.uint8], columns: int, rows: int, stride: int) -> Pixels:
         """Return the grey image (rows, columns), of uint8 or uint16, in the bytes `data` (n,) of a frame.
 
-        The starts of two rows are `stride` bytes apart. Raises PixelError if the data are damaged, or an
-        image of another size.
+        The starts of two rows are `stride` bytes apart. Raises PixelError if the data are damaged or are an
+        image of a different size.
         """
         if self.is_compressed:
             return _decoded(data.tobytes(), columns, rows)

@@ -182,7 +182,7 @@ def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
 
 
 BRAKED: tuple[PwmCounts, PwmCounts] = (FULL_ON, FULL_ON)
-"""PWM counts of both bridge inputs for braking, so that the coil current is zero.
+"""PWM counts of both bridge inputs for braking, which makes the coil current zero.
 
 While braking, both ends of the coil are at the supply voltage, even if one leg of the bridge is stuck high.
 """
@@ -687,7 +687,7 @@ class Drv8830Bridges:
             self._modulate()
 
     def all_off(self) -> None:
-        """Switch all bridges off. Raises NotResponding after all chips have been tried."""
+        """Switch all bridges off. If a chip does not answer, try the others and then raise NotResponding."""
         failed: NotResponding | None = None
         with self._lock:
             self._duty.clear()
@@ -714,7 +714,7 @@ class Drv8830Bridges:
                 control = control_of(wanted)
                 if a == b:
                     control, wanted = (BRAKE, 0.0) if a else (OFF, 0.0)
-                # The limit acts if the supply voltage exceeds the highest voltage of a bridge by rounding.
+                # The limit acts only if rounding makes `wanted` larger than the highest voltage of a bridge.
                 self._error[index] = min(max(wanted - volts_of(control), -_LARGEST_ERROR), _LARGEST_ERROR)
                 if control != self._written[index]:
                     self._write(index, CONTROL, control)

@@ -253,7 +253,7 @@ _SEMI_MAJOR_AXIS, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84, NGA.
 _FASTEST = 12_000.0
 _HIGHEST = 3e6
 EARLIEST_NS = 1_767_225_600 * SECOND_NS
-"""UTC (ns since 1970) of the start of 2026, before which no released software of this project flew."""
+"""UTC (ns since 1970) of the start of 2026; no released software of this project flew earlier."""
 ROLLOVER_NS = 1024 * 7 * 86_400 * SECOND_NS
 """Period (ns) after which the ten-bit week number of GPS repeats."""
 _PROTOCOL = re.compile(rb"PROTVER[ =](\d+\.\d+)")
@@ -267,8 +267,8 @@ class UbloxReceiver:
     ) -> None:
         """Prepare the driver, which requests a fix every `period_ns` from the receiver on the open `port`.
 
-        Dates before `earliest_ns` (ns since 1970) are moved by 1024 weeks. Raises OutOfRange for a period
-        outside 0.1 to 60 s.
+        Dates before `earliest_ns` (ns since 1970) are moved forward by 1024 weeks. Raises OutOfRange for a
+        period outside 0.1 to 60 s.
         """
         if not 0.1 <= period_ns / SECOND_NS <= 60.0:
             raise OutOfRange(DEVICE, "period", period_ns / SECOND_NS, 0.1, 60.0, "s")
@@ -425,7 +425,7 @@ class UbloxReceiver:
                 self._change_rate(self._own_rate)
         elif port.baud_rate == self._own_rate:
             if now_ns - decoded_ns >= UNDECODED_NS and self._last_byte_ns > decoded_ns:
-                # A port that rejects a baud rate is set to the next one later.
+                # If the port rejects this baud rate, the next attempt uses another baud rate.
                 self._others.append(self._others.pop(0))
                 self._change_rate(self._others[-1])
         elif decoded_ns > self._rate_ns:
@@ -500,9 +500,9 @@ def reading_of(
 ) -> GpsReading:
     """Return the reading of a message with a payload of `length` bytes, received at `arrival_ns`.
 
-    The earliest possible UTC is `earliest_ns`, ns since 1970. A date up to 1024 weeks earlier is moved
-    forward by 1024 weeks, and any other date outside the 1024 weeks that follow counts as impossible. Raises
-    OutOfRange for physically impossible values.
+    The earliest possible UTC is `earliest_ns`, ns since 1970. A date in the 1024 weeks before this time is
+    moved forward by 1024 weeks. Raises OutOfRange for physically impossible values, and for earlier dates and
+    dates more than 1024 weeks after `earliest_ns`.
     """
     _require(
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),
@@ -595,7 +595,7 @@ class NmeaReceiver:
     def __init__(self, port: SerialPort, clock: Clock, earliest_ns: int = EARLIEST_NS) -> None:
         """Read sentences from the open `port`.
 
-        Dates before `earliest_ns` (ns since 1970) are moved by 1024 weeks.
+        Dates before `earliest_ns` (ns since 1970) are moved forward by 1024 weeks.
         """
         self._port, self._clock, self._earliest_ns = port, clock, earliest_ns
         self._buffer = b""
@@ -678,7 +678,7 @@ class NmeaReceiver:
     def _pvt(self, rmc: list[str], gga: list[str]) -> Pvt:
         """Return the content of the sentences RMC and GGA in the units of a NAV-PVT message.
 
-        Raises ValueError or OverflowError.
+        Raises ValueError or OverflowError for an invalid field.
         """
         clock, date = rmc[1], rmc[9]
         fix = gga[6] not in _NOT_MEASURED and rmc[2] == "A"
@@ -724,7 +724,7 @@ class NmeaReceiver:
 def _degrees(text: str, hemisphere: str) -> float:
     """Return an angle (deg) written as degrees and minutes (dddmm.mmmm).
 
-    Raises ValueError or OverflowError.
+    Raises ValueError or OverflowError for an invalid text.
     """
     whole = int(float(text)) // 100
     return (whole + (float(text) - 100.0 * whole) / 60.0) * (-1.0 if hemisphere in {"S", "W"} else 1.0)

@@ -37,7 +37,7 @@ _FAILURES = 3
 _ALIKE = 10
 """Largest accepted number of consecutive equal samples; a working sensor has noise."""
 _STUCK_S, _AGAIN_S = 3, 60
-"""Time (s) of equal values after which the sensors are started again, and time until the next start."""
+"""Time (s) of equal values after which the sensors are started again, and interval of further starts."""
 LARGEST_RATE = math.radians(2000.0)
 """Default of the largest accepted body rate per axis, rad/s: the range of common gyros."""
 _NORM_TOLERANCE = 1e-2
@@ -130,9 +130,9 @@ class UnitSettings:
     field_range: float
 
     def body_maps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return matrices (3, 3) from measured rate and field to those of the body, and an offset (3,), T.
+        """Return the matrices (3, 3) from measured to true rate and field, body axes, and an offset (3,), T.
 
-        The offset, which the bias causes, is subtracted from the field in body axes.
+        The offset is caused by the magnetometer's bias, and is subtracted from the field in body axes.
         """
         gyro, magnetometer = (
             np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in (self.gyro_matrix, self.field_matrix)
@@ -328,7 +328,7 @@ class CheckedUnit:
 
 
 def level_attitude(field: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Return the quaternion (4,) from the testbed frame into the body, from field and specific force at rest.
+    """Return the quaternion (4,) from testbed frame to body axes, given field and specific force at rest.
 
     The testbed's y axis points down, and the horizontal field points along its -z axis. In free fall the
     quaternion is the identity.

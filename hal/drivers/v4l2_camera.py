@@ -7,8 +7,7 @@ returns the buffers of earlier frames to the kernel without reading their pixels
 A flag of the kernel driver states whether the time stamp refers to the start of exposure (SOE) or to the end
 of the frame. The kernel driver uvcvideo always sets the flag SOE. Unless the module parameter `hwtimestamps`
 is set, however, uvcvideo stamps the arrival of the first packet of a frame (uvc_video_decode_start), which is
-after the end of the exposure. The setting `stamp` can override the meaning of the time stamps that the kernel
-driver flags.
+after the end of the exposure. The setting `stamp` can override the meaning that this flag states.
 
 `VideoDevice` executes the system calls. A failed system call raises OSError with the kernel's errno. The
 device is opened in non-blocking mode, so that no call waits for a frame. The structures and request numbers
@@ -74,7 +73,7 @@ _KINDS: dict[str, Any] = {
 
 
 def _fields(layout: str) -> list[tuple[str, Any]]:
-    """Return ctypes fields: `name:16c` is an array of 16 chars (kinds in `_KINDS`), `name` a c_uint32."""
+    """Return ctypes fields: `name` is a c_uint32, and `name:16c` an array of 16 chars (kinds in `_KINDS`)."""
     fields: list[tuple[str, Any]] = []
     for word in layout.split():
         name, _, kind = word.partition(":")
@@ -632,7 +631,7 @@ class V4l2Camera:
             device.close()
 
     def _dequeue(self, device: VideoDevice) -> Filled | None:
-        """Return the oldest filled buffer, or None if no buffer is filled or read errors have just begun."""
+        """Return the oldest filled buffer, or None if none is filled or if a read error may be temporary."""
         try:
             filled = device.dequeue()
         except OSError as error:

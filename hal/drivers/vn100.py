@@ -57,8 +57,8 @@ _LINE_LOAD_LIMIT = 0.8  # largest fraction of the serial line's capacity that me
 class Vn100Settings(UnitSettings):
     """Settings of the VN-100 driver.
 
-    A binary rate must divide 800, and an ASCII rate must be listed for register 7. The largest accepted field
-    is 6 gauss for the testbed's unit, and 2.5 gauss for current units.
+    For binary packets, `rate_hz` must divide 800; for ASCII lines, register 7 must permit the rate. The
+    largest accepted field is 6 gauss for the testbed's unit, and 2.5 gauss for current units.
 
     Attributes:
         attitude_map: (4, 4) matrix that maps the unit's quaternion (NED into sensor frame) to the project's
@@ -228,7 +228,7 @@ class Recovery:
 
     def reset(self) -> None:
         """Record that the unit has restarted, and therefore runs with the settings in its flash memory."""
-        # The time stamp of the first sample after a recovery reveals a restart that was handled already.
+        # The first time stamp after a recovery steps back because of the restart that was already handled.
         self._was_reset = not self._is_fresh
 
     def advance(
@@ -236,8 +236,8 @@ class Recovery:
     ) -> None:
         """Advance the recovery by one poll, in which `sentences` and a number of `readings` were received.
 
-        Since the start of the driver, `received` bytes and `packets` valid packets, including those with
-        unknown fields, have been received. Raises NotResponding if the port is lost.
+        `received` and `packets` are the numbers of bytes and of valid packets, including those with unknown
+        fields, since the start of the driver. Raises NotResponding if the port is lost.
         """
         if self._reading_ns is None:
             self._reading_ns = now_ns
@@ -287,7 +287,7 @@ class Recovery:
                 self._begin(now_ns)
             else:
                 if self._port.baud_rate == self._own_rate:
-                    # A port that rejects a baud rate is set to the next one later.
+                    # If the port rejects this baud rate, the next attempt uses another baud rate.
                     self._others.append(self._others.pop(0))
                     self._port.set_baud_rate(self._others[-1])
                 else:
@@ -422,7 +422,7 @@ class ReadingConverter:
         self._alike = 0
 
     def reading(self, item: BinaryPacket | AsciiLine) -> ImuReading | None:
-        """Return the reading in a packet or line, or None without a reading or if the reading is rejected.
+        """Return the reading in a packet or line, or None if there is no reading or the reading is rejected.
 
         If only the rate of a reading is invalid, the rate is set to NaN.
         """
@@ -472,7 +472,7 @@ class ReadingConverter:
         )
 
     def _fault(self, *sample: tuple[float, ...]) -> str:
-        """Return a text with the impossible quantity of a rejected sample, its value and its limit."""
+        """Return a text that names the impossible quantity of a rejected sample, with its value and limit."""
         settings, quaternion = self._settings, sample[0]
         quantities = (
             ("rate", 1.0, settings.rate_range, "rad/s"),
@@ -491,7 +491,8 @@ class ReadingConverter:
     def check_for_others(self, items: Sequence[BinaryPacket | AsciiLine], foreign: int, now_ns: int) -> None:
         """Detect a unit that sends an output that was not requested.
 
-        In this poll, the packets and lines `items` and `foreign` packets with unknown fields were received.
+        `items` are the packets and lines received in this poll, and `foreign` is the number of received
+        packets with unknown fields.
         """
         count = foreign + sum(map(self._is_other, items))
         if count == 0:

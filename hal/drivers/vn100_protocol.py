@@ -311,7 +311,7 @@ class StreamParser:
     """
 
     def __init__(self, byte_ns: float = 0.0, longest: int = 512) -> None:
-        """Prepare the decoder for packets of at most `longest` bytes, each of which is sent in `byte_ns`.
+        """Prepare the decoder for packets of at most `longest` bytes; the line sends a byte in `byte_ns`.
 
         A small value of `longest` limits the delay of a valid packet that follows noise which resembles the
         start of a packet.

@@ -209,8 +209,8 @@ class CoilState(NamedTuple):
         stale: whether the newest command was too old, so that the driver set the coils to zero.
         faults: number of failed bus transactions since start.
         error: text of the present failure, or an empty text if the last transaction succeeded.
-        braked: indices of the braked bridges, which have both inputs high so that no current flows even if a
-            leg is stuck high.
+        braked: indices of the braked bridges. Both inputs of a braked bridge are high, so that no current
+            flows even if a leg is stuck high.
     """
 
     command: FloatArray
@@ -259,7 +259,7 @@ class TorqueCoils(Protocol):
     def command(self, currents: FloatArray) -> None:
         """Request the current of each coil (n,), A. Never waits for the bus.
 
-        Larger currents are reduced to the limit. If a value is not finite, the coils are set to zero and
+        Currents above the limit are reduced to it. If a value is not finite, the coils are set to zero and
         OutOfRange is raised.
         """
 
@@ -304,7 +304,7 @@ class FrameSource(Protocol):
         """Start one exposure now. Raises NotResponding if the camera is lost."""
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, or None without a new frame. Never blocks."""
+        """Return the newest finished frame once, or None if there is no new frame. Never blocks."""
 
     def close(self) -> None:
         """Close the camera."""

@@ -54,8 +54,7 @@ class CoilReach:
     def note(self, folder: Path) -> None:
         """Store the attributes `where` and `writes` in `folder` for the script `deploy/coils-off`.
 
-        The file is synced to the disk, and also contains the SHA-256 of its text, as a checksum. Never
-        raises.
+        The file is synced to the disk, and ends with the SHA-256 of its text. This method never raises.
         """
         import hashlib  # noqa: PLC0415 - the guardian, which imports this module, needs no checksum
 

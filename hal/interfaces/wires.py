@@ -66,7 +66,7 @@ class Clock(Protocol):
         """Running tickers in the order of their creation."""
 
     def utc_ns(self) -> int:
-        """Return UTC in ns since 1970. UTC is used as a label in telemetry, never for control."""
+        """Return UTC in ns since 1970. UTC may jump, so it dates data but never times the control loop."""
 
 
 class SerialPort(Protocol):
@@ -120,7 +120,7 @@ class RawI2cBus(I2cBus, Protocol):
     """I2C bus that also executes transactions without a register address."""
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """Write `data`, if any, and read `count` bytes, if any, after a repeated START."""
+        """In one transaction, write `data` unless it is empty and read `count` bytes unless that is 0."""
 
 
 class SpiDevice(Protocol):
@@ -129,7 +129,7 @@ class SpiDevice(Protocol):
     def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
         """Send frames one after the other, and return the bytes received during each frame.
 
-        Raises OSError.
+        Raises OSError if the transfer fails.
         """
 
 
@@ -141,12 +141,12 @@ class Wires(Protocol):
     """
 
     def serial(self, device: str, baud_rate: int) -> SerialPort:
-        """Return the serial port of a device file. Raises NotResponding."""
+        """Return the serial port of a device file. Raises NotResponding if the port cannot be opened."""
 
     def i2c(self, bus: int | str | None = None) -> RawI2cBus:
-        """Return the I2C bus with a number or device file, or for None the bus of the coils.
+        """Return the I2C bus with the number or device file `bus`, or the coils' bus if `bus` is None.
 
-        Raises DeviceError.
+        Raises DeviceError if the bus cannot be opened.
         """
 
     def spi(self, device: str, speed_hz: int, mode: int) -> SpiDevice:
@@ -185,8 +185,8 @@ class Rig:
         cameras: emulated cameras, first the star camera (None if not fitted), or None for real cameras.
         earliest_utc_ns: earliest possible UTC (ns since 1970) of the flight, which resolves the ambiguous
             week number of a GPS receiver.
-        lateness: function that returns how often emulated devices in real time were later than `LATE_NS`, and
-            their largest lateness, s, or None if no emulated devices run in real time.
+        lateness: function that returns how often emulated devices were later than `LATE_NS`, and their
+            largest lateness, s. It is None unless emulated devices run in real time.
     """
 
     clock: Clock
