@@ -48,7 +48,7 @@ TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 BENCH = (13.0, 10.0)
 PATH_WINDOW_S = 20.0
-"""Length (s) of the time axis, from the command of a step, in the figure of the planned paths."""
+"""Length (s) of the time axis in the figure of the planned paths; it begins at the command of a step."""
 _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the figure of the coil cage is drawn."""
 _BENCH_SAMPLES = 400
@@ -181,7 +181,7 @@ def _rate(signals: RunSignals) -> Figure | None:
 
 
 def _overview(signals: RunSignals) -> Figure | None:
-    """Draw attitude, current, power and rate in panels below each other, as shown in the README."""
+    """Draw attitude, current, power and rate in panels one below the other, as shown in the README."""
     if not len(signals.flown.time):
         return None
     drawn = [panels.attitude, panels.current, *([panels.power] if signals.power else []), panels.rate]
@@ -574,7 +574,7 @@ def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
     dipoles, limits = 1e3 * made.plan.path.dipoles(times), 1e3 * made.task.craft.limit
     panels.vectors(dipole, times, dipoles)
     text = ", ".join(f"{name} {limit:.3g}" for name, limit in zip("xyz", limits, strict=True))
-    # A limit is drawn only near the curves, because a distant line would flatten the curves.
+    # A limit is drawn only if a curve comes near it, because a distant line would flatten the curves.
     for (name, colour), limit in zip(panels.AXIS_COLOURS.items(), limits.tolist(), strict=True):
         if np.abs(dipoles).max() > 0.3 * limit:
             panels.level(dipole, -limit, "", colour)
@@ -651,7 +651,8 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
     ax.plot(times, 1e6 * across, color=panels.BLUE, linewidth=1.3, label="across the field")
     label = "along the field, not available"
     ax.plot(times, 1e6 * along, color=panels.VERMILLION, linewidth=1.3, label=label)
-    # Dipole perpendicular to the field that produces this torque, relative to the dipole limit (worst axis).
+    # Largest ratio over the axes of the dipole that produces this torque (perpendicular to the field) and
+    # its limit.
     share = np.max(np.abs(np.cross(field, torque)) / size[:, None] ** 2 / craft.limit, axis=1)
     if share.max() > 0.3:
         label = "limit of the torque across the field"
@@ -665,7 +666,7 @@ def day_figure(
 ) -> Figure:
     """Return the figure of a day: elevations above the stations, their passes, eclipses and targets.
 
-    The `targets` are start (s after the start of the span) and name of each target.
+    The `targets` are pairs of a start (s after the start of the span) and a name.
     """
     rows = len(stations) + bool(targets)
     figure = Figure(figsize=(13.0, 3.6 + 0.45 * rows), layout="constrained")

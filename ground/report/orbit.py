@@ -1,4 +1,4 @@
-"""Measures of a flight in orbit: detumbling, attitude knowledge, pointing, objects, star camera, limits."""
+"""Performance of a flight in orbit: detumbling, attitude knowledge, pointing, objects and star camera."""
 
 from __future__ import annotations
 
@@ -246,9 +246,9 @@ def dipole_errors(run: Run) -> dict[str, float]:
 
 
 def _judged_dipoles(run: Run) -> dict[str, FloatArray]:
-    """Return errors and true residual dipoles (n, 2, 3), A m^2, of the last ten minutes, one per second.
+    """Return errors and true residual dipoles (n, 2, 3), A m^2, of the last ten minutes in each light.
 
-    A flight that was shorter in sunlight or in shadow has fewer rows.
+    There is one row per second, and fewer rows if the flight was in sunlight or in shadow for a shorter time.
     """
     packets, truth = run["navigation"], run["orbit_truth"]
     packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]

@@ -171,8 +171,8 @@ def coil_power(run: Run) -> PowerHistory | None:
 def bus_power(run: Run) -> tuple[FloatArray, FloatArray]:
     """Return the times (n,), s, and the power (n,), W, measured by the monitor in the coils' supply.
 
-    The power is the bus voltage, before the losses of the bridges, times the current of all coils. The arrays
-    of times and power are empty without a monitor.
+    The power is the bus voltage, before the losses of the bridges, times the current of all coils. Both
+    arrays are empty if there is no monitor.
     """
     packets = run["housekeeping"]
     packets = packets[np.isfinite(packets["coil_power"])]
@@ -210,7 +210,7 @@ def mean_rates(truth: PacketArray, start: FloatArray, stop: FloatArray) -> Float
 
 
 def streaks(run: Run) -> Object:
-    """Return the number of frames and rates from streaks, and the errors of the rates.
+    """Return the numbers of frames and of rates from streaks, and the errors of the rates.
 
     The errors are those of the camera's rate, so the true misalignment of a simulated camera does not count.
     A rate of unknown sign (status `ambiguous`) is counted, but has no error. `normalised` is the mean of e'
@@ -234,7 +234,7 @@ def streaks(run: Run) -> Object:
 
 
 def star_attitudes(run: Run) -> Object:
-    """Return the number of frames and attitudes of the star tracker, and the errors of the attitudes.
+    """Return the numbers of frames and of attitudes of the star tracker, and the errors of the attitudes.
 
     The value `rms_error` (rad) is the rms error about the body axes. The value `normalised` is the mean of e'
     P^-1 e / 3 over the attitudes with error e and covariance P. The true misalignment of a simulated camera

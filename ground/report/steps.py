@@ -83,10 +83,10 @@ class StepResponse:
 def commanded_steps(
     indices: Sequence[int], times: FloatArray, targets: FloatArray, release_q2: float, end: float
 ) -> list[StepCommand]:
-    """Return the steps between successive `targets`, commanded q2 (n,), at ascending `times` (n,), s.
+    """Return the steps between successive `targets` (n,), values of q2.
 
-    The `indices` (n,) number the steps in the configuration. The first step begins at `release_q2`, and the
-    last step ends at `end`, s.
+    The targets are commanded at ascending `times` (n,), s. The `indices` (n,) are the numbers of the steps in
+    the configuration. The first step begins at `release_q2`, and the last step ends at `end`, s.
     """
     starts = np.concatenate([[release_q2], targets[:-1]])
     ends = np.append(times[1:], end)

@@ -28,7 +28,7 @@ from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 _LOST_S = 2.0
-"""Time (s) from the end of the flight log to the end of the truth log above which packets are lost."""
+"""Time (s) from the end of the flight log to the end of the truth log above which packets count as lost."""
 
 
 @np.errstate(all="ignore")  # packets may contain any numbers; results that are not finite become None
