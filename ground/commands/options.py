@@ -78,7 +78,7 @@ def read_picture(options: argparse.Namespace) -> Image:
         raise UsageError(f"--overlay {options.overlay}: a PNG file is written: give a name that ends in .png")
     if options.raw:
         pixels = read_raw(options.image, *options.raw)
-    else:  # the lens of a calibrated camera belongs to the rows and columns of its detector
+    else:  # a lens calibration refers to the rows and columns of the detector
         pixels = read_image(options.image, upright=options.camera is None)
     check_size(options.image, pixels)
     return pixels
@@ -101,13 +101,13 @@ def exposure_of(options: argparse.Namespace, configured: float | None) -> tuple[
 
 
 _MOST_ASIDE, _MOST_RATIO = 60.0, 3.0
-"""Largest angle (deg) and ratio of magnitudes between a rough rate and the rate whose sign it determines."""
+"""Largest angle (deg) and ratio between a measured rate and the rough rate that determines its sign."""
 
 
 def prior_contradiction(prior: Sequence[float] | None, rate: FloatArray | None) -> str:
     """Return how a rough rate (3,) contradicts a measured rate (3,), rad/s, or an empty text.
 
-    A rough rate that contradicts the measured rate does not determine its sign.
+    A rough rate that contradicts the measured rate is not used to determine the sign of the latter.
     """
     if prior is None or rate is None or not np.any(prior):
         return ""

@@ -50,7 +50,7 @@ _CURES = {
     StreakStatus.BLACK: "take the lens cap off, or expose longer",
     StreakStatus.SATURATED: "expose for a shorter time, or correct --saturation",
 }
-"""What to do about each reason why a picture gives no rate."""
+"""Remedy for each reason why a picture gives no rate."""
 _SHUTTER = (
     "shutter:       not described, included in the uncertainty: give --line-time, 0 for all rows at once\n"
 )

@@ -123,9 +123,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _alone(folder: Path) -> AbstractContextManager[None]:
-    """Return a lock of the metadata, without which two commands could sign different metadata of one version.
+    """Return a lock that keeps two commands from signing different metadata of the same version.
 
-    A folder without metadata is not locked. A locked folder raises UsageError.
+    A folder without metadata is not locked. Raises UsageError if the folder is locked already.
     """
     metadata = folder / "metadata"
     problem = f"{folder}: another command signs with these keys: try again after its end"

@@ -71,7 +71,7 @@ _OF_TRANSFERS: dict[str, type[directives.CancelFile | directives.SuspendFile | d
 }
 _RATE = 20_000.0  # default rate of frames to the satellite (bytes/s)
 _SILENCE_S = 60.0  # default time (s) without a packet after which a file command fails
-_TURN_S = 0.01  # time (s) for which received packets are awaited before the due protocol data units are sent
+_TURN_S = 0.01  # longest time (s) to wait for packets before the protocol data units that are due are sent
 _SHOW_S = 1.0  # time (s) between two lines of progress
 _LINGER_S = 0.5
 """Time (s) after a transfer in which the satellite may request a repetition of the last answer."""
@@ -240,7 +240,7 @@ def _command_by_link(options: argparse.Namespace) -> int:
 
 
 def _hint(options: argparse.Namespace) -> str:
-    """Return how to see the completion of a command that has started, for a command that changes the mode."""
+    """Return how to see that a started command has changed the mode; empty if it does not change the mode."""
     if options.what not in commands.LAYOUTS:
         return ""
     mode = final_mode(_command_of(options))
@@ -288,7 +288,7 @@ def _command_of(options: argparse.Namespace) -> commands.Command:
         value = getattr(options, field.name)
         if field.kind.startswith("S"):
             value, size = " ".join(value), int(field.kind[1:])
-            if len(value.encode(errors="replace")) >= size:  # a command such as `safe` is sent all the same
+            if len(value.encode(errors="replace")) >= size:  # a command such as `safe` is sent anyway
                 sys.stderr.write(f"knightcube: {field.name}: only its first {size - 1} bytes are sent\n")
         numbers_by_label = {label: number for number, label in field.states}
         fields[field.name] = numbers_by_label[value] if field.states else value
@@ -592,7 +592,7 @@ class _FileWork:
         return {"text": f"completed: {directive}"}
 
     def _turn(self, name: str) -> None:
-        """Transfer for a moment. Raises KnightCubeError after a signal or a long silence."""
+        """Receive and send what is due. Raises KnightCubeError after a signal or a long silence."""
         if select.select([self._terminal], [], [], _TURN_S)[0]:
             self._session.take(self._terminal.take(), time.monotonic_ns())
         now_ns = time.monotonic_ns()

@@ -377,7 +377,7 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
             options.link, feed, history, place, by_link, frames=kept, files=files, stations=stations
         )
     to: str | None = options.to
-    flight_trouble: Callable[[], str] = str  # an empty text
+    flight_trouble: Callable[[], str] = str  # returns an empty text
     if to is not None:
         flight_address(to)
     if options.fly is not None:

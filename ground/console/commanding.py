@@ -282,7 +282,7 @@ class LinkFeed:
         """
         with self.lock:
             counter = self._terminal.send(packet, _SPI)
-            self._reports.pop(counter, None)  # a report on a frame with an earlier key
+            self._reports.pop(counter, None)  # it would belong to a frame with an earlier key
         until = time.monotonic() + _ANSWER_S
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
@@ -340,7 +340,7 @@ class FlightProcess:
         return self._trouble
 
     def errors(self) -> str:
-        """Return the standard error of the flight, which also has its progress."""
+        """Return the text that the flight has written to standard error, including its progress lines."""
         return self._errors.read_text(encoding="utf-8", errors="replace").strip()
 
 

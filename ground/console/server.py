@@ -73,7 +73,7 @@ class ConsoleFeed(PacketSource, Protocol):
 
     @property
     def restarts(self) -> int:
-        """Number of restarts of the flight, at each of which the mission time began again."""
+        """Number of restarts of the flight, at each of which the mission time began again at zero."""
 
 
 @dataclass(slots=True)
@@ -202,7 +202,7 @@ def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
 
 
 def application(console: Console, access: Access) -> web.Application:
-    """Return the web application. The packets of `console` must have been read once before."""
+    """Return the web application of a console whose packets have been read at least once."""
 
     @web.middleware
     async def only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:

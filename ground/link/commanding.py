@@ -193,7 +193,7 @@ def explained(report: Report) -> str:
 
 
 def no_answer(gate: Gate, seconds: float) -> KnightCubeError:
-    """Return the error of a command on which no report arrived for `seconds` s, with its possible causes.
+    """Return the error, with possible causes, for a command on which no report arrived within `seconds` s.
 
     The causes depend on the numbers of telemetry frames that `gate` has accepted and refused.
     """
@@ -226,9 +226,9 @@ def command(
     """Send a command, `show` its reports and return them. Raises KnightCubeError if no report arrives.
 
     The call ends with the final report, when `ended` is true for the list of received reports, or after
-    `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
-    the ground when it restarts, and after a minute without a frame. If the frame's counter was used before,
-    or if the reserve SPI is used, the counters of the ground are then raised above those of the satellite.
+    `seconds` s. A ping is sent after each silence, because a link process that restarts, or that receives no
+    frame for a minute, forgets the UDP address of the ground. If the frame's counter was used before, or if
+    the reserve SPI is used, the counters of the ground are then raised above those of the satellite.
     """
     found = _followed(terminal, packet, spi, seconds, show, ended)
     if spi == COMMAND_SPIS[1] or any(report.stage is Stage.REPEATED for report in found):
@@ -330,7 +330,7 @@ class FileSession:
     """
 
     def __init__(self, terminal: Terminal, store: Store, spi: int, rate: float, now_ns: int) -> None:
-        """Send at most `rate` bytes/s of frames. Raises KnightCubeError."""
+        """Create a session that sends at most `rate` bytes/s of frames. Raises KnightCubeError."""
         self._terminal = terminal
         self._rate, self._spi = rate, spi
         self._sealer = terminal.sealer(spi, _BLOCK)
@@ -350,7 +350,7 @@ class FileSession:
     def ask(self, directive: Directive, now_ns: int) -> None:
         """Send a command and repeat it until the satellite answers.
 
-        Ignore late reports on earlier commands.
+        Late reports on earlier commands are ignored.
         """
         self._counters.clear()
         self._reports.clear()
@@ -414,7 +414,7 @@ class FileSession:
         return found
 
     def reason_of(self, progress: Progress) -> str:
-        """Return why a transfer ended: the satellite's reason for a refusal, or else that of the transfer."""
+        """Return why a transfer ended: the reason that the satellite reported, or else the ground's own."""
         return self._texts.get((progress.source, progress.number), "") or progress.said
 
     def ended(self, name: str, number: int | None = None) -> bool:

@@ -354,9 +354,9 @@ class StreamGround:
 
 
 def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
-    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, or kiss: with the address of a TNC.
+    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD or kiss:TNC.
 
-    The TNC speaks KISS on HOST:PORT (TCP) or /dev/FILE@BAUD.
+    TNC is the address, HOST:PORT (TCP) or /dev/FILE@BAUD, of a terminal node controller that uses KISS.
 
     Raises UsageError for an invalid address or key folder, and KnightCubeError if the line cannot be opened.
     """
