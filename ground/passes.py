@@ -36,7 +36,7 @@ NEWER = "give newer elements (`knightcube elements` with --fixes or --read)"
 """Remedy for elements whose predicted times are uncertain."""
 _KNOWN_SHARE = 0.25
 """Standard deviation of the predicted times, as a fraction of the orbital period, above which the revolution
-that passes over a station is unknown."""
+in which the satellite passes over a station is unknown."""
 SENDING = timedelta(minutes=1)
 """Shortest time from now until a scheduled command is due, because the satellite must receive it first."""
 _BETWEEN = timedelta(seconds=1)
@@ -126,10 +126,10 @@ def scheduled_targets(
 ) -> list[list[tuple[datetime, PointingTarget]]]:
     """Return UTC and pointing target of the commands for each pass: to the station, and back to nadir.
 
-    The passes are in order of rise. The first command of a pass is due `lead` s before the rise, but after
-    the last command of the pass before: the satellite points to a station until the pass over this station
-    ends. No command is due before `earliest`. A pass that ends during an earlier pass, or before `earliest`,
-    has no commands.
+    The passes are in order of rise. The first command of a pass is due `lead` s before the rise, but not
+    before the last command of the preceding pass, because the satellite points to a station until the pass
+    over this station ends. No command is due before `earliest`. A pass that ends during an earlier pass, or
+    before `earliest`, has no commands.
     """
     found: list[list[tuple[datetime, PointingTarget]]] = []
     # End of the latest pass that has commands.
@@ -206,7 +206,7 @@ class OrbitPrediction:
         return self._elements.at(julian_date(self.end)).sigma / _SPEED
 
     def check_age(self) -> None:
-        """Raise UsageError if the error of the predicted times is a considerable part of a revolution."""
+        """Raise UsageError if the predicted times are uncertain by more than a quarter of a revolution."""
         if self.timing_error_s > _KNOWN_SHARE * self.period_s:
             epoch = f"{self._satellite.epoch.utc_datetime():%Y-%m-%d}"
             problem = f"the times at the end have a standard deviation of {self.timing_error_s:.0f} s"
@@ -227,7 +227,7 @@ class OrbitPrediction:
         """Return the passes over all stations that overlap the span, in order of rise.
 
         Raises UsageError if the satellite never sets at a station, such as a geostationary satellite, and if
-        the elements are too old to predict which revolution passes over a station.
+        the elements are too old to predict in which revolution the satellite passes over a station.
         """
         self.check_age()
         found = [one for station in stations for one in self._over(station)]

@@ -139,7 +139,7 @@ def _with_text(
     font = ImageFont.load_default(size=15.0 * scale)
     taken: list[tuple[float, float, float, float]] = []
     for (x, y), text in labels:
-        # The label is right of the star, or left if a brighter star's label is on the right, or omitted.
+        # The label is on the right of the star, or on the left if the right is occupied, or else omitted.
         for place, anchor in (((x + 11.0 * scale, y), "lm"), ((x - 11.0 * scale, y), "rm")):
             box = draw.textbbox(place, text, font=font, anchor=anchor)
             free = all(

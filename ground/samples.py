@@ -1,7 +1,7 @@
 """Sample pictures as inputs of other commands. The simulator renders each picture from known parameters.
 
-The pictures are rendered on demand, because 12-bit noise cannot be compressed, and stored pictures would not
-follow changes of the simulator. Pictures rendered with the same seed are identical.
+The pictures are rendered on demand, because 12-bit noise cannot be compressed, and because stored pictures
+would be outdated after a change of the simulator. Pictures rendered with the same seed are identical.
 """
 
 from __future__ import annotations

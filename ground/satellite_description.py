@@ -28,7 +28,7 @@ from sim_hal.worlds.orbit import elements, julian_date, log_density, sun_positio
 Vector = tuple[float, float, float]
 
 TILT_DEG = 22.0
-"""Angle of the star camera from the normal of the orbit towards the zenith, deg."""
+"""Tilt (deg) of the star camera's boresight from the orbit normal towards the zenith."""
 _YEAR_RATE = 2.0 * math.pi / (365.2422 * 86_400.0)  # mean rate of the Sun's right ascension, rad/s
 _EQUATOR_FIELD = 2.98e-5  # field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]
 _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
@@ -179,7 +179,7 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
 
 
 def _worst_pressure(perigee: float) -> float:
-    """Return the largest drag and solar pressure (Pa) at the `perigee` (m from the Earth's centre)."""
+    """Return the sum of the largest drag and solar pressure (Pa) at `perigee`, m from the Earth's centre."""
     place, sun = np.array([[perigee, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
     density = math.exp(float(log_density(place, sun, 0.0)[0]))
     return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / perigee + 2.0 * _SUN_PRESSURE
@@ -190,7 +190,7 @@ def _rounded_up(value: float, step: float) -> float:
 
 
 def configuration_text(satellite: Satellite, values: Derived, made: FittedElements, command: str) -> str:
-    """Return the configuration file of a satellite, which names the `command` that writes the file."""
+    """Return the text of a satellite's configuration file, including the `command` that writes the file."""
     x, y, z = satellite.size
     orbit, release = satellite.orbit, satellite.release_deg
     place = ", ".join(
@@ -313,7 +313,7 @@ def _text(value: float) -> str:
 
 
 def _laid_out(text: str) -> str:
-    """Return a text with its comments aligned, except those that fill a line of their own."""
+    """Return a text with its comments aligned, except comments that are alone on their line."""
     lines = []
     for line in text.splitlines():
         value, mark, comment = line.partition(" # ")

@@ -72,7 +72,7 @@ class ScanResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of packets by name of the packet types that were found."""
+        """Number of packets of each packet type that was found, by name."""
         return {name: len(array) for name, array in self.packets.items() if len(array)}
 
     @property
@@ -83,7 +83,7 @@ class ScanResult:
 
 
 def scan(data: bytes, whole: bool = False) -> ScanResult:
-    """Return the packets in `data` and the account of all bytes.
+    """Return the packets in `data`, and the numbers of bytes inside and outside packets.
 
     If `whole` is true, the data are those from the start of a flight, where the sequence counts begin at
     zero, so packets that are missing before the first found packet are counted too.

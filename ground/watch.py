@@ -318,7 +318,7 @@ class FlightState:
 
 
 def _failed_commands(rows: Iterable[np.void]) -> list[LoggedEvent]:
-    """Return the reports of a link on refused and failed commands, which may be scheduled, as warnings."""
+    """Return the reports of a link on refused and failed commands, scheduled or not, as warnings."""
     return [
         LoggedEvent(
             float(row["time_ns"]) * 1e-9,

@@ -137,7 +137,7 @@ def _bits_of(field: Field) -> Iterator[Field]:
 
 
 def _size(kind: str) -> int:
-    """Return the number of bits of a number from its kind; for example, `b3` has three bits."""
+    """Return the size in bits of a number of the given kind; for example, `b3` has three bits."""
     return int(kind[1:]) if kind.startswith("b") else _BITS_OF[kind]
 
 

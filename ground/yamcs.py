@@ -409,7 +409,7 @@ _PROCEDURES: Mapping[str, Sequence[dict[str, Any]]] = {
     "detumble": (_mode("neq", "safe"), _command("mode", mode="detumble"), _mode("neq", "safe")),
     "list-files": (_command("list-files", entity="another-ground-station", under=""),),
 }
-"""Steps of each procedure by its name. After the command for mode `point`, mode `acquire` may come first."""
+"""Steps of each procedure by its name. On the way to mode `point`, a satellite may be in mode `acquire`."""
 
 
 def procedures_of(body: Body | None) -> Mapping[str, Sequence[dict[str, Any]]]:
