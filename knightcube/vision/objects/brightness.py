@@ -235,7 +235,7 @@ def _dot(first: FloatArray, second: FloatArray, count: int) -> float:
 
 @loop_helper
 def _append_row(factor: FloatArray, matrix: FloatArray, order: IntArray, count: int) -> bool:
-    """Append the row of image `order[count]` to a Cholesky factor of `count` rows, if it is definite."""
+    """Append the row of image `order[count]` to a Cholesky factor, and return whether the factor exists."""
     own = order[count]
     for k in range(count):
         factor[count, k] = (matrix[own, order[k]] - _dot(factor[count], factor[k], k)) / factor[k, k]

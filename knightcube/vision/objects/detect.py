@@ -145,7 +145,7 @@ def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the start and end directions (n, 2, 3) of stars whose chords have the midpoints of `vectors`.
+    """Return start and end directions (n, 2, 3) of stars whose chords have the same midpoints as `vectors`.
 
     A star moves on a circle about the rotation axis. The midpoint of the star's chord is nearer to the
     rotation axis than the star, by a factor of the cosine of half the rotation angle.
@@ -316,7 +316,8 @@ class ObjectReport:
 _LEAST_CROSSING_PX = 10.0
 # Largest distance (px) of a line's end from a star's path for which the line is part of the path.
 _ON_PATH_PX = 1.5
-# Distance (px) of a streak's ends from the ends predicted for a star below which the streak is a star's.
+# Distance (px) of a streak's ends from the ends predicted for a star below which the streak counts as a
+# star's streak.
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
@@ -324,16 +325,16 @@ _FEW_PATHS = 2
 _GOOD_FIT = 1.4
 # Upper limit of chi-square per pixel along a uniform streak (three standard deviations for 1000 pixels).
 _UNIFORM = 1.15
-# A detected line is a segment of a star's path only if the path has at least this fraction of its brightness.
+# Minimum brightness of a star's path, as a fraction of the brightness of a line that is a segment of it.
 _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided; every part must be bright enough.
 _PARTS = 12
-# Largest ratio of the excess chi-square that remains with an object to the decrease by the object.
-# The second value is for a uniform streak that resembles the streak of a star.
+# Largest ratio of the excess chi-square that remains with an object to the decrease due to the object. The
+# second value is for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
 # Fraction of the required decrease of chi-square above which light may be a segment of an object's streak.
 _PART = 0.6
-# Largest ratio of remaining excess chi-square to its decrease by an object for which ends are located.
+# Largest ratio of the remaining excess chi-square to its decrease due to an object whose ends are located.
 _HOPELESS = 4.0
 # Margin (standard deviations of the PSF) beyond the distance at which a star's profile equals the noise.
 _DIM_SIGMAS = 2.0
@@ -341,7 +342,7 @@ _DIM_SIGMAS = 2.0
 _BORDER_PX = 2
 # Largest standard deviation (px) of the ends of an object's streak.
 _VAGUE_PX = 3.0
-# Factor of the required decrease of chi-square in regions at the border, whose stars are not seen whole.
+# Factor on the required decrease of chi-square in regions at the border, where stars may be truncated.
 _AT_BORDER = 3.0
 
 
@@ -481,8 +482,9 @@ class Judge:
 
         Stars are fitted to each region. If the fitted stars do not explain all light, they are subtracted,
         and the brightest remaining light of the region is tested. In regions at the border of the image, an
-        object must decrease chi-square more, and its ends lie inside the image. Regions whose label is in
-        `settled` are not examined. Regions whose label is in `strange` are examined first, then the largest.
+        object must decrease chi-square more, and its ends must be inside the image. Regions whose label is in
+        `settled` are not examined. Regions whose label is in `strange` are examined first, followed by the
+        largest of the other regions.
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)
@@ -514,7 +516,7 @@ class Judge:
             few = self._light(ends, stars, _FEW_PATHS)
             least = few.chi_square_with(ends)
             gained = few.chi_square - least
-            # Fitted stars can hide a part of the object's streak, so that the ends contain only the rest.
+            # Fitted stars can hide a part of the object's streak; `ends` are then those of the visible part.
             if gained < enough or least - few.expected > gained:
                 longer = few.located(ends, among_stars=True) if gained >= _PART * enough else None
                 if longer is None:
@@ -618,7 +620,8 @@ class Judge:
     ) -> tuple[LocatedEnds, StarLight, Explanation] | None:
         """Return located ends of an object, model of stars, and fit of stars and object, or None.
 
-        Vague ends, and ends at the border of the image, do not show whether the object moves like a star.
+        Returns None also for uncertain ends and for ends at the border of the image, because they do not show
+        whether the object moves like a star.
         """
         best = None
         for among_stars in (True, False):

@@ -1,9 +1,9 @@
 """Directions of possible objects in an image whose attitude is determined from the stars.
 
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
-object is also a point or a short streak. If the stars are points, a possible object is an area of light
-significantly above the noise that is not at a catalogue star, or light beside a star that the star's image
-does not explain. A tracker over several images determines which possible objects move relative to the stars.
+object is also a point or a short streak. A possible object is then an area of light that is significantly
+above the noise and not at a catalogue star, or light beside a star that the star's image does not explain. A
+tracker over several images determines which possible objects move relative to the stars.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration

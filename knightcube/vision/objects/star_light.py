@@ -196,7 +196,7 @@ class StarLight:
         return np.asarray(others[found])
 
     def _object_images(self, ends: FloatArray) -> list[FloatArray]:
-        """Return the weighted images (p,) of objects with paths straight in the image and among stars."""
+        """Return the weighted images (p,) of an object on paths straight in the image and among the stars."""
         paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
         first = int(np.abs(paths[1] - paths[0]).max() < _SAME_PATH)
         return [self._weighted_image(path) for path in paths[first:]]
@@ -247,7 +247,7 @@ class StarLight:
             ends = found.ends
             if change < _LOCATED:
                 break
-            # The range stays long while the light may continue beyond its end.
+            # The range stays long while the light may continue beyond the end of the range.
             ended = moved.max() < _BEYOND_LATER - 2.0 * _FOLLOWED
             beyond = _BEYOND_LATER if ended else max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         return found

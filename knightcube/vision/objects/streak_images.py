@@ -423,7 +423,7 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
 
 
 def _between_ends(start: FloatArray, stop: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Return the fractions (n,) of a streak's light that its ends leave, and their slopes along the streak.
+    """Return the factors (n,) by which the ends reduce a streak's brightness, and their derivatives along it.
 
     The distances `start` and `stop` (n,) from the ends are positive within the streak.
     """
@@ -745,7 +745,7 @@ def fitted_line(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: 
 def _sum_line(
     light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float, sums: FloatArray
 ) -> None:
-    """Set `sums` (6, 5) to the products of the images of `line_image`, in the last row with the pixels."""
+    """Set `sums` (6, 5) to the normal equations of a fit of the images of `line_image`, as for `solved`."""
     rows, columns = light.shape
     width = math.sqrt(sigma**2 + 1.0 / 12.0)
     reach = 4.0 * width
