@@ -1,4 +1,4 @@
-"""Reads image files as arrays (PNG, TIFF, JPEG and BMP through Pillow, FITS and PGM) and writes images.
+"""Reading of image files (PNG, TIFF, JPEG and BMP through Pillow, FITS and PGM), and writing of images.
 
     pixels = read_image("night.fits")      # counts (rows, columns), unchanged from the file
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
@@ -225,9 +225,9 @@ def read_image(path: Path | str, *, upright: bool = True) -> Image:
     The format is recognised by the file's content, not by its name. The pixels are uint8 or uint16. The
     pixels of FITS files may also be signed, 32-bit or floating-point. Colour images are converted to
     luminance (ITU-R BT.601). Photographs are rotated according to the orientation in their EXIF data unless
-    `upright` is false: then rows and columns are those of the camera's detector, as a calibrated lens needs
-    them. All formats except FITS and PGM need Pillow. Raises UsageError if the file is missing, damaged or
-    in an unsupported format, if pixels are not finite, or if Pillow is not installed.
+    `upright` is false. If `upright` is false, rows and columns are those of the camera's detector, as a
+    calibrated lens requires. All formats except FITS and PGM need Pillow. Raises UsageError if the file is
+    missing, damaged or in an unsupported format, if pixels are not finite, or if Pillow is not installed.
     """
     path = Path(path)
     if content := _fits_content(path):
@@ -262,8 +262,8 @@ def grey_map_image(content: bytes, name: str) -> Image:
 def read_raw(path: Path, columns: int, rows: int, bits: int, header: int | None = 0) -> Image:
     """Return the image (rows, columns) of a file of raw pixels, of 8 bits or of 16 bits little-endian.
 
-    The pixels are stored row by row at the end of the file, after `header` bytes; if `header` is None, after
-    any number of bytes. Raises UsageError if the file is missing or has another size.
+    The pixels are stored row by row at the end of the file, after `header` bytes, or after any number of
+    bytes if `header` is None. Raises UsageError if the file is missing or has another size.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
     try:
@@ -304,9 +304,9 @@ _EXIF_FOLDER, _EXPOSURE_TIME = 0x8769, 0x829A
 def stated_exposure(path: Path) -> float | None:
     """Return the exposure time (s) in the metadata of an image file, or None.
 
-    The metadata are EXPTIME or EXPOSURE of a FITS file, those of a frame that a flight kept (`keep_frame`),
-    and ExposureTime of the EXIF data of other files.
-    Raises UsageError if a FITS file cannot be read.
+    The exposure time is read from EXPTIME or EXPOSURE of a FITS file, from the metadata of a frame that a
+    flight kept (`keep_frame`), or from ExposureTime in the EXIF data of other files. Raises UsageError if a
+    FITS file cannot be read.
     """
     value: Any = None
     # Damaged metadata are ignored; `read_image` reports damaged files.
@@ -381,7 +381,7 @@ def _through_pillow(path: Path, upright: bool) -> Image:
 _ON_SIDE = (5, 6, 7, 8)
 """Values of the EXIF tag Orientation for which the stored rows are columns of the displayed image."""
 _ORIENTATION = 0x0112
-"""Number of the tag Orientation (EXIF 2.3, TIFF 6.0): sides of the picture at which row and column 0 lie."""
+"""Number of the tag Orientation (EXIF 2.3, TIFF 6.0), which states on which sides row and column 0 lie."""
 
 
 def _upright(image: Image, picture: Picture, upright: bool) -> Image:

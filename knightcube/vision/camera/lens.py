@@ -551,7 +551,7 @@ def _radial_numpy(away: FloatArray, terms: _Terms) -> tuple[FloatArray, FloatArr
 
 
 def _tangential_numpy(one: FloatArray, other: FloatArray, terms: _Terms) -> FloatArray:
-    """Return the symmetric bilinear form (m, 2), px, of the tangential distortion of two distances (m, 2).
+    """Return the symmetric bilinear form (m, 2), px, of the tangential distortion for two vectors (m, 2), px.
 
     Without tangential distortion, the result is a single zero.
     """
@@ -681,7 +681,7 @@ def _radial(x: float, y: float, terms: _Terms) -> tuple[float, float, float]:
 
 @loop_helper
 def _tangential(x: float, y: float, u: float, v: float, terms: _Terms) -> tuple[float, float]:
-    """Return the values of `_tangential_numpy` for the distances (x, y) and (u, v)."""
+    """Return the values of `_tangential_numpy` for the vectors (x, y) and (u, v)."""
     p1, p2 = terms[8], terms[9]
     across, total = x * v + y * u, x * u + y * v
     return p2 * (total + 2.0 * x * u) + p1 * across, p1 * (total + 2.0 * y * v) + p2 * across
