@@ -255,8 +255,8 @@ def _line_edges(
 ) -> ScanEdges:
     """Return the edges on columns and rows whose step height exceeds `contrast`.
 
-    For the columns, and for the rows, the brightness `light` and the mask of bright pixels are (n, m), and
-    the indices `places` are (n,).
+    Each argument except `contrast` has two elements, for columns and for rows: the brightness `light` (n, m),
+    the mask `bright` of bright pixels (n, m) and the indices `places` (n,).
     """
     parts, read = [], 0
     for direction, binary in enumerate(bright):

@@ -354,8 +354,8 @@ def _altitude_off(
 ) -> tuple[float, float]:
     """Return the distance (sigma) of the implied altitude from prior knowledge, and the altitude, m.
 
-    A known altitude is compared with the altitude of a fit without it; otherwise the fitted altitude is
-    compared with the range `altitudes`, m.
+    A known altitude is compared with the altitude of a fit in which the altitude is unknown. If no altitude
+    is known, the fitted altitude is compared with the range `altitudes`, m.
     """
     if prior.altitude >= UNKNOWN:
         (low, high), altitude = altitudes, fit.view.surface.height_of(fit.view.position)

@@ -310,7 +310,7 @@ def limb_radius_sigma(altitude: float) -> float:
 
 
 def limb_tilt_sigma(view: LimbView, stand: Orientation, settings: HorizonSettings) -> float:
-    """Return the standard deviation per axis (rad) of the limb's tilt by a flattening of unknown direction.
+    """Return the standard deviation per axis (rad) of the limb's tilt due to an unknown flattening direction.
 
     The tilt is 0 if the rotation about nadir, and with it the direction of the flattening, is known.
     """

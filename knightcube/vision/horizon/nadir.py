@@ -205,7 +205,7 @@ def find_nadir(
 
     Raises:
         ArgumentError: if the size of image or mask differs from the camera's, if pixels are not finite, or if
-            the mask contains other values than Booleans or integers, of which all but 0 are true.
+            the mask contains values other than Booleans and integers. An integer other than 0 is true.
 
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
@@ -263,7 +263,7 @@ class _ScannedImage:
     """An image whose edges and cones are kept for further searches with other knowledge of directions."""
 
     def __init__(self, image: Image, camera: CameraModel, hidden: BoolArray | None) -> None:
-        """Keep an image and its mask. Raises ArgumentError as `find_nadir`."""
+        """Keep an image and its mask. Raises ArgumentError for the same reasons as `find_nadir`."""
         self.image = image_of_camera(image, camera)
         self.camera, self.hidden = camera, None if hidden is None else _mask(hidden, camera)
         self._observed: dict[int, tuple[Observation, ScanLines, list[_FreeCone]]] = {}
@@ -278,7 +278,10 @@ class _ScannedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FreeCone:
-    """The best cone through free edges (or None), the number of its free edges, and the edges left free."""
+    """The best cone through the edges that earlier cones have left free, or None.
+
+    The number of free edges on the cone is `count`. The mask `free` (n,) marks the edges that remain free.
+    """
 
     cone: ConeCandidate | None
     count: int
@@ -362,7 +365,10 @@ def _by_field(
     settings: HorizonSettings,
     hidden: BoolArray | None,
 ) -> tuple[list[_FieldTrial], FloatArray]:
-    """Return the best horizon at each trial focal length, if prior knowledge permits it, and the weights."""
+    """Return the best horizon at each trial focal length, and the weights of these horizons.
+
+    Horizons that contradict prior knowledge are omitted.
+    """
     centre, width = 0.0, 1.0
     trials: list[_FieldTrial] = []
     weights = np.zeros(0)
