@@ -145,7 +145,7 @@ class ReadingAgreement(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FixVerdict:
-    """Use of a GPS fix: used, refused for a reason, or, without a `refusal`, awaiting further fixes."""
+    """Use of a GPS fix: used, refused for the reason `refusal`, or, by default, awaiting further fixes."""
 
     used: bool = False
     refusal: str = ""
@@ -182,10 +182,13 @@ class Filter(Protocol):
         """Return the estimate propagated to `time_ns`, without changing the filter."""
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time, or None beyond the history."""
+        """Return the estimate at a past time, or None if the time is before the stored history."""
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,), ns, and rates (n, 3), rad/s, of an interval, or None beyond the history."""
+        """Return the times (n,), ns, and rates (n, 3), rad/s, of an interval.
+
+        Returns None if the interval begins before the stored history.
+        """
 
 
 class ReadingFeed(Protocol):
@@ -293,7 +296,7 @@ class BodyTargets(Protocol):
         """Return the angle (rad) between body and target."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle (rad) from the presently required attitude, or None if none is required."""
+        """Return the angle (rad) between the body and the attitude required now; None if none is required."""
 
 
 class BodyView(Protocol):
@@ -462,8 +465,9 @@ class FlightBody:
 class BodyKind:
     """A kind of body.
 
-    The function `plan` of the planner worker converts a job to a plan; it is None without a planner. The
-    function `make` builds the body from a configuration and the parameters that an earlier boot learned.
+    The function `plan` runs in the planner worker, and converts a job to a plan; `plan` is None for a body
+    without a planner. The function `make` builds the body from a configuration and the parameters that an
+    earlier boot learned.
     """
 
     plan: Callable[[Any], Any] | None

@@ -2,8 +2,9 @@
 
 The dispatcher is one of the documented containment boundaries: no command can end the control loop.
 
-A command replaces the whole table of onboard parameters, and the new table is stored for later boots. Before
-a table takes effect, its values are checked against their ranges and against the bounds of the configuration.
+A command that loads parameters replaces the whole table of onboard parameters. The new table is stored for
+later boots. Before a table takes effect, its values are checked against their ranges and against the bounds
+of the configuration.
 If a flight ends uncleanly, or restarts the process, within `PROVEN_NS` after a load, the next boot uses the
 previous table (`flight.loop.state`).
 """
@@ -96,7 +97,7 @@ class OnboardParameters:
             self._events.report(events.PARAMETERS_LEFT, now_ns, text)
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Replace the table with the CRC `replaced` by another; return why it is rejected, or ""."""
+        """Load a table in place of the one with the CRC `replaced`; return why it is rejected, or ""."""
         if replaced != self._crc:
             return f"the table in use has CRC {self._crc:08x}, not {replaced:08x}: dump and check it again"
         before = self._table.values if self._table.proven else self._table.before

@@ -124,8 +124,8 @@ class JobRunner(Protocol):
 class LockStepRunner:
     """Runs jobs in lock-step with simulated time; implements JobRunner.
 
-    The attribute `borrowed_ns` is the total real time (ns) of the jobs, which run in the calling thread,
-    without the time in which numba compiles functions.
+    The attribute `borrowed_ns` is the total real time (ns) of the jobs, which run in the calling thread. It
+    excludes the time in which numba compiles functions.
     """
 
     def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
@@ -163,7 +163,7 @@ class LockStepRunner:
         return ready
 
     def news(self) -> list[WorkerNews]:
-        """Return an empty list, because there are no processes that could die."""
+        """Return an empty list, because there are no processes that could end."""
         return []
 
     def close(self) -> None:
@@ -183,7 +183,7 @@ Task = Callable[[Cycle], None]
 
 
 class RateGroup:
-    """A periodic task, its period, and the statistics of its cycles; the next slot is due at `due_ns`, ns."""
+    """A periodic task with the statistics of its cycles; `due_ns` is the time (ns) of the next slot."""
 
     def __init__(self, name: str, period_ns: int, task: Task) -> None:
         if period_ns <= 0:
@@ -193,7 +193,7 @@ class RateGroup:
         self.max_execution_ns = self._slot = self._epoch_ns = self.due_ns = 0
 
     def begin(self, epoch_ns: int) -> None:
-        """Start the grid of slots, of which slot 0 is due at `epoch_ns`."""
+        """Start the grid of slots; slot 0 is due at `epoch_ns`."""
         self._epoch_ns = self.due_ns = epoch_ns
         self._slot = 0
 
@@ -304,7 +304,7 @@ REST_NS = 600 * SECOND_NS
 
 
 class Attempts:
-    """Counts the unexpected exits of a worker since it last ran for `STEADY_NS`; 0 before the first exit."""
+    """Counts the unexpected exits of a worker (`deaths`) since the worker last ran for `STEADY_NS`."""
 
     def __init__(self) -> None:
         self.deaths = 0
@@ -335,7 +335,7 @@ _REAPED_WITHIN_S = 1.0
 
 
 class WorkerProcess:
-    """A worker process for one thread; it is `ready` once it has imported its function."""
+    """A worker process, used by one thread only; it is `ready` once it has imported its function."""
 
     def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
         """Start the process on the given cores; an empty set permits all cores. Raises OSError."""
@@ -385,7 +385,7 @@ class WorkerProcess:
         return False
 
     def fileno(self) -> int:
-        """Return the descriptor of the socket, on which an answer can be awaited."""
+        """Return the descriptor of the socket, so that `select` can wait for an answer."""
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:

@@ -237,7 +237,7 @@ class Facts:
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str | Callable[[], str]) -> None:
         """Update a condition (`holds` is None if unknown); report a change as an event with `text`.
 
-        A function `text`, which returns the text, is only called for a change.
+        If `text` is a function, it returns the text, and is only called if the condition changes.
         """
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
@@ -314,8 +314,8 @@ class StreamState(IntEnum):
 class StreamLimits:
     """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value in the value's unit.
 
-    `has_silence_alarm` states whether another monitored condition reports missing readings. Missing readings
-    with another condition are not reported by the condition `poor`.
+    `has_silence_alarm` states whether another monitored condition reports missing readings; if so, the
+    condition `poor` does not report them.
     """
 
     name: str
@@ -362,7 +362,7 @@ class StreamWatch:
         self._valid = True
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings; the rate, and the time without a reading, count from `time_ns` on."""
+        """Discard earlier readings; measure the rate and the time without a reading from `time_ns` on."""
         self._times.clear()
         self._begin_ns = self._since_ns = time_ns
 
@@ -448,7 +448,7 @@ CLOCK_OFF_NS = 1_000_000_000
 
 
 class FlightClock:
-    """Clock of the `host`, which returns the GPS receiver's UTC if the host's UTC differs from it."""
+    """Clock of the `host`, with the GPS receiver's UTC if the host's UTC is off by more than a second."""
 
     def __init__(self, host: Clock) -> None:
         self.host = host

@@ -185,7 +185,7 @@ class ControlCycle:
     def _accept_results(self, record: _CycleRecord) -> None:
         """Pass the workers' results to their tasks, and update the estimate if cameras changed it."""
         tasks, now_ns = self._tasks, record.now_ns
-        # After an error in a task, the next cycle accepts the other results.
+        # If a task raises an exception, the next cycle accepts the remaining results.
         self._results.extend(self._jobs.collect())
         while self._results:
             result = self._results.popleft()
@@ -283,7 +283,7 @@ class FlightEnding:
     """State of a flight at the end of its loop.
 
     Attributes:
-        mission_time: s.
+        mission_time: mission time (s) at the end.
         cycles: number of completed control cycles.
         mode: label of the mode.
         alarms: names of the monitored conditions that are active at the end.
@@ -317,7 +317,7 @@ LABEL_PERIOD_NS = 60 * SECOND_NS
 
 
 def nothing() -> None:
-    """Do nothing, because lock-step simulation has no watchdog."""
+    """Do nothing, because a lock-step simulation has neither guardian nor watchdog."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,7 +377,7 @@ class FlightLoop:
         self._executive.stop()
 
     def note(self, kind: EventKind, text: str) -> None:
-        """Store an event from before the flight, which is reported when the flight starts."""
+        """Store an event that occurred before the flight; it is reported when the flight starts."""
         self._notes.append((kind, text))
 
     def watch(self, progress: Callable[[FlightProgress], None]) -> None:
@@ -553,7 +553,10 @@ class FlightLoop:
         self._show(progress)
 
     def _keep_state(self, now_ns: int) -> None:
-        """Pass the state for the next boot to the keeper, and report its events, without disk access."""
+        """Pass the state for the next boot to the keeper, and report the keeper's events.
+
+        This method does not access the disk.
+        """
         keeper = self._supervisors.keeper
         if keeper is None:
             return

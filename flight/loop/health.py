@@ -89,7 +89,7 @@ ResourceReader = Callable[[int], ResourceSample]
 
 @dataclass(frozen=True, slots=True)
 class ResourceState:
-    """Processor load and memory growth computed from samples, or NaN with too few samples.
+    """Processor load and memory growth computed from samples; NaN while there are too few samples.
 
     The load `cpu_share` is the processor time between the last two samples, as a fraction of one core. The
     growth `memory_slope` of memory use (bytes/s) is a least squares fit over the window.
@@ -312,7 +312,7 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report skipped slots of the control group; other groups skip slots only when it does."""
+        """Report skipped slots of the control group; other groups skip slots only if it skips slots too."""
         if group.name != CONTROL:
             return
         self.lost += slots

@@ -69,7 +69,7 @@ from knightcube.vision.streaks.geometry import Course
 from knightcube.vision.streaks.streak_result import FrameMotion, LikelihoodSettings, StreakStatus
 
 _LEAST_PRIOR_SIGMA = 5e-4
-"""Standard deviation (rad) of the alignment between star camera and inertial unit."""
+"""Standard deviation (rad) of the alignment error between star camera and inertial unit."""
 _COURSE_NODES = 17
 """Number of equally spaced times in an exposure at which the body rate is sampled."""
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
@@ -523,7 +523,7 @@ class ObjectTracks:
             self._events.report(events.OBJECT_LOST, now_ns, text)
 
     def _record_track(self, track: Track, now_ns: int, attitude: FloatArray | None = None) -> None:
-        """Record a track; `attitude` (3, 3), rad^2, is the covariance of an attitude without star fix."""
+        """Record a track; `attitude` (3, 3), rad^2, is the covariance of an attitude without a star fix."""
         line = track.line
         across = np.eye(3) - np.outer(line.direction, line.direction)
         orbit = self._body.estimation.orbit(line.time_ns)
@@ -631,18 +631,21 @@ class Imaging:
     def reduce(self, search: bool, frame_every: int) -> None:
         """Set how much work is done: the search for objects, and the fraction of exposures that are made.
 
-        Objects are searched only if `search` is true, and only every n-th exposure is made (n is
-        `frame_every`). The largest permitted age of the newest frame limits how many exposures are left out.
+        Frames are searched for objects only if `search` is true, and only every n-th exposure is made, where
+        n is `frame_every`. The largest permitted age of the newest frame limits n.
         """
         self._searches = search
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
 
     def workload(self) -> tuple[int, int]:
-        """Return the numbers of omitted exposures, and of frames that arrived or ended late."""
+        """Return the number of omitted exposures, and the number of frames that were late.
+
+        A frame is late if it arrives while the worker is busy, or if its processing takes too long.
+        """
         return self._shed, self._late
 
     def begin(self, time_ns: int) -> None:
-        """Count the age of the newest frame from `time_ns` until the first frame arrives."""
+        """Measure the age of the newest frame from `time_ns` on, until the first frame arrives."""
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:

@@ -101,7 +101,7 @@ _USUAL: Row = {
     Trigger.REACT_SAFE: Mode.SAFE,
     Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
 }
-"""Default results of the triggers in modes that steer the body; table rows override some of them."""
+"""Default results of the triggers in every mode; the rows of the table override some of them."""
 
 TRANSITIONS: Table = {
     Mode.BOOT: {
@@ -142,7 +142,7 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_POINT: TriggerAnswer.STAY,
     },
     Mode.SUN: {**_USUAL, Trigger.LOST: Mode.ACQUIRE, Trigger.COMMAND_SUN: TriggerAnswer.STAY},
-    Mode.POINT: {**_USUAL, Trigger.LOST: Mode.ACQUIRE},  # a new target is approached from this attitude
+    Mode.POINT: {**_USUAL, Trigger.LOST: Mode.ACQUIRE},  # a repeated command may set a new target
 }
 
 
@@ -239,7 +239,7 @@ class HoldTimer:
 class AttitudeWatch:
     """Triggers changes between acquisition and pointing, and controls what a body does in the mode SAFE.
 
-    The mode `follows` comes after the acquisition, or is None. In SAFE, the flags `detumbles` and
+    The attribute `follows` is the mode after the acquisition, or None. In SAFE, the flags `detumbles` and
     `acquires_sun` state whether the body is being detumbled or turned to the Sun.
     """
 
@@ -347,7 +347,10 @@ SAFING_REACTIONS = {
 
 
 def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
-    """Return the modes in which a reaction has an effect: all, unless the reaction changes the mode."""
+    """Return the modes in which a reaction has an effect.
+
+    A reaction that never changes the mode has an effect in all modes.
+    """
     trigger = SAFING_REACTIONS.get(reaction)
     if trigger is None:
         return frozenset(Mode)
@@ -372,7 +375,8 @@ class ModeControl:
     ) -> None:
         """Connect the machine with body and steering; `stop`, given a reason, ends the flight.
 
-        Raises KnightCubeError and ConfigError.
+        Raises KnightCubeError for an invalid table of conditions or transitions, and ConfigError if the body
+        does not have the configured initial mode.
         """
         facts.check(facts.FACTS, modes_moved_by)
         self._settings, self._stop = modes, stop

@@ -49,8 +49,8 @@ from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Estimate, Me
 from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 _AT_A_TIME = 16
-"""Number of filter updates that one control cycle repeats after a late measurement, which takes a few ms.
-Repeating the filter updates of one second takes a few control cycles."""
+"""Number of filter updates that one control cycle repeats after a late measurement. They take a few ms, and
+the filter updates of one second are repeated within a few control cycles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class CoilKnowledge:
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
         """Return which currents are known, from the driver's state and the time since the last call.
 
-        A coil may carry any current if a supply current is `suspected` to contradict a healthy circuit.
+        If the supply current contradicts a healthy coil circuit (`suspected`), a coil may carry any current.
         """
         obeyed, self._obeys = self._obeys, not in_force.error
         was_suspected, self._suspected = self._suspected, suspected
@@ -285,15 +285,18 @@ class Navigation:
         return estimate
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time, or None beyond the filter's history."""
+        """Return the estimate at a past time, or None if the time is before the filter's history."""
         return self._filter.past(time_ns) if self._filter.started else None
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,), ns, and rates (n, 3), rad/s, of a past interval, or None beyond the history."""
+        """Return the times (n,), ns, and rates (n, 3), rad/s, of a past interval.
+
+        Returns None if the interval begins before the filter's history.
+        """
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def begin_from(self, attitude: AttitudeMeasurement) -> bool:
-        """Start a filter without an estimate from an attitude of the stars; return whether it started."""
+        """If the filter has no estimate, start it from a star fix; return whether it started."""
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
@@ -381,7 +384,7 @@ class Positioning:
         self._link_recorded_ns: int | None = None
 
     def begin(self, time_ns: int) -> None:
-        """Count the age of the newest fix from `time_ns` until the first fix arrives."""
+        """Measure the age of the newest fix from `time_ns` on, until the first fix arrives."""
         self._fixed_ns = time_ns
 
     def run(self, now_ns: int) -> None:
@@ -464,7 +467,7 @@ class SunSensing:
         self._read_ns = 0
 
     def begin(self, time_ns: int) -> None:
-        """Count the age of the newest reading from `time_ns` until the first reading arrives."""
+        """Measure the age of the newest reading from `time_ns` on, until the first reading arrives."""
         self._read_ns = time_ns
 
     def run(self, now_ns: int) -> None:
@@ -530,7 +533,7 @@ class HorizonCameraTask:
         self._job: tuple[int, int, int] | None = None
 
     def begin(self, time_ns: int) -> None:
-        """Count the ages of frames from `time_ns`, when the first trigger is due, until frames arrive."""
+        """Set the time of the first trigger; until frames arrive, their ages are measured from `time_ns`."""
         self._triggered_ns = time_ns - self._settings.fine_period_ns
         self._seen_ns = [time_ns] * len(self._cameras)
 

@@ -36,7 +36,7 @@ analogue-to-digital converter."""
 CELL_RANGE = (1.0, 4.6)
 """Range (V) of the voltage of a cell, outside which a reading is wrong."""
 DIFFERENCE = 0.1
-"""Largest difference (V per cell) between the voltages of battery and bus."""
+"""Largest accepted difference (V per cell) between the measured voltages of battery and bus."""
 
 
 class ChargeEstimate:

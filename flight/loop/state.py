@@ -195,7 +195,8 @@ class Noted:
 def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
     """Return the state of the next boot, marked as running; a crash of the last boot is recorded in it.
 
-    Parameters of other `devices` are discarded. After a crash, the previous table replaces an unproven table.
+    Parameters that were learned for devices other than `devices` are discarded. After a crash, the previous
+    table replaces an unproven table.
     """
     unclean = state.unclean
     if state.running:
@@ -426,7 +427,10 @@ class StateStore:
         self._order: tuple[str, ...] = COPIES
 
     def load(self) -> StoredState:
-        """Return the newest valid copy, or defaults. A lost state is an unclean shutdown. Never raises."""
+        """Return the newest valid copy, or defaults. Losing the state counts as an unclean shutdown.
+
+        Never raises.
+        """
         read = [self._read(name) for name in COPIES]
         whole = [r for r in read if r.copy is not None]
         newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)
@@ -653,8 +657,8 @@ def open_state(
     The sequence `runs` holds the folders of the newest runs, which contain files with boot numbers. The last
     folder belongs to the present run. When `stack` closes, the final state is written, as a clean end unless
     an exception was raised. A DeviceError counts as a clean end, because it is reported as a device error and
-    safe mode would not help. During the start, so do the other errors after which a start is retried,
-    KnightCubeError and OSError.
+    safe mode would not help. During the start, KnightCubeError and OSError also count as a clean end, because
+    the start is retried after them.
     """
     folder = state_folder(config, environment)
     if folder is None:

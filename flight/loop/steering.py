@@ -5,9 +5,9 @@ direction of the torque is preserved. The sent commands are compared with the su
 motion (`flight.loop.coil_monitor`). When a coil is diagnosed as broken, a monitored condition becomes active
 and reports an event. The reaction to the event `coil-broken` excludes the axis.
 
-All currents in the loop are effective currents, with which healthy coils would have the same dipole. The coil
-drive converts effective currents to actual coil currents by the signs and gains that the coil monitor has
-estimated.
+All currents in the loop are effective currents. The effective current of a coil is the current with which a
+healthy coil would produce the same dipole. The coil drive converts effective currents to actual coil currents
+by the signs and gains that the coil monitor has estimated.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ class CoilDrive:
         self._coils.command(self.command)
 
     def _brake(self, axes: Axes) -> None:
-        """Brake the H-bridges of failed coils: a leg stuck high drives a coil even without a command."""
+        """Brake the H-bridges of failed coils, because a leg stuck high drives a coil without a command."""
         if axes != self._braked:
             self._coils.brake(axes)
             self._braked = axes
@@ -227,7 +227,11 @@ class Steering:
         self._has_rate = True  # whether the newest reading or another source gives the body rate
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
-        """Follow the path or hold its end; without a measured estimate, control is lost if `ever_started`."""
+        """Follow the path, or hold the attitude at its end.
+
+        Without a measured estimate, the coils are set to zero. The loss of control is reported only if the
+        filter has had an estimate in this flight (`ever_started`).
+        """
         control = self._body.control
         reference = control.paths.sample(now_ns)
         reason = "measurement too old or estimate too inaccurate for control: coils set to zero"

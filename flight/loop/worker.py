@@ -190,7 +190,7 @@ _HEADER = struct.Struct("<QQI")
 def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
     """Pickle a value, with large buffers in the memory `slab`.
 
-    Raises KnightCubeError for a too small `slab`.
+    Raises KnightCubeError if `slab` is too small.
     """
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
@@ -206,7 +206,7 @@ def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
     """Encode a value for a receiver that does not trust the sender.
 
-    Raises KnightCubeError for another type.
+    Raises KnightCubeError for an unsupported type, or if `slab` is too small.
     """
     body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
@@ -223,9 +223,9 @@ def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
 
 
 def message_length(data: bytes | bytearray) -> int | None:
-    """Return the length of the message at the start of `data`, or None if incomplete.
+    """Return the length of the message at the start of `data`, or None if its header is incomplete.
 
-    Raises KnightCubeError.
+    Raises KnightCubeError for an impossible length.
     """
     if len(data) < _HEADER.size:
         return None
@@ -275,7 +275,7 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
             del received[:length]
             line.sendall(_answer(function, argument, slab))
             del argument
-            # Memory is returned to the kernel after the result was sent, which does not delay the result.
+            # Memory is returned to the kernel after the result was sent, so that the result is not delayed.
             give_back()
 
 
