@@ -329,7 +329,7 @@ class SatelliteEstimation(BodyEstimation):
         return estimate.rate
 
     def fastest_by_field(self) -> float:
-        """Return the body rate from the magnetometer plus its standard deviation, rad/s, or infinity."""
+        """Return the rate (rad/s) from the magnetometer plus its standard deviation; infinite if unknown."""
         found = self.orbit_filter.rate_by_field()
         if found is None:
             return math.inf
@@ -420,7 +420,7 @@ ORBIT = BodyKind(pointing_job.run, make)
 
 
 def _pauses(config: OrbitConfig) -> WindowSchedule:
-    """Return the control windows of pointing, in which the coils act for a longer time than in detumbling."""
+    """Return the control windows of pointing, in which the coils are driven for longer than in detumbling."""
     return _windows(config, config.pointing.act)
 
 
@@ -469,7 +469,7 @@ def _sensor(config: OrbitConfig) -> Sensor | None:
 
 
 def fastest_rate(config: OrbitConfig) -> float:
-    """Return the rate (rad/s) above which the satellite detumbles or the star camera pauses."""
+    """Return the smaller of two rates (rad/s): the tumble rate, and the largest rate of the star camera."""
     camera = config.camera.max_rate if config.camera is not None else None
     return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 
@@ -481,7 +481,7 @@ _FIELD_BIAS_WALK = 3.0e-10
 _DIPOLE_WALK, _SUNLIT_WALK = 1.5e-6, 2.0e-7
 """Random walk of the residual dipole in shadow and of its increase in sunlight, A m^2 per sqrt(s)."""
 _UNIFORM = 1.0 / math.sqrt(3.0)
-"""Standard deviation of a uniformly distributed error whose largest value is one."""
+"""Standard deviation of an error that is uniformly distributed between -1 and 1."""
 
 
 def description_errors(config: OrbitConfig) -> BodyErrors:
@@ -604,7 +604,7 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
     air, dipole = np.array(config.largest_torques()) / float(np.linalg.eigvalsh(inertia)[0])
 
     def disturbance(time_ns: int) -> float:
-        """Return the largest acceleration (rad/s^2) by disturbances, without drag for an unknown orbit."""
+        """Return the largest acceleration (rad/s^2) by disturbances, without drag if the orbit is unknown."""
         state = environment.state(time_ns)
         density = 0.0 if state is None else mean_density(float(np.linalg.norm(state.position)))
         return float(dipole + air * density)

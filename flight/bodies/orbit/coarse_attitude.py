@@ -354,7 +354,7 @@ def horizon_camera_feed(
 def _spread(
     sight: VectorObservation, turn: FloatArray, claim: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return deviation (2,) of a direction, its covariance (2, 2), and that of its prediction (2, 2)."""
+    """Return the deviation (2,) of a direction from its prediction, and the covariances (2, 2) of both."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
     # A small rotation e changes a direction d by the cross product d x e.

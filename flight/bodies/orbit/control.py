@@ -120,7 +120,7 @@ class SunAcquisitionLaw(_MagneticLaw):
             self._acquisition.update_sun(reading.time_ns, found.direction)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now. Without a Sun direction, the command only damps the rotation."""
+        """Return the present command, which only damps the rotation if the Sun direction is unknown."""
         found = self._acquisition.sun is not None
         if found is not self._found:
             self._found = found
@@ -138,7 +138,7 @@ invertible."""
 
 
 def commanded(dipole: FloatArray, coils: FloatArray) -> FloatArray:
-    """Return the command (3,) of a dipole (3,), A m^2; `coils` (3, 3) maps commands to dipoles."""
+    """Return the command (3,) that produces a dipole (3,), A m^2; `coils` (3, 3) maps commands to dipoles."""
     errors = np.clip(coils - np.eye(3), -_LARGEST_COIL_ERROR, _LARGEST_COIL_ERROR)
     return np.asarray(np.linalg.solve(np.eye(3) + errors, dipole))
 

@@ -67,7 +67,7 @@ EARLIEST = 2.0
 TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
 """Largest accepted step (ns) of the receiver's time relative to the host's clock, and drift of that clock."""
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
-"""Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not know them."""
+"""Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not state them."""
 WITNESS_GATE, LATEST_WITNESS_NS = 4.0, 20 * SECOND_NS
 """`WITNESS_GATE` is the RMS deviation of the measured field strength from an orbit's prediction, in standard
 deviations, above which the field contradicts the orbit. `LATEST_WITNESS_NS` is the largest age (ns) at which
@@ -173,7 +173,7 @@ def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
 
 
 class EstimatedEnvironment:
-    """Knowledge of the orbit.
+    """Estimate of the orbit, and of field and sunlight along the orbit.
 
     The number `refused` of GPS fixes does not include fixes that are kept to begin an orbit. The text
     `refusal` states why the last fix was refused; it is empty if the fix was used or kept.
@@ -314,7 +314,7 @@ class EstimatedEnvironment:
         return None
 
     def _unconfirmed(self, state: OrbitState) -> OrbitState:
-        """Return a state from a few fixes with an increased standard deviation.
+        """Return `state`, which follows from only a few fixes, with an increased standard deviation.
 
         The increase covers the distance between the state and the position predicted by the elements.
         """

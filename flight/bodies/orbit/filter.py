@@ -334,7 +334,7 @@ class StepReplay:
         self.take_on(place + 1)
 
     def place(self, time_ns: int) -> int | None:
-        """Return the index of the step that contains a time, or None beyond the history."""
+        """Return the index of the step that contains a time, or None for a time outside the history."""
         for k, step in enumerate(self.steps):
             if step.begin_ns <= time_ns < step.end_ns:
                 return k
@@ -354,7 +354,10 @@ class StepReplay:
         return field, step.gyro
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
-        """Return the body's rotation (4,) between two times from gyro data, or None beyond the history."""
+        """Return the body's rotation (4,) between two times, from gyro data.
+
+        Returns None if a time is outside the history, or if a rate without a gyro is too uncertain.
+        """
         if to_ns < from_ns:
             back = self.turned(to_ns, from_ns)
             return None if back is None else conjugate(back)
@@ -687,7 +690,7 @@ class OrbitFilter:
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
         """Apply measurements of past times, and call `applied` with flags of those that passed the gate.
 
-        Measurements beyond the history are ignored.
+        Measurements that are older than the history are ignored.
         """
         self._close()
         places = [self._replay.place(m.time_ns) for m in late]
@@ -730,7 +733,7 @@ class OrbitFilter:
         return self._propagated.now(time_ns, seconds, dipole, newest.around, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time, or None if the time is beyond the history."""
+        """Return the estimate at a past time, or None if the history has no estimate for this time."""
         if self._steps and time_ns >= self._steps[-1].end_ns:
             return self.at(time_ns) if time_ns <= self.measured_ns else None
         place = self._replay.place(time_ns)
@@ -743,7 +746,10 @@ class OrbitFilter:
         return self._propagated.then(step.before, time_ns, seconds, step.dipole, step.around)
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,), ns, and rates (n, 3), rad/s, of an interval, or None beyond the history."""
+        """Return the times (n,), ns, and rates (n, 3), rad/s, of an interval.
+
+        Returns None if the history does not cover the interval.
+        """
         inside = [s for s in self._steps if s.end_ns > begin_ns and s.begin_ns < end_ns]
         last = self.past(max(end_ns, inside[-1].end_ns)) if inside else None
         if not inside or last is None or inside[0].begin_ns > begin_ns:

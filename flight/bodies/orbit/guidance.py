@@ -57,17 +57,17 @@ class PathPoint:
 
     @property
     def motion(self) -> AttitudeReference:
-        """The wanted motion."""
+        """The planned motion."""
         return self.law.reference(self.seconds)
 
     @property
     def quaternion(self) -> FloatArray:
-        """(4,) ICRS into body."""
+        """Attitude quaternion (4,) from ICRS to body axes."""
         return self.motion.quaternion
 
     @property
     def body_rate(self) -> FloatArray:
-        """(3,) rad/s, body axes."""
+        """Angular rate (3,), rad/s, in body axes."""
         return self.motion.rate
 
 
@@ -78,7 +78,7 @@ near the end, because the time is too short for a new plan."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Followed:
-    """A path that is followed from `begin_ns` on, with or without a slew; times count from `origin_ns`."""
+    """A path that is followed from `begin_ns` on, with or without a slew; times are since `origin_ns`."""
 
     law: PointingLaw
     origin_ns: int
@@ -149,7 +149,7 @@ class PointingPaths:
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
     def running(self, now_ns: int) -> RunningSlew | None:
-        """Return the slew whose rest may be planned again, or None before it begins and near its end."""
+        """Return the slew whose rest may be planned again; None if no slew runs, or if its end is near."""
         point, followed = self.sample(now_ns), self._followed
         if point is None or followed is None or followed.slew is None or self._next is not None:
             return None
@@ -199,7 +199,7 @@ class PointingPaths:
 
 @dataclass(frozen=True, slots=True)
 class PointingTargetLaw:
-    """The planned attitude of a target as a function of time; implements `AttitudeLaw`."""
+    """The planned attitude of a target as a function of time; implements `flight.loop.body.TargetLaw`."""
 
     target: PointingTarget
     paths: PointingPaths
@@ -404,9 +404,9 @@ AGAIN_NS = 10_000_000_000
 REST_AGAIN_NS = 5_000_000_000
 """Shortest time (ns) between two plans for the rest of a slew."""
 MOST_WAITS = 4
-"""Largest number of times `REST_AGAIN_NS` until the rest of a slew is planned again. The number grows by one
-with each plan that does not improve the present plan, because most plans that follow do not improve it. If a
-coil fails or is used again, the rest is planned at once."""
+"""Longest time, in units of `REST_AGAIN_NS`, until the rest of a slew is planned again. The time grows by one
+unit with each plan that does not improve the present plan, because most later plans do not improve it either.
+If a coil fails or is used again, the rest is planned at once."""
 _SMALLEST = 0.5
 """Smallest plausible principal moment of inertia, relative to the smallest configured moment."""
 

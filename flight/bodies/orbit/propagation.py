@@ -121,8 +121,8 @@ class FilterStep:
 
     Attributes:
         dipole: mean commanded dipole (3,), A m^2.
-        doubt: standard deviation of the error of `dipole`, A m^2 per axis, in addition to that of the coils'
-            matrix; zero for known dipoles of three coils.
+        doubt: standard deviation of the error of `dipole`, A m^2 per axis, in addition to the error of the
+            coils' matrix; zero for known dipoles of three coils.
         gyro: mean angular rate (3,), rad/s, of `samples` gyro readings with the mean time `gyro_ns`. Without
             a gyro reading, `gyro` is the rate at the end of the step, estimated from the magnetometer, and
             `spread` is the covariance (3, 3), rad^2/s^2, of this rate.

@@ -143,7 +143,7 @@ def _gain_ratio(estimate: Estimate, model: Parameters) -> float:
 
 
 def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstimate:
-    """Return the rotation about the thread; no approximation is needed for a suspended body.
+    """Return the rotation about the thread, which is exact for a suspended body.
 
     The disturbance is the acceleration that a plant with the parameters of `model` does not explain, scaled
     so that this plant and the body need the same current to hold an attitude.
@@ -218,7 +218,7 @@ class PlanningSettings:
         replan_period: time (s) between two plans, and duration of the paths that hold a reached target.
         late_after_ns: planning time (ns) after which a plan is reported as late.
         nodes: number of interpolation nodes of a path.
-        strategy: see the module.
+        strategy: strategy of path planning, as described at the top of this module.
         time_price: cost (W) of the duration of a slew, or None for a fixed horizon.
         current_share: fraction of the current limit that a plan may use; the controller may use the rest.
         cost: the power whose integral over time a path minimises.
@@ -682,7 +682,7 @@ class CageTracker:
         self._plant, self._field, self._dipole = plant, field, dipole
 
     def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
-        """Return the command that makes the requested torque with the least current."""
+        """Return the command that produces the requested torque with the least current."""
         wanted = self._inner.command(estimate, reference)
         angle = self._read(estimate).angle
         torque = self._plant.torque_constant * float(wanted.currents[0]) * math.cos(angle)
