@@ -308,7 +308,7 @@ class CltuStream:
         return found
 
     def _frame(self, coded: bytes) -> tuple[bytes, int] | None:
-        """Return the frame (b"" if invalid) and the bytes of valid codeblocks, or None if incomplete."""
+        """Return the frame (b"" if invalid) and the length of valid codeblocks, or None if incomplete."""
         data, corrected, length = b"", 0, _BLOCK_DATA
         for end in range(_BLOCK, len(coded) + 1, _BLOCK):
             block = coded[end - _BLOCK : end]

@@ -147,11 +147,14 @@ class CommandError(KnightCubeError):
 
 
 class MalformedError(CommandError):
-    """Raised for bytes that are not a command; not answered, lest two flights answer each other forever."""
+    """Raised for bytes that are not a command.
+
+    Such bytes are not answered, so that two flights cannot answer each other endlessly.
+    """
 
 
 class _Command:
-    """Command, whose attributes have the names of the fields of its packet unless it overrides `fields`."""
+    """Base class of commands; attributes are named like packet fields unless `fields` is overridden."""
 
     __slots__ = ()
     packet: ClassVar[Packet]
@@ -249,7 +252,7 @@ class Point(_Command):
 
 @dataclass(frozen=True, slots=True)
 class LoadParameters(_Command):
-    """Command to replace the table with the CRC-32 `replaced` by new values in the order of the table."""
+    """Command to replace the table whose CRC-32 is `replaced`; new values are in the order of the table."""
 
     replaced: int
     values: tuple[float, ...]
@@ -615,9 +618,10 @@ class DatagramChannel:
 
 
 def open_unix(path: Path) -> DatagramChannel:
-    """Bind a UNIX datagram socket that owner and group may write to, instead of a stale socket file.
+    """Bind a UNIX datagram socket that owner and group may write to. A stale socket file is replaced.
 
-    Raises UsageError for another file, if a process listens at this path, or if binding fails.
+    Raises UsageError if `path` is a file of another kind, if a process listens at `path`, or if binding
+    fails.
     """
     try:
         bound = _bound_unix(path)

@@ -55,7 +55,7 @@ def stated_length(header: bytes) -> int:
 
 
 def open_telecommand(frame: bytes, spacecraft: int) -> bytes:
-    """Return a BD telecommand frame for this spacecraft without its CRC. Raises FrameError for others."""
+    """Return a BD frame for this spacecraft without its CRC. Raises FrameError for any other frame."""
     if len(frame) < TELECOMMAND_HEADER.size + CRC_BYTES or stated_length(frame) != len(frame):
         raise FrameError("its length is wrong")
     first = int.from_bytes(frame[:2], "big")

@@ -105,7 +105,10 @@ TELEMETRY_SPIS = (3, 4)
 
 
 def may_change(spi: int, changed: int) -> bool:
-    """Return whether an SPI may change a key: only the reserve SPI may change keys of reserve SPIs."""
+    """Return whether a command with an SPI may change the key of the SPI `changed`.
+
+    The reserve SPI may change all keys, and the primary SPI only the keys of primary SPIs.
+    """
     return spi == COMMAND_SPIS[1] or changed not in (COMMAND_SPIS[1], TELEMETRY_SPIS[1])
 
 
@@ -312,7 +315,7 @@ class _Witness:
             self._replaced[spi].add(_id_of(known.key))
             overwrite(self._folder / f"replaced-{spi}", b"".join(sorted(self._replaced[spi])))
         self.known[spi] = association
-        # One copy of a counter is written each time, so that a crash damages at most the newest copy.
+        # If only the counter is new, the copies are written alternately, so that a crash damages only one.
         self._writes += 1
         for copy in COPIES if new else (COPIES[self._writes % 2],):
             overwrite(self._folder / f"spi-{spi}.{copy}", encode(association))
@@ -469,7 +472,7 @@ class Gate:
         return known
 
     def _by_newer_key(self, entry: Association, header: bytes, protected: bytes) -> tuple[Association, bytes]:
-        """Return association and data of a frame with a newer key than that of `entry`. Raises RefusedError.
+        """Return association and data of a frame with a key newer than that of `entry`. Raises RefusedError.
 
         On the ground, another process that shares the folder of keys may already have replaced the key.
         """
@@ -524,7 +527,7 @@ class Sealer:
     def seal(self, header: bytes, data: bytes) -> tuple[bytes, int]:
         """Return a protected frame, without CRC, and its counter.
 
-        Raises KnightCubeError without a counter.
+        Raises KnightCubeError if no counter can be reserved.
         """
         if self._next == self._end or (self._shared and self._is_overtaken()):
             self._reserve()

@@ -66,7 +66,7 @@ class FileSum:
         self._at = self._value = 0
 
     def step(self) -> int | None:
-        """Process the next 1 MiB; return the checksum at the end of the file, None before. Raises OSError."""
+        """Process the next 1 MiB; return the checksum after the last step, else None. Raises OSError."""
         if self._left:
             with self._path.open("rb") as file:
                 file.seek(self._at)
@@ -156,7 +156,7 @@ class Ranges:
 
 
 _SOON = 4
-"""Number of retries from which the period of a timer doubles."""
+"""Number of the first retry after which the period of a timer is doubled."""
 _LONGEST_NS = 60_000_000_000
 """Longest period (ns) of a timer, unless its first period is longer."""
 
@@ -351,7 +351,8 @@ def _condition_text(condition: int) -> str:
 
 
 LACK_NS, SILENT_NS = 2_000_000_000, 10_000_000_000
-"""Time (ns) without a PDU after which missing ranges are requested, after and before the EOF."""
+"""Times (ns) without a PDU after which missing ranges are requested: after the EOF has been received, and
+before."""
 FINISHED_NS = 5_000_000_000
 """Period (ns) after which an unacknowledged Finished PDU is repeated."""
 _FINISHED_TRIES = 20
@@ -586,7 +587,7 @@ _SUSPENDED = "suspended"
 
 
 class Origin(NamedTuple):
-    """Frame and packet (first 16 bits, sequence count) of a transfer's command, or zeros without command."""
+    """Frame and packet (first 16 bits, sequence count) of the command for a transfer; zeros without one."""
 
     spi: int = 0
     counter: int = 0

@@ -303,7 +303,7 @@ class DeleteFile(_Directive):
 
 @dataclass(frozen=True, slots=True)
 class Activate(_Directive):
-    """Command to start the trial of the signed software in bundle `name` (docs/fly/renewal.md)."""
+    """Directive to start the trial of the signed software in bundle `name` (docs/fly/renewal.md)."""
 
     name: str
     sum: bytes

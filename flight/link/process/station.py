@@ -145,7 +145,7 @@ class UdpLine:
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return frames and senders of datagrams; a too long datagram is cut to an invalid length."""
+        """Return frames and senders of datagrams; a datagram that is too long is cut to an invalid length."""
         found = []
         for _ in range(AT_MOST):
             try:
@@ -476,7 +476,7 @@ class Station:
         self._renewal = Renewal(folder, settings.renewal, settings.command_loss)
         self._verification = Verification()
         self._packer, self._commands = Packer(), CommandPacker()
-        # Portions that were sent with different keys are not joined.
+        # Segments (class `Portion`) that were sent with different SPIs are not joined.
         self._joiners = {spi: directives.Joiner() for spi in COMMAND_SPIS}
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._label, self._zero_utc_ns = b"", 0
@@ -721,7 +721,7 @@ class Station:
         raise problem or KnightCubeError("no SPI is configured for telemetry")
 
     def _report_stages(self, *reports: Report) -> None:
-        """Report stages of commands to the flight, which may be scheduled commands."""
+        """Report stages of commands that the flight executes, and note results of scheduled commands."""
         for one in reports:
             self._scheduling.reported(one)
         self._report(*reports)

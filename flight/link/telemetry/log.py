@@ -280,7 +280,7 @@ def _drop(run: Path) -> None:
 def _numbered(archive: Path) -> list[tuple[int, Path]]:
     """Return the run numbers and paths of all files and folders with the name of a run, in order.
 
-    A disk in trouble gives an empty list.
+    The list is empty if the disk is failing or damaged.
     """
     try:
         matches = [(_NAME.fullmatch(path.name), path) for path in archive.glob("run-*")]
