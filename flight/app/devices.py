@@ -289,7 +289,8 @@ def open_camera(
 ) -> FrameSource:
     """Open the configured camera.
 
-    Raises ConfigError without a camera, and DeviceError for missing hardware unless the flight is `patient`.
+    Raises ConfigError if the camera has no `device`, and DeviceError for missing hardware unless the flight
+    is `patient`.
     """
     if camera.device is None:
         raise ConfigError("camera.device", NO_CAMERA)

@@ -455,7 +455,7 @@ def _saturation(camera: Camera) -> float:
 
 
 def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
-    """Return a camera's estimator of rates from streaks. Raises ConfigError if the body does not have it."""
+    """Return the configured estimator of rates from streaks. Raises ConfigError if the body has none."""
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))
     if body.streak_estimator is None:

@@ -180,7 +180,7 @@ class SeparationInhibit:
     """Keeps coils and transmitter off for a configured time after the first power-up.
 
     Launch providers require this inhibit. The CubeSat Design Specification allows no transmission within 45
-    minutes after the deployment. The time with power is counted in a file, so that a restart neither ends the
+    minutes after the deployment. The powered-on time is counted in a file, so that a restart neither ends the
     inhibit nor begins it again. Flight and link count the time separately, each in its own folder.
 
     A damaged or missing file counts as the first power-up, because it does less harm to keep the coils off
@@ -214,7 +214,7 @@ class SeparationInhibit:
 
 
 def _powered(path: Path) -> float:
-    """Return the stored time with power, s, or 0 if the file is missing or damaged."""
+    """Return the stored powered-on time (s), or 0 if the file is missing or damaged."""
     with suppress(OSError, ValueError):
         return float(line_of(_persistently(LinuxFiles().read, path) or b"") or b"0")
     return 0.0
@@ -640,7 +640,7 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
 
 
 def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes | None, str, bool]:
-    """Return a file's bytes, why they are unusable or "", and whether a checksum confirms the bytes."""
+    """Return a file's bytes, why they are unusable (or ""), and whether a checksum confirms the bytes."""
     try:
         data = _persistently(read, path)
         expected = _persistently(LinuxFiles().read, sum_file(path))

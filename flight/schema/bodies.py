@@ -414,7 +414,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         return _two_digits(0.1 * torque * float(np.sqrt(np.mean(rates**2))))
 
     def dipole_errors(self) -> tuple[float, float]:
-        """Return the largest errors (A m^2, each axis) of two dipoles: residual, and additional in sunlight.
+        """Return the largest errors (A m^2 per axis) of the residual dipole and of its increase in sunlight.
 
         The default error of the residual dipole in shadow is proportional to the mass, as for a satellite
         with some magnetic cleanliness. A missing mass is computed from the moments of inertia of a

@@ -153,7 +153,7 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
 
 
 class MagnetometerSection(SensorsSection, frozen=True, kw_only=True):
-    """A magnetometer for a silent inertial unit, or as the only unit without `inertial_unit`."""
+    """A magnetometer that replaces a silent inertial unit, or is the only unit if `inertial_unit` is none."""
 
     driver: DriverName = "sensors"
 
@@ -285,7 +285,7 @@ class Coils(Section, frozen=True, kw_only=True):
 
 
 def coil_fields(config: Any) -> FloatArray | None:
-    """Return the field (n, 3), T/A, of each coil at the inertial unit, or None without all positions."""
+    """Return each coil's field (n, 3), T/A, at the inertial unit, or None if a coil's position is unknown."""
     plant, fields = getattr(config, "plant", None), []  # the testbed's plant describes all coils
     for coil in config.coils.windings:
         if coil.position is None or not any(coil.position):
@@ -399,9 +399,9 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
 
     The error `focal_length` is relative, `centre` is in px along x and y, `distortion` is the displacement of
     an image corner relative to its distance from the centre, and `line_time` is in s. A zero means that the
-    value is exact, as in an emulated camera. Without `accuracy.line_time`, the `line_time` of the camera
-    section is considered exact. The angle `mounting_deg` is the largest rotation of the
-    camera about each body axis from its `mounting`; the true rotation is assumed to be uniform within it.
+    value is exact, as in an emulated camera. If `accuracy.line_time` is omitted, a `line_time` that the
+    camera section states is considered exact. The angle `mounting_deg` is the largest rotation of the camera
+    about each body axis from its `mounting`; the true rotation is assumed to be uniform within it.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
@@ -685,7 +685,7 @@ class Driver:
         open: function that takes the rig and the section, and returns the driver (`hal.interfaces.devices`).
             A driver of coils must be passive until its method `start` is called.
         probe: function that takes a rig and the section, queries the device without changing its state, and
-            returns its answer as text, or raises DeviceError without an answer.
+            returns its answer as text, or raises DeviceError if the device does not answer.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
             device to the emulated wires, and returns the device. A camera driver needs no function `emulate`,
             because the simulator emulates the cameras of all drivers. A device of another package without an
@@ -860,7 +860,7 @@ def _camera_fields(others: tuple[tuple[str, type[Any]], ...]) -> list[tuple[str,
 
 @lru_cache(maxsize=64)
 def _shape(shape: Hashable, fields: tuple[tuple[str, Any], ...]) -> type[Any]:
-    """Return a struct type derived from `shape` in which fields have other types, and its defaults."""
+    """Return a struct type derived from `shape`, in which some fields have other types but equal defaults."""
     assert isinstance(shape, type)
     defaults = {one.name: one.default for one in msgspec.structs.fields(shape)}
     given = [

@@ -234,7 +234,7 @@ parser."""
 class _FastLoader(_Loader):
     """Loads a text with the parser of libyaml, which takes a tenth of the time of PyYAML's own parser.
 
-    Raises ImportError where PyYAML was built without libyaml.
+    Raises ImportError if PyYAML was built without libyaml.
     """
 
     def __init__(self, text: str) -> None:
@@ -279,7 +279,7 @@ def read_text(path: Path, packaged: bool = True) -> str:
     """
     try:
         with path.open(encoding="utf-8") as file:
-            text = file.read(_LONGEST + 1)  # a device may have no end
+            text = file.read(_LONGEST + 1)  # a device file may be endless
     except FileNotFoundError as error:
         missing = no_such_file() if packaged else "no such file; check the path"
         raise UnreadConfigError(str(path), f"cannot be read: {missing}") from error
@@ -562,7 +562,7 @@ def _unit_hint(dotted: str, value: Any, message: str) -> str:
 
 
 def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
-    """Suggest a name for an unknown key of the msgspec struct at `path`, first one that begins with it."""
+    """Suggest a known key for the unknown `key` of the struct at `path`, if possible one that extends it."""
     for step in re.findall(r"\.([^.\[]+)", path):
         fields = {f.encode_name: f.type for f in msgspec.structs.fields(shape)}
         tree = tree.get(step) if isinstance(tree, dict) else None

@@ -585,7 +585,7 @@ def _check_body(document: Document) -> None:
 def _replace_unit(document: Document) -> None:
     """Use the magnetometer as an inertial unit without a gyro if `inertial_unit` is `none`.
 
-    Raises ConfigError for a file whose `inertial_unit` is none, and which has no magnetometer.
+    Raises ConfigError if `inertial_unit` is `none` and no magnetometer is configured.
     """
     values = document.values
     if values.get("inertial_unit") is not None:

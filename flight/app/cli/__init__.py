@@ -109,8 +109,8 @@ class _Answer:
 def to_json(facts: Any) -> str:
     """Return the result of a command as one line of JSON, with numbers rounded to 15 digits.
 
-    Otherwise, times that are computed from integers in ns would be printed as 15.450000000000001. NaN and
-    infinity become null, because JSON supports neither.
+    Without rounding, times that are computed from integers in ns would be printed as 15.450000000000001. NaN
+    and infinity become null, because JSON supports neither.
     """
     text = json.dumps(_rounded(facts), allow_nan=False) + "\n"
     _Answer.made = True

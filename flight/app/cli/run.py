@@ -157,8 +157,8 @@ def _faults_help() -> str:
 REFUSED = 78
 """Exit status of a service whose configuration is wrong (EX_CONFIG of sysexits.h).
 
-The service manager restarts the service after any other failure. A shell that cannot start the service for a
-moment ends with status 2.
+The service manager restarts the service after any other failure. The status 2 of other usage errors is not
+used, because a shell that temporarily cannot start the service also ends with status 2.
 """
 
 
@@ -214,7 +214,7 @@ def _flown(options: argparse.Namespace) -> int:
 def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
     """Return a function that shows progress in one line of a terminal, or otherwise as a line every 10 s.
 
-    The line also names the function for whose compilation a first flight waits.
+    While a first flight waits for numba, the line names the function that numba compiles.
     """
     terminal = stream.isatty()
     period, before, after = (0.2, "\r\x1b[K", "") if terminal else (10.0, "", "\n")
