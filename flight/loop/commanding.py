@@ -97,7 +97,7 @@ class OnboardParameters:
             self._events.report(events.PARAMETERS_LEFT, now_ns, text)
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Load a table in place of the one with the CRC `replaced`; return why it is rejected, or ""."""
+        """Replace the table, which has the CRC `replaced`, by `values`; return why this is refused, or ""."""
         if replaced != self._crc:
             return f"the table in use has CRC {self._crc:08x}, not {replaced:08x}: dump and check it again"
         before = self._table.values if self._table.proven else self._table.before
