@@ -391,7 +391,7 @@ class AttitudeFilter:
     def command(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None = None, known: bool = True
     ) -> None:
-        """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes.
+        """Record the coil currents (3,), A, from `time_ns` on, and the field (3,), T, in reference axes.
 
         Commands must be recorded in order of time, each before the measurements that follow it. The default
         of `field` is the constant field of the body description. If `known` is false, the coils may carry
@@ -466,7 +466,7 @@ class AttitudeFilter:
             since_ns = self._check.judge(self._history.newest)
             if since_ns is not None:
                 self.mark_unknown(since_ns)
-        if self._branch is None:  # a branch needs its base
+        if self._branch is None:  # the base checkpoint of a branch must not be dropped
             self._history.forget(measurement.time_ns)
         return used
 

@@ -77,9 +77,9 @@ class MeanRateMeasurement:
 class DirectionMeasurement(_AtOneTime):
     """A direction observed from the body, such as the direction of the Sun or nadir.
 
-    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The component along
-    the direction of the `covariance` (3, 3) of `observed`, rad^2, is ignored. If horizon cameras observed the
-    Sun, `sun_cameras` is their bit mask, otherwise 0.
+    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The `covariance` (3,
+    3), rad^2, is that of `observed`; its component along the direction is ignored. If horizon cameras
+    observed the Sun, `sun_cameras` is their bit mask, otherwise 0.
     """
 
     time_ns: int

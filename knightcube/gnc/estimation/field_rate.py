@@ -73,8 +73,8 @@ class FieldRateSettings:
         refusals: number of consecutively rejected measurements after which the filter restarts (field
             measurements) or the gyro is excluded (gyro measurements).
         gyro_sigma: assumed bound of the gyro bias per axis, rad/s.
-        longest_gap: longest time, s, between the samples that start the filter, during which no fast spin can
-            remain undetected.
+        longest_gap: longest time between two of the samples that start the filter, s. It is so short that no
+            fast spin remains undetected.
     """
 
     inertia: FloatArray
@@ -252,7 +252,7 @@ class FieldRate:
             self._correct(weighed, innovation)
 
     def _restart_counted(self, exclude_gyro: bool) -> None:
-        """Restart and count it."""
+        """Restart the filter, and count the restart."""
         self.restart()
         self._is_reset = False
         self._gyro_refused = self._settings.refusals if exclude_gyro else 0
@@ -298,7 +298,7 @@ class FieldRate:
         (_, first), (span_a, middle), (span_b, last) = self._waiting
         self._waiting.pop(0)
         square = float(last @ last)
-        if min(span_a, span_b) <= 0.0 or square == 0.0:  # a field of zero is that of a failed sensor
+        if min(span_a, span_b) <= 0.0 or square == 0.0:  # a failed sensor may read zero
             return
         strength = math.sqrt(square)
         noise = settings.gate_sigma * math.sqrt(2.0) * settings.field_sigma

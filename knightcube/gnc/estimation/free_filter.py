@@ -209,8 +209,8 @@ class FreeFilterSettings:
             the solar radiation torque and of the constant torque are fixed fractions of `torque`.
         coil_noise: density of the white noise of each coil's dipole while it is driven, A m^2 sqrt(s).
         errors: largest errors of the description of body and sensors.
-        coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; for coils
-            along the body axes None, because their covariance follows from `errors`.
+        coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; None for
+            coils along the body axes, whose covariance follows from `errors`.
         roles: roles of the blocks whose role differs from the default, by name of the block.
         gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
             probable than a one-dimensional deviation of this size.
@@ -516,7 +516,7 @@ class FreeFilter:
             covariance[np.ix_(at, at)] = prior
 
     def _with(self, memories: Sequence[FreeMemory]) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield constants and covariance of the present estimate, and then of each copy of the estimate."""
+        """Yield constant states and covariance of the present estimate, and then of each of its copies."""
         yield self._constants, self.covariance
         for memory in memories:
             yield memory.constants, memory.covariance

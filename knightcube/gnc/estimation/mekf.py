@@ -198,7 +198,7 @@ def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
 
 
 class Correction(NamedTuple):
-    """The result of a correction, without changes of state and covariance if the measurement is rejected.
+    """The result of a correction; state and covariance are unchanged if the measurement is rejected.
 
     `square` is the normalised squared innovation, `spread` (k, k) is the covariance of the innovation, and
     the flag `used` is whether the measurement passed the gate.
@@ -513,7 +513,7 @@ class CommandHistory:
     def record(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True
     ) -> None:
-        """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes."""
+        """Record the coil currents (3,), A, from `time_ns` on, and the field (3,), T, in reference axes."""
         torquing = self._body.torquing(currents, field, known)
         if self._torquings[-1] == torquing:
             return
@@ -644,7 +644,7 @@ class PropagationModel:
         )
 
     def rate_change(self, state: FilterState, covariance: FloatArray, time_ns: int) -> RateChange:
-        """Return the change of the rate at the time of a gyro sample whose age is estimated."""
+        """Return the angular acceleration at the time of a gyro sample whose age is estimated."""
         half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
         first, last = self.commands.at(time_ns - half_ns), self.commands.at(time_ns + half_ns)
         return rate_change(self.body, state, covariance, first, last)
@@ -739,7 +739,7 @@ _TIME = attrgetter("time_ns")
 
 
 class CheckpointHistory:
-    """The checkpoints of the last `history_ns` nanoseconds, an empty history before the filter starts."""
+    """The checkpoints of the last `history_ns` nanoseconds; there are none before the filter starts."""
 
     def __init__(self, history_ns: int) -> None:
         self._history_ns = history_ns

@@ -460,7 +460,7 @@ def rate_change(
     """Return the angular acceleration at a gyro sample whose age is uncertain.
 
     The arguments `before` and `after` are the coil states at two times, which precede and follow the sample
-    by the standard deviation of its age. The two accelerations differ if a coil command begins or ends
+    by half the standard deviation of its age. The two accelerations differ if a coil command begins or ends
     between their times. Half the difference of the two accelerations, and the product of the errors of age
     and acceleration, are treated as noise.
     """
