@@ -42,8 +42,7 @@ _NEWTON_STEPS, _EXACT = 60, 1e-9
 """Largest number of Newton steps for limited currents, and accuracy of the resulting dipole moment as a
 fraction of the moment."""
 _SATURATED = 1e-4
-"""Ratio of the Newton matrix weight of a coil at its current limit to the weight of a coil below its
-limit."""
+"""Weight in the Newton matrix of a coil at its current limit, relative to a coil below its limit."""
 _WEAKEST = 0.15
 """Torque per unit current below which a torque direction is discarded, as a fraction of the largest torque
 per unit current of any direction. A torque in a discarded direction would need the full current, and scaling
@@ -197,7 +196,7 @@ class CoilMap:
         return held
 
     def linear_shares(self, used: BoolArray) -> FloatArray:
-        """Return the matrix (n, n) from any currents to the currents of least heat with equal dipole moment.
+        """Return the matrix (n, n) that maps currents to the currents of least heat with equal dipole moment.
 
         Only the coils marked in `used` (n,) carry the currents of least heat, which depend linearly on the
         given currents because current limits are ignored.

@@ -199,5 +199,5 @@ class Detumbler:
         self._rate = None
         if self._before is not None:
             span_ns = time_ns - self._before[0]
-            if span_ns < 2 * self._schedule.period_ns:  # without samples, the rate is unknown
+            if span_ns < 2 * self._schedule.period_ns:  # after longer gaps, the rate is unknown
                 self._rate = rate_across(self._before[1], field, span_ns * _SECOND)

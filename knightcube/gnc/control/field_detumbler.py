@@ -16,10 +16,10 @@ deviation of the rate across the field is below `BOUNDED`. The coils are switche
 accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
 
 The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
-obeys h' = m x B, where m is the dipole moment and B the field, with neither inertia nor attitude. By
-Pontryagin's principle, the dipole moment of minimum time has the maximum magnitude L and the direction of -B
-x y, where the costate y is a constant vector. The momentum can be reduced to at most r within the time T if
-and only if every vector y satisfies the inequality
+obeys h' = m x B, where m is the dipole moment and B the field. The equation contains neither the inertia nor
+the attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum magnitude L and the
+direction of -B x y, where the costate y is a constant vector. The momentum can be reduced to at most r within
+the time T if and only if every vector y satisfies the inequality
 
     h . y <= L (integral of |B x y| over the time T) + r |y|.
 
@@ -66,7 +66,7 @@ mean limit of the body axes."""
 STEEP = 12.0
 """Gain of the dipole moment: a coil reaches the dipole limit if |B x y| (field B, costate y) exceeds the mean
 of |B x y| divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would
-then reverse the coil currents wherever B x y is small."""
+then reverse the coil currents when B x y is small."""
 FLAT = 0.02
 """Lower bound of |B x y| (field B, costate y), as a fraction of the largest |B x y|, which keeps the weights
 of the iteration finite."""
@@ -324,7 +324,7 @@ class FieldDetumblerSettings:
 
     @property
     def instants(self) -> FloatArray:
-        """Times (n,) after the start of a plan at which the field is predicted, denser at the start, s."""
+        """Times (n,), s, after the start of a plan, at which the field is predicted; denser at the start."""
         return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
 
 

@@ -137,7 +137,7 @@ class SlewStart:
         quaternion, rate: attitude (4,) and body rate (3,), rad/s, at the first of `times`.
         times: equally spaced times (m,) of table and preview, s.
         kept: number of time steps in the pointing table.
-        inertia: (3, 3) kg m^2.
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
         areas: scaled areas (3,) of the body's faces, on which air and sunlight act.
@@ -450,7 +450,7 @@ class PointingJob:
 
     Attributes:
         origin_ns: time at which the orbit state, the attitude and the body rate are valid, ns.
-        inertia: (3, 3) kg m^2.
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         areas: scaled areas (3,) of the body's faces, on which air and sunlight act.
@@ -483,7 +483,7 @@ class PointingJob:
 
 def prepare() -> None:
     """Import the modules that plan slews, which the worker process does before its first job."""
-    from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
+    from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process does not need scipy
 
 
 def run(job: PointingJob) -> PointingTable | None:

@@ -55,7 +55,7 @@ class LinearErrorModel:
     """The linear model of the attitude and rate errors over n steps.
 
     Attributes:
-        transition: (n, 6, 6).
+        transition: transition matrices (n, 6, 6) of the errors.
         by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2.
         by_torque: change of the errors (n, 6, 3) per N m of torque in each axis.
         missing: torque f (n, 3) that the reference motion needs in addition to the modelled torques, N m.

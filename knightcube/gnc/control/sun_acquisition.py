@@ -214,7 +214,7 @@ class SunAcquisition:
         self._sun.measure(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the actual dipole moment (3,), A m^2, until the next command, if not as commanded."""
+        """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
