@@ -80,7 +80,7 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
     Raises:
         GeomagneticError: if the time is outside the years of the model, or if the position is farther than
             ten Earth radii from the Earth's centre, where the solar wind determines the field.
-        ArgumentError: if the position is not finite or lies deep within the Earth, for example in km.
+        ArgumentError: if the position is not finite, or lies deep within the Earth, as a position in km does.
     """
     at, date = _single_position(position), julian_date(time)
     _check_near_earth(math.hypot(*at.tolist()))
@@ -160,8 +160,8 @@ def sun_direction(
         velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
 
     Raises:
-        ArgumentError: if position or velocity is not finite, if the position lies deep within the Earth, for
-            example in km, except at its centre, or if the time is not in the years 1900 to 2099.
+        ArgumentError: if position or velocity is not finite, if the position lies deep within the Earth but
+            not at its centre (as a position in km does), or if the time is not in the years 1900 to 2099.
     """
     observer = finite_array("position", position, (3,))
     if observer.any():
@@ -180,8 +180,8 @@ def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conic
         shadow: shadow model, either "conical" with penumbra, or "cylindrical" with the values 0 and 1 only.
 
     Raises:
-        ArgumentError: if a position is not finite or lies deep within the Earth, for example in km, for a
-            time that is not in the years 1900 to 2099, and for an unknown shadow model.
+        ArgumentError: if a position is not finite or lies deep within the Earth (as a position in km does),
+            if the time is not in the years 1900 to 2099, or for an unknown shadow model.
     """
     at = _position(position)
     sun = -earth_from_sun(float(terrestrial_time(ephemeris_date("time", time))))[0]
@@ -267,12 +267,12 @@ def propagate_orbit(
     Args:
         position: (3,) initial position in ICRS axes, m.
         velocity: (3,) initial velocity in ICRS axes, m/s.
-        seconds: (n,) times relative to the initial state, in increasing or decreasing order, s, at most 30
+        seconds: (n,) times relative to the initial state, s, in increasing or decreasing order; at most 30
             days.
 
     Raises:
-        ArgumentError: if a value is not finite, if the orbit intersects the Earth, for example in km, or if a
-            time is more than 30 days from the initial state.
+        ArgumentError: if a value is not finite, if the orbit intersects the Earth (as a state in km does), or
+            if a time is more than 30 days from the initial state.
     """
     at, motion = _single_position(position), finite_array("velocity", velocity, (3,))
     lowest = _perigee(at, motion)
@@ -313,10 +313,10 @@ def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> 
     """Return positions (n, 3), m, and velocities (n, 3), m/s, in ICRS axes from a two-line element set.
 
     The propagator is SGP4. The position error of SGP4 is one to three kilometres near the epoch of the
-    elements. It grows by one to three kilometres per day, and with the square of the time by the unknown
-    drag. Elements are therefore useful for some days before and after their epoch. They are accepted up to a
-    standard deviation of 1,000 km, which is reached after about 5 days at a height of 300 km, two weeks at
-    400 km and two months at 800 km.
+    elements. It grows by one to three kilometres per day; the unknown drag adds an error that grows with the
+    square of the time. Elements are therefore useful for some days before and after their epoch. They are
+    accepted up to a standard deviation of 1,000 km, which is reached after about 5 days at a height of 300
+    km, two weeks at 400 km and two months at 800 km.
 
     Args:
         elements: the two lines of the element set.

@@ -211,8 +211,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
     The second derivative of the loss differs from the information matrix by at most sqrt(2 loss/total). If
     the loss is small, the information matrix is used as second derivative (Gauss-Newton method). The four
     stationary points of the loss are the eigenvectors of Davenport's matrix K, and only one stationary point
-    is a minimum. If the largest eigenvalue is double, as for mirrored directions, the minimum
-    is not unique.
+    is a minimum. If the largest eigenvalue is double, as for mirrored directions, the minimum is not unique.
 
     Raises AttitudeError if the iteration does not converge, or converges to a point that is not a minimum.
     """

@@ -213,7 +213,7 @@ class FieldAhead:
         return NODE_STEP * (len(self._fields) - 1)
 
     def _restart(self, state: OrbitState) -> float:
-        """Discard past nodes (all after a jump of the position); return the time (s) since the first node."""
+        """Discard past nodes, or all nodes after a jump; return the time (s) since the first node."""
         since = (state.julian_date - self._begin) * DAY
         fits = 0.0 <= since <= self._span
         if fits:

@@ -37,7 +37,7 @@ DAY = 86_400.0
 def julian_date(utc: datetime) -> float:
     """Return the Julian date UTC, days, of a `datetime`, which is in UTC unless it has a time zone.
 
-    Raises ArgumentError for another type.
+    Raises ArgumentError for an argument of another type.
     """
     if not isinstance(utc, datetime):
         raise ArgumentError("time", f"{utc!r}: give a datetime, such as datetime(2026, 11, 26, 12)")
@@ -52,7 +52,7 @@ FIRST_YEAR, LAST_YEAR = 1900, 2100
 def ephemeris_date(name: str, utc: datetime) -> float:
     """Return the Julian date UTC, days, of the argument `name`, at which the Sun's position is known.
 
-    Raises ArgumentError for another type than `datetime`, and for a time before 1900 or after 2099.
+    Raises ArgumentError if the argument is not a `datetime`, and for a time before 1900 or after 2099.
     """
     date = julian_date(utc)
     if not FIRST_YEAR <= utc.year < LAST_YEAR:
