@@ -95,7 +95,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if isinstance(address, tuple):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, address, data, timeout, to)
-    # The answer's socket is beside the flight's socket, because a flight as a service has no access to /tmp.
+    # A flight that runs as a service has no access to /tmp, but it can answer to a socket beside its own.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (

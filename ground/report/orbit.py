@@ -246,9 +246,9 @@ def dipole_errors(run: Run) -> dict[str, float]:
 
 
 def _judged_dipoles(run: Run) -> dict[str, FloatArray]:
-    """Return errors and true residual dipoles (n, 2, 3), A m^2, of the last ten minutes in each light.
+    """Return errors and true residual dipoles (n, 2, 3), A m^2, in sunlight and in shadow.
 
-    There is one row per second, and fewer rows if the flight was in sunlight or in shadow for a shorter time.
+    The rows are those of the last ten minutes in sunlight, or in shadow, one row per second.
     """
     packets, truth = run["navigation"], run["orbit_truth"]
     packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
