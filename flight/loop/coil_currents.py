@@ -460,6 +460,11 @@ class Evidence:
         """Return all predictions in order of time."""
         return [one for segment in self._segments for one in segment]
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether a coil was driven during any reading."""
+        return any(one.mean[:, 0].any() for one in self.readings())
+
     def monitor_gain(self, known: Mapping[int, CoilFault]) -> float | None:
         """Return the gain of a current monitor that measures all currents with a common error, or None.
 

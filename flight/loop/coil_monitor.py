@@ -13,11 +13,12 @@ is stuck. A coil is diagnosed as broken when the readings reject the hypothesis 
 hypotheses that explain the later readings concern this coil. Several axes remain possible if no axis or
 several axes are driven. The axes that remain possible are driven alone, one after another, by a small probe
 current. The other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil
-draws current. A reversed coil is detected from the angular acceleration, which also distinguishes a faulty
-current monitor from a broken coil. Averaged over longer bins, the acceleration reveals missing torque at
-currents that are too small for the current monitor. If torque is missing, a probe shows whether the coil is
-open. If one gain of the current monitor explains the readings while different coils are driven, the current
-monitor is considered faulty, and its later readings are divided by this gain.
+draws current. If all coils are at zero current after a suspicion, they are probed too, because their drives
+may be too short for a diagnosis. A reversed coil is detected from the angular acceleration, which also
+distinguishes a faulty current monitor from a broken coil. Averaged over longer bins, the acceleration reveals
+missing torque at currents that are too small for the current monitor. If torque is missing, a probe shows
+whether the coil is open. If one gain of the current monitor explains the readings while different coils are
+driven, the current monitor is considered faulty, and its later readings are divided by this gain.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -260,6 +261,11 @@ class Probe:
         self._tried.add(axis)
         self._running = (axis, now_ns)
         return now_ns + 2 * self._half_ns
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether an axis was tried since the last suspicion."""
+        return bool(self._tried)
 
     def stop(self) -> None:
         """End the square wave and consider all axes untried."""
@@ -683,13 +689,18 @@ class CoilMonitor:
         if len(evidence) < _EVIDENCE:
             return
         left = evidence.possible_faults(self._known)
+        waited = now_ns >= self._judge_ns
         if evidence.is_normal_again(self._known, left):
+            # Coils that have been at zero current since the suspicion are probed, unless no probe is applied.
+            if not evidence.is_driven and not (self._probe.has_begun and waited):
+                if not self._probe.has_begun:
+                    self._look_further({axis for axis, _ in left}, now_ns)
+                return
             if (gain := evidence.monitor_gain(self._known)) is not None:
                 self._doubt_monitor("", gain, now_ns)
             self._reset()
             return
         axes = {axis for axis, _ in left}
-        waited = now_ns >= self._judge_ns
         if self._compared is not None:
             if waited:
                 self._conclude(*self._compared, now_ns)

@@ -84,6 +84,41 @@ def test_after_a_fault_that_ends_all_coils_are_used_and_not_suspected() -> None:
     assert seen.watch.probe is None
 
 
+def pulses(time: float, _: ImuReading) -> FloatArray:
+    """Return -60 mA in coil y for 0.8 s, followed by a pause of 2.2 s."""
+    return np.array([0.0, -0.06 if time % 3.0 < 0.8 else 0.0, 0.0])
+
+
+def test_a_leg_that_is_needed_only_in_short_pulses_is_found_by_the_probe_in_a_pause() -> None:
+    """A suspicion at the end of a pulse is followed by probes, although the coils are at zero current."""
+    seen = observe(pulses, FAULT_AT + 12.0, [f"bridge-y: b-low @ {FAULT_AT}"], monitor_only=True)
+    ((when, axis, name),) = seen.found
+    assert (axis, name) == ("y", "B_LOW")
+    assert FAULT_AT < when < FAULT_AT + 9.0
+
+
+def test_healthy_coils_in_short_pulses_are_neither_suspected_nor_probed() -> None:
+    seen = observe(pulses, 20.0, monitor_only=True)
+    assert seen.found == []
+    assert seen.suspicious == 0
+
+
+def test_a_suspicion_of_coils_at_zero_ends_if_no_probe_is_applied() -> None:
+    """A suspicion of coils at zero current ends after the probe, also if another mode commands zero."""
+    watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
+    suspicious = []
+    for cycle in range(40 * 6):
+        time = 0.025 * cycle
+        driven = time < 1.9
+        watch.commanded(round(time * 1e9), np.array([0.0, -0.06 if driven else 0.0, 0.0]))
+        if cycle % 8 == 0:
+            watch.measured(reading(time, 0.06 if time < 1.2 else 0.0))
+        suspicious.append(bool(watch.suspicion))
+    assert any(suspicious)
+    assert not any(suspicious[40 * 5 :])
+    assert watch.verdicts == ()
+
+
 def _alone(axis: int, current: float) -> Predicted:
     """Return a sample of the supply current (A) while only one axis is commanded, to 40 mA."""
     commands = np.zeros((12, 3))
