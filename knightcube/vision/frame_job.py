@@ -373,11 +373,11 @@ def found_in_image(
     """Return the solution of an image (rows, columns), and the lens parameters estimated up to this image.
 
     The image has integers or floating-point numbers, which are converted to counts. If the image shows no
-    stars because it is overexposed, or because all its pixels are equal, the reason states this.
-    The scale is the lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for
-    a calibrated camera. Stars are first searched near the positions predicted by `attitude_prior`. The
-    predicted rate determines the sense of the rotation, which a single frame does not show. The parameters
-    `lens` are estimated from earlier images of the camera, or None if they are not estimated.
+    stars because it is overexposed, or because all its pixels are equal, the reason states this. The scale is
+    the lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for a calibrated
+    camera. Stars are first searched near the positions predicted by `attitude_prior`. The predicted rate
+    determines the sense of the rotation, which a single frame of a global shutter does not show. The
+    parameters `lens` are estimated from earlier images of the camera, or None if they are not estimated.
     """
     pixels, unit, zero = raw_counts(pixels)
     if unit != 1.0 or zero != 0.0:

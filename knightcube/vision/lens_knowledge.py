@@ -496,7 +496,8 @@ class LensKnowledge:
         """Return an estimate that starts from stored values (7,) of LEARNED and their covariance (7, 7).
 
         Since the values were stored, each may have changed by the fraction `changed` of its configured
-        standard deviation. Returns None if values differ by five configured standard deviations.
+        standard deviation. Returns None if a value differs from the configuration by more than five
+        configured standard deviations, or if there are not seven values.
         """
         if values.shape != _AT.shape:
             return None

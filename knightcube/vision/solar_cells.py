@@ -290,7 +290,7 @@ class FieldAndStrings:
         self.wrong = ""
 
     def forget(self) -> None:
-        """Mark all rotations about the field as possible, after the body has rotated without gyro data."""
+        """Mark all rotations about the field as possible, for instance after a rotation without gyro data."""
         self._base = None
         self._against[:] = 0.0
 

@@ -117,7 +117,8 @@ class StarSolution:
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
             is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
-        rate_sign_known: whether the sign of `rate` is known, which requires a predicted rate.
+        rate_sign_known: whether the sign of `rate` is known. For a global shutter, the sign is known only
+            from a predicted rate.
         sky_map: conversion between pixels of the image and ICRS directions, or None if the image was not
             solved.
         frame: all results of the star tracker, including the points that are not catalogue stars. Attitude

@@ -629,11 +629,12 @@ class CameraChoice:
 
 
 def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[CameraChoice]:
-    """Return the cameras in the order in which they are read for the Sun, or none if the Sun is not visible.
+    """Return the cameras in the order in which they are read, or none if no solar string is lit by the Sun.
 
     Cameras with the coarse Sun direction in their field of view come first, followed by cameras that may have
     the Sun in their field of view. Each group of cameras is sorted by the angle between boresight and coarse
-    Sun direction. Without a coarse Sun direction, all cameras are possible, in their given order.
+    Sun direction. If some strings are lit but give no coarse Sun direction, all cameras are possible, in
+    their given order.
     """
     if sun.direction is None or sun.basis is None or sun.tangent_covariance is None:
         if sun.status is CoarseSunStatus.DARK:

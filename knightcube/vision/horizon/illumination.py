@@ -322,7 +322,7 @@ def _sample_indices(size: int) -> IntArray:
 
 @lru_cache(maxsize=8)
 def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
-    """Return a mask of the samples that the lens images, and the unit vectors (m, 3) of these samples."""
+    """Return unit vectors (m, 3) to the samples that the lens images, and the mask (64,) of these samples."""
     x, y = np.meshgrid(_sample_indices(lens.columns), _sample_indices(lens.rows), indexing="ij")
     rays = lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
     imaged = np.isfinite(rays[:, 0])

@@ -300,8 +300,8 @@ _FARTHEST = 2.0
 def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detections:
     """Return the sources of a frame (rows, columns), the brightest first.
 
-    The attribute `Detections.stars` of the result marks the sources that are stars. Raises ValueError unless
-    the pixels are finite real numbers and the frame has at least 16 x 16 pixels.
+    The method `Detections.stars` of the result returns the sources that may be stars. Raises ValueError
+    unless the pixels are finite real numbers and the frame has at least 16 x 16 pixels.
     """
     return measure_areas(survey(pixels, settings))
 

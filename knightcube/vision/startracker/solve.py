@@ -59,7 +59,8 @@ class FrameSolution:
     """The attitude of one frame at mid-exposure, and the rate if the stars are streaks.
 
     Attributes:
-        status: outcome of the frame. The attributes from `star` on are valid only for the status SOLVED.
+        status: outcome of the frame. The attributes from `star` on, except `motion`, are valid only for the
+            status SOLVED.
         reason: why the frame was not solved, in one sentence; empty if it was solved.
         kind: whether the frame shows points or streaks.
         camera: camera model, with the fitted focal length if the focal length was free.

@@ -174,7 +174,7 @@ def correlation_of(smooth: float, single: float) -> float:
 def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
     """Return which noise values (n,) are unreliable because of clipping at zero counts or quantisation.
 
-    `reach` (n,) is the distance from the median to the lower 2.3rd percentile, counts.
+    `reach` (n,) is the distance from the median to the 2.3rd percentile, counts.
     """
     return np.asarray((reach < 2.0 * _CUT_OFF * noise) | (noise < _HIDDEN))
 
@@ -416,7 +416,7 @@ class DetectionSettings:
             eq. (12) to (21)), and the other methods weight the pixels of the window (`measurement`).
         threshold_sigmas: minimum height of a peak in the smoothed frame, in standard deviations of its noise.
         most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame's area
-            contributes at most a quarter of `most_stars`.
+            contributes at most three eighths of `most_stars`, or four stars if this is more.
         psf_sigma: standard deviation of the PSF, px. If `psf_sigma` is None, it is measured in the frame,
             which needs several stars. For tracking windows with few stars, `psf_sigma` should be stated.
         gain: electrons per count, or None to measure the gain from the residuals of the stars.
