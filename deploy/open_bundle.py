@@ -239,6 +239,9 @@ def main(words: Sequence[str]) -> int:
         else:
             before = accepted_text(Path(present)) if kind in _VALUES else ""
             write_set(renewed_text(kind, artefact, before, kept, facts["sha256"]), place / "set")
+    except FileExistsError as error:
+        sys.stderr.write(f"{error.filename} exists: give a new folder, or delete the files of the attempt\n")
+        return 1
     except (Refused, OSError) as error:
         sys.stderr.write(f"{str(error).splitlines()[0]}\n")
         return 1

@@ -270,6 +270,14 @@ def test_the_program_of_the_board_states_its_arguments(capsys: pytest.CaptureFix
     assert "TRUSTED ROOT BUNDLE KIND FOLDER" in capsys.readouterr().err
 
 
+def test_a_folder_of_an_earlier_attempt_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    used = tmp_path / "unpacked/metadata"
+    used.mkdir(parents=True)
+    words = [str(tmp_path / name) for name in ("trusted", "root", "bundle")]
+    assert script("open_bundle").main([*words, "release", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.startswith(f"{used} exists: give a new folder")
+
+
 def test_a_bundle_that_cannot_be_written_does_not_use_up_a_version(signing: Path, tmp_path: Path) -> None:
     source = _sources(tmp_path / "source", "0.2.0")
     (source / "README.md").write_bytes(Random(1).randbytes(300_000))
