@@ -80,8 +80,11 @@ class PySerialPort:
         try:
             self._serial = self._open()
         except _PORT_ERRORS as error:
+            # The text of pyserial's exceptions repeats the device and the error number.
+            number = error.errno if isinstance(error, OSError) else None
+            reason = os.strerror(number) if number else str(error)
             self._failure = (
-                f"cannot be opened at {baud_rate} baud ({error}): is the device plugged in, the name right, "
+                f"cannot be opened at {baud_rate} baud ({reason}): is the device plugged in, the name right, "
                 "the port free, and may this user open it (group dialout)?"
             )
             if not patient:

@@ -216,7 +216,8 @@ def test_closing_ends_the_thread_that_waits_for_data(monkeypatch: pytest.MonkeyP
 
 
 def test_a_port_that_is_not_there_is_named() -> None:
-    with pytest.raises(NotResponding, match=r"/dev/no-such-port: cannot be opened at 115200 baud"):
+    text = r"/dev/no-such-port: cannot be opened at 115200 baud \(No such file or directory\): "
+    with pytest.raises(NotResponding, match=text):
         PySerialPort("/dev/no-such-port", 115200, SystemClock())
 
 
