@@ -463,14 +463,21 @@ def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
 
 
 def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: ExitStack) -> Supervision:
-    """Connect the supervisors, and raise the priority of the control loop and the coil driver."""
+    """Connect the supervisors, and raise the priority of the control loop and the coil driver.
+
+    Raises ConfigError if the coil driver runs no periodic job, whose runs the heartbeats depend on.
+    """
+    coils = next((ticker for ticker in clock.tickers if ticker.name == COILS), None)
+    if coils is None:
+        raise ConfigError(
+            "coils.driver", f"runs no ticker {COILS!r}: its method `start` must start one (docs/extending)"
+        )
     overseer = ServiceManager(os.environ, os.getpid())
     stack.callback(overseer.close)
     first = [thread for thread in threading.enumerate() if thread.name == COILS]
     obtained = system.obtain([0, *(thread.native_id or 0 for thread in first)], CONTROL_PRIORITY)
     stack.callback(system.relinquish)
     stack.callback(overseer.stopping)
-    coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
 
     stack.callback(gc.enable)
     collector = clock.ticker("garbage", _COLLECT_NS, Collector())

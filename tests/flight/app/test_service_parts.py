@@ -18,6 +18,7 @@ from flight.app.service import Collector, EndingSignals, FlownRelease, Supervisi
 from flight.link import events
 from flight.link.files.store import line_of, to_record
 from flight.loop.state import LinuxFiles
+from flight.schema.document import ConfigError
 from hal.interfaces.guardian import GuardianNews
 
 MS = 1_000_000
@@ -194,6 +195,12 @@ def test_heartbeats_pass_while_the_job_of_the_coils_is_served() -> None:
     assert bench.done == ["beat", "settled", "ready flying"]
     bench.supervision.beat()
     assert bench.done == ["beat", "settled", "ready flying", "beat"], "ready once"
+
+
+def test_a_coil_driver_without_a_periodic_job_is_refused() -> None:
+    clock = SimpleNamespace(tickers=[SimpleNamespace(name="imu")])
+    with ExitStack() as stack, pytest.raises(ConfigError, match=r"coils\.driver: runs no ticker 'coils'"):
+        service.supervise(cast(Any, None), cast(Any, clock), cast(Any, None), stack)
 
 
 def test_the_guardians_news_and_notes_of_the_start_become_events() -> None:
