@@ -61,6 +61,9 @@ _BAD_STAGES = frozenset({Stage.REFUSED, Stage.FAILED})
 class PacketSource(Protocol):
     """A source of the packets of a flight, such as its log or its link."""
 
+    behind: bool
+    """Whether the last call of `new` returned only a part of the packets that are available."""
+
     @property
     def silence(self) -> float:
         """Time (s) since the last packet."""
@@ -70,6 +73,10 @@ class PacketSource(Protocol):
 
         Raises KnightCubeError or UsageError.
         """
+
+
+_PORTION = 1 << 26
+"""Number of bytes of a log after which a call of `LogTail.new` returns the packets that it has read."""
 
 
 class LogTail:
@@ -90,6 +97,7 @@ class LogTail:
         self._begins = is_first(segments[0])
         self._offset = 0
         self._rest = b""
+        self.behind = False
         self._bytes = self._outside = self._missing = self._others = self._packets = 0
         try:
             age = max(0.0, time.time() - segments[-1].stat().st_mtime)
@@ -99,20 +107,28 @@ class LogTail:
 
     @property
     def silence(self) -> float:
-        """Time (s) since the log last grew, initially from the modification time of its file."""
-        return time.monotonic() - self._grew
+        """Time (s) since the log last grew, initially from the modification time of its file.
+
+        While the reader is behind the end of the log, the time is zero.
+        """
+        return 0.0 if self.behind else time.monotonic() - self._grew
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets that were written since the last call, by name. Raises UsageError."""
-        data = self._rest + self._read()
-        while (following := self._following()) is not None:
+        """Return the packets that were written since the last call, by name. Raises UsageError.
+
+        A long log is returned in portions by several calls, and `behind` is true until its end is reached.
+        """
+        # After an error, the bytes that were already read remain in `_rest`.
+        self._rest += self._read()
+        while len(self._rest) < _PORTION and (following := self._following()) is not None:
             # The old segment is complete now, but its last packets may have been written after the last read.
-            data += self._read()
+            self._rest += self._read()
             self._path, self._offset = following, 0
-            data += self._read()
-        found = scan(data, self._begins)
+            self._rest += self._read()
+        self.behind = len(self._rest) >= _PORTION
+        found = scan(self._rest, self._begins)
         self._begins = self._begins and not found.counts
-        self._rest = data[len(data) - found.truncated_bytes :] if found.truncated_bytes else b""
+        self._rest = self._rest[found.total_bytes - found.truncated_bytes :]
         self._bytes += found.total_bytes - found.truncated_bytes
         self._outside += found.skipped_bytes
         self._missing += sum(found.missing.values())
@@ -138,12 +154,12 @@ class LogTail:
         try:
             with self._path.open("rb") as file:
                 file.seek(self._offset)
-                data = file.read()
+                data = file.read(_PORTION)
         except FileNotFoundError:  # the segment was deleted because the log was too large
             data = b""
         except OSError as error:
             raise UsageError(f"{self._path}: cannot be read: {reason_of(error)}") from error
-        if data and self._offset:
+        if data and self._offset and not self.behind:
             self._grew = time.monotonic()
         self._offset += len(data)
         return data

@@ -159,7 +159,7 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
     if options.json or options.once:
         state.update(tail.new())
         until = time.monotonic() + wait
-        while not {"attitude", "health"} <= state.newest.keys() and time.monotonic() < until:
+        while tail.behind or (not {"attitude", "health"} <= state.newest.keys() and time.monotonic() < until):
             state.update(tail.new())
         # The link process also sends packets of its own, which do not show that a flight is in progress.
         if not state.newest or (by_link and not state.mode):

@@ -208,6 +208,8 @@ class LinkFeed:
         restarts: number of restarts of the flight that the packets have shown.
     """
 
+    behind = False
+
     def __init__(self, terminal: Terminal) -> None:
         self._terminal = terminal
         self.lock = threading.Lock()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import json
 import os
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +36,7 @@ from flight.link.telemetry.definitions import (
 )
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
+from ground import watch
 from ground.commands import station
 from ground.telemetry import read_run, scan
 from ground.watch import (
@@ -412,6 +415,52 @@ def test_a_segment_that_is_dropped_meanwhile_is_passed_over(run: Path, tmp_path:
     assert len(tail.new()["control"]) == 61
 
 
+def test_a_long_log_is_read_in_portions(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = (run / "flight-0001.ccsds").read_bytes()
+    for number, begin in enumerate(range(0, len(data), 7000)):
+        path = tmp_path / f"flight-{number + 1:04}.ccsds"
+        path.write_bytes(data[begin : begin + 7000])
+        os.utime(path, (time.time() - 500.0,) * 2)
+    monkeypatch.setattr(watch, "_PORTION", 5000)
+    tail = LogTail(tmp_path)
+    counts: list[int] = []
+    while tail.behind or not counts:
+        counts.append(sum(map(len, tail.new().values())))
+        assert tail.behind == (tail.silence < 100.0)
+    assert sum(counts) == sum(read_run(run).flight.counts.values())
+    assert len(counts) > 2
+    assert not tail.problem
+    monkeypatch.setattr(station, "_READ_S", 0.0)
+    for once in (True, False):
+        options = argparse.Namespace(once=once, json=False, link=None, plain=True, every=1.0, patience=60.0)
+        assert station._watch(options, LogTail(tmp_path), 0.0, "") == (0 if once else 1)
+        assert "6.000 s" in capsys.readouterr().out, "the whole log was read"
+
+
+def test_an_error_of_the_disk_loses_no_packet(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = (run / "flight-0001.ccsds").read_bytes()
+    (tmp_path / "flight-0001.ccsds").write_bytes(data[:5000])
+    (tmp_path / "flight-0002.ccsds").write_bytes(data[5000:])
+    tail, segments = LogTail(tmp_path), tmp_path / "flight-0002.ccsds"
+    with monkeypatch.context() as patch:
+        opened = Path.open
+
+        def failing(path: Path, *arguments: Any) -> Any:
+            if path == segments:
+                raise OSError(errno.EIO, "Input/output error")
+            return opened(path, *arguments)
+
+        patch.setattr(Path, "open", failing)
+        with pytest.raises(UsageError, match="cannot be read"):
+            tail.new()
+    assert sum(map(len, tail.new().values())) == sum(read_run(run).flight.counts.values())
+    assert not tail.problem
+
+
 def test_silence_is_counted_from_the_last_byte_and_of_an_old_log_from_its_file(
     run: Path, tmp_path: Path
 ) -> None:
@@ -440,6 +489,7 @@ class Portions:
 
     silence = 0.0
     restarts = 0
+    behind = False
 
     def __init__(self, *portions: bytes) -> None:
         self.left = list(portions)

@@ -239,7 +239,7 @@ def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path)
     """Packets that the link itself sends once a second do not count as packets of the flight."""
 
     class Feed:
-        silence, restarts = 0.0, 0
+        silence, restarts, behind = 0.0, 0, False
         came: tuple[str, ...] = ("link", "verification")
 
         def new(self) -> dict[str, PacketArray]:
@@ -270,7 +270,7 @@ def test_what_is_shown_live_is_whole(folder: Path) -> None:
     """
 
     class Feed:
-        silence, restarts = 0.0, 0
+        silence, restarts, behind = 0.0, 0, False
         came: tuple[tuple[str, int], ...] = ()
 
         def new(self) -> dict[str, PacketArray]:
