@@ -327,7 +327,7 @@ class _Pages:
     async def series(self, request: web.Request) -> web.StreamResponse:
         """Answer the query ?packet=&field=&component=&from=&to= (s) &points= with a field's values over time.
 
-        With points=0 the answer contains every value in the time span, up to a million values.
+        With points=0 the answer contains every value in the time span; more than a million are refused.
         """
         name, column = request.query.get("packet", ""), request.query.get("field", "")
         if name not in LAYOUTS or column not in (LAYOUTS[name].dtype.names or ()):
@@ -338,9 +338,15 @@ class _Pages:
             raise UsageError(f"{name}.{column}[{component}]: no such component")
         span = (int(_real(request, "from") * 1e9), int(_real(request, "to") * 1e9))
         points = _whole(request, "points", 1000)
+        history = self._console.history
+        count = history.count(name, span[1]) - history.count(name, span[0] - 1)
+        if not points and count > _MOST_EXPORTED:
+            raise UsageError(
+                f"{count} values: a table has at most {_MOST_EXPORTED}: zoom to a shorter span, or write the "
+                "whole run with `knightcube export RUN`"
+            )
         points = min(max(points, 2), _MAX_POINTS) if points else _MOST_EXPORTED
-        series = self._console.history.series
-        times, values = await asyncio.to_thread(series, name, column, component, span, points)
+        times, values = await asyncio.to_thread(history.series, name, column, component, span, points)
         finite = [value if abs(value) < float("inf") else None for value in values.tolist()]
         return web.json_response({"times": times.tolist(), "values": finite})
 

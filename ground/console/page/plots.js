@@ -1,4 +1,5 @@
 // Plots with history. Each plot asks the console for its span of time; peaks are kept when values are reduced.
+import { say } from "/page/commands.js";
 import { colour } from "/page/theme.js";
 import { rounded, shownUnit } from "/page/values.js";
 
@@ -86,6 +87,7 @@ class Panel {
     Object.assign(this, { plots, fields, plot: null });
     this.title = make("h3", {});
     this.note = make("span", { className: "limits" });
+    this.trouble = make("span", {});
     const adder = make("input", { placeholder: "+ parameter", autocomplete: "off" });
     adder.setAttribute("list", "parameters");
     adder.setAttribute("aria-label", "add a parameter to this plot");
@@ -96,7 +98,7 @@ class Panel {
     const button = (text, title, action) => make("button", { type: "button", textContent: text, title, onclick: action });
     this.box = make("section", { className: "panel" }, make("header", {}, this.title, make("span", { className: "tools" }, adder,
       button("CSV", "every value of the span that is shown", () => this.saveTable()), button("PNG", "picture of this plot", () => this.savePicture()),
-      button("×", "remove this plot", () => plots.remove(this)))), this.note);
+      button("×", "remove this plot", () => plots.remove(this)))), this.note, this.trouble);
     this.box.querySelector(".tools button:last-child").setAttribute("aria-label", "remove this plot");
     this.arrange();
   }
@@ -121,6 +123,7 @@ class Panel {
     const asked = this.curves.map(async ({ field, component }) => {
       const query = new URLSearchParams({ packet: field.packet, field: field.column, component, from, to, points });
       const answer = await (await fetch(`/api/series?${query}`)).json();
+      if (answer.error && !points) throw new Error(answer.error);
       return [answer.times ?? [], (answer.values ?? []).map((value) => (value === null ? null : value * field.factor))];
     });
     return uPlot.join(await Promise.all(asked));
@@ -203,7 +206,9 @@ class Panel {
   fileName(kind) { return `${this.plots.table.name}_${this.fields.map(({ name }) => name).join("_")}.${kind}`.replace(/[^A-Za-z0-9_.-]/g, "_"); }
 
   async saveTable() {
-    const data = await this.series(...this.extent, 0);
+    let data;
+    try { data = await this.series(...this.extent, 0); } catch (error) { say(this.trouble, error.message, "error"); return; }
+    say(this.trouble, "");
     const heads = this.curves.map(({ field, component }) => [field.name, field.components[component]].filter(Boolean).join(".") + (field.shown ? ` [${field.shown}]` : ""));
     const lines = [["time [s]", ...heads].join(",")];
     for (let row = 0; row < data[0].length; row++) lines.push(data.map((column) => column[row] ?? "").join(","));

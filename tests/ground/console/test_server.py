@@ -22,6 +22,7 @@ from flight.link.commands import COMMANDS, POINT, Command, crc_of
 from flight.link.events import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
+from ground.console import server
 from ground.console.commanding import CommandForms, RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console
@@ -200,6 +201,16 @@ def test_a_wrong_question_is_answered_in_words(folder: Path, query: str, complai
     status, answer = get(folder, f"/api/series?{query}")
     assert status == 400
     assert complaint in answer["error"]
+
+
+def test_a_table_that_would_be_too_long_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = "/api/series?packet=control&field=path_q2&from=0&to=1000"
+    everything = get(folder, f"{query}&points=0")[1]
+    monkeypatch.setattr(server, "_MOST_EXPORTED", len(everything["values"]) - 1)
+    status, answer = get(folder, f"{query}&points=0")
+    assert status == 400
+    assert f"{len(everything['values'])} values: a table has at most" in answer["error"]
+    assert get(folder, query)[0] == 200, "a plot shows minima and maxima"
 
 
 def test_the_reader_is_pushed_the_newest_and_then_a_moment_of_the_past(folder: Path) -> None:
