@@ -300,6 +300,7 @@ class ObjectTracker:
         self._settings = settings
         self._gate = bound(settings.missed, 2)
         self._tracks: list[Track] = []
+        self._newest_ns: int | None = None
         self._confirmed = 0
 
     @property
@@ -315,14 +316,17 @@ class ObjectTracker:
         return None
 
     def clear(self) -> None:
-        """Delete all tracks."""
-        self._tracks = []
+        """Delete all tracks; the next frame may have any time."""
+        self._tracks, self._newest_ns = [], None
 
     def ingest(self, frame: FrameSightings) -> tuple[list[Track], list[Track]]:
         """Process a frame, and return the newly confirmed tracks and the confirmed tracks that ended.
 
-        Raises ValueError for a frame older than the previous frame.
+        Raises ValueError, without any change of the tracks, for a frame that is not later than the previous
+        frame. Two frames of the same time may be the same exposure, whose errors would count as independent.
         """
+        if self._newest_ns is not None and frame.time_ns <= self._newest_ns:
+            raise ValueError(f"time_ns is {frame.time_ns}: it must be after {self._newest_ns}")
         motion = self._settings.motion
         tide = None if frame.observer is None else tides(frame.observer)
         tracks = [
@@ -354,7 +358,7 @@ class ObjectTracker:
         alive += self._new_tracks(
             frame, spread, set(taken.values()), self._settings.maximum_tracks - len(alive)
         )
-        self._tracks = alive
+        self._tracks, self._newest_ns = alive, frame.time_ns
         return confirmed, ended
 
     def _associated(self, tracks: list[Track], frame: FrameSightings, spread: FloatArray) -> dict[int, int]:

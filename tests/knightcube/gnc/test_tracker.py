@@ -228,10 +228,14 @@ def test_noise_and_stars_that_no_catalogue_has_make_no_track_in_100_frames() -> 
         assert not confirmed
 
 
-def test_a_frame_older_than_the_last_is_refused() -> None:
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("time", [4.0, 5.0])
+def test_a_frame_that_is_not_later_than_the_last_is_refused(time: float, count: int) -> None:
     rng = np.random.default_rng(7)
     tracker = ObjectTracker(TrackSettings())
     one = np.array([[0.0, 0.0, 1.0]])
-    tracker.ingest(sightings(rng, 5.0, one, _SIGMA, _ATTITUDE))
-    with pytest.raises(ValueError, match="must not be before"):
-        tracker.ingest(sightings(rng, 4.0, one, _SIGMA, _ATTITUDE))
+    tracker.ingest(sightings(rng, 5.0, one[:count], _SIGMA, _ATTITUDE))
+    with pytest.raises(ValueError, match="must be after 5000000000"):
+        tracker.ingest(sightings(rng, time, one, _SIGMA, _ATTITUDE))
+    tracker.clear()
+    tracker.ingest(sightings(rng, time, one, _SIGMA, _ATTITUDE))
