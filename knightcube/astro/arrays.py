@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -75,9 +75,27 @@ def real_number(value: npt.ArrayLike) -> float:
 
 
 def check_type(name: str, value: object, kind: type[object]) -> None:
-    """Raise ArgumentError unless the argument `name` of a public function is an object of a class."""
+    """Raise ArgumentError unless the argument `name` of a public function is an object of a class.
+
+    The whole numbers of a dataclass are checked too (`check_whole`).
+    """
     if not isinstance(value, kind):
         raise ArgumentError(name, f"{value!r}: give an object of the class {kind.__name__}")
+    if is_dataclass(value):
+        check_whole(value, f"{name}.")
+
+
+def check_whole(settings: Any, prefix: str = "") -> None:
+    """Raise ArgumentError unless the fields of a dataclass that are annotated as int are whole numbers.
+
+    Dataclasses that are values of fields are also checked. The text `prefix` precedes the names.
+    """
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if field.type == "int" and not isinstance(value, (int, np.integer)):
+            raise ArgumentError(prefix + field.name, f"{value!r}: give a whole number")
+        if is_dataclass(value):
+            check_whole(value, f"{prefix}{field.name}.")
 
 
 _UNIT = 1e-12

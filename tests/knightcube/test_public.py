@@ -36,9 +36,13 @@ from knightcube import (
 from knightcube.vision.horizon import settings
 from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement
 from knightcube.vision.objects.detect import DetectedObjects, SpaceObject
+from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
-from knightcube.vision.sun import SunMeasurement, SunSolution, SunStatus
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings
+from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
+from knightcube.vision.sun import SunMeasurement, SunSettings, SunSolution, SunStatus
 
 # Without types, so that arguments of other types can be tested.
 LIB: Any = knightcube
@@ -251,6 +255,42 @@ SLEW: dict[str, Any] = {
 def test_an_argument_of_another_type_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda value: SunSettings(stride=value), "stride"),
+        (lambda value: settings.EdgeSettings(run=value), "run"),
+        (lambda value: settings.HorizonSettings(tries=value), "tries"),
+        (
+            lambda value: LIB.detect_objects(
+                IMAGE, CAMERA, [0, 0, 1], 1.0, ObjectSettings(most_points=value)
+            ),
+            "settings.most_points",
+        ),
+        (
+            lambda value: LIB.estimate_rate(
+                IMAGE, CAMERA, 1.0, settings=LikelihoodSettings(most_stars=value)
+            ),
+            "settings.most_stars",
+        ),
+        (
+            lambda value: StarTracker(
+                settings=SolveSettings(identification=IdentificationSettings(work=value))
+            ),
+            "settings.identification.work",
+        ),
+        (
+            lambda value: StarTracker(settings=SolveSettings(detection=DetectionSettings(window=value))),
+            "settings.detection.window",
+        ),
+    ],
+)
+def test_a_setting_that_must_be_a_whole_number_is_named(call: Callable[[Any], object], name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"^{name}: 7.5: give a whole number"):
+        call(7.5)
+    call(np.int64(7))
 
 
 def test_a_roll_that_is_rounded_to_a_revolution_is_shown_as_zero() -> None:

@@ -15,6 +15,7 @@ from knightcube.astro.arrays import (
     FloatArray,
     Image,
     check_type,
+    check_whole,
     checked_deviation,
     finite_array,
     unit_vector,
@@ -174,6 +175,7 @@ class EdgeSettings:
     response: LogarithmicResponse | None = None
 
     def __post_init__(self) -> None:
+        check_whole(self)
         if self.lines < 2:
             raise UsageError(f"lines {self.lines}: give at least 2 columns and rows")
         if self.run < 1 or self.run % 2 == 0:
@@ -221,6 +223,7 @@ class HorizonSettings:
     sphere_sigma: float = math.radians(0.1)
 
     def __post_init__(self) -> None:
+        check_whole(self)
         low, high = self.altitudes
         if not LEAST_ALTITUDE <= low < high < math.inf:
             raise UsageError(
