@@ -93,11 +93,13 @@ def run(options: argparse.Namespace) -> int:
     unused = prior_contradiction(options.prior, found.rate)
     if unused:
         found = _estimate(options.method, pixels, pinhole, exposure, likelihood, None)
-    objects = _objects(pixels, pinhole, found, likelihood, unit)
-    facts = _facts(found, objects, options.method) | {"shutter_described": not likelihood.shutter_unstated}
+    objects, unsearched = _objects(pixels, pinhole, found, likelihood, unit)
+    facts = _facts(found, objects, options.method) | {"objects_reason": unsearched}
+    facts |= {"shutter_described": not likelihood.shutter_unstated}
     unstated = isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated
     assumed = _FIELD if options.fov and options.fov_error is None and found.rate is not None else ""
-    text = _text(found, objects) + (_SHUTTER if unstated else "") + assumed
+    text = _text(found, objects) + (f"objects:       not searched: {unsearched}\n" if unsearched else "")
+    text += (_SHUTTER if unstated else "") + assumed
     print_result(
         options, facts | {"prior_used": not unused}, text + (f"prior:         {unused}\n" if unused else "")
     )
@@ -157,13 +159,14 @@ def _estimate(
 
 def _objects(
     pixels: Image, pinhole: Pinhole, found: FrameMotion, likelihood: LikelihoodSettings, unit: float
-) -> tuple[SpaceObject, ...]:
+) -> tuple[tuple[SpaceObject, ...], str]:
+    """Return the objects in the picture, and the reason why they could not be searched or an empty text."""
     if found.rate is None:
-        return ()
+        return (), "the rate is not known"
     gain, saturation = likelihood.gain, likelihood.saturation
     settings = ObjectSettings(psf_sigma=likelihood.psf_sigma, gain=gain, saturation=saturation)
-    found_objects = detect_objects(pixels, pinhole, found.rate, found.exposure, settings).objects
-    return tuple(replace(item, flux=unit * item.flux) for item in found_objects)
+    detected = detect_objects(pixels, pinhole, found.rate, found.exposure, settings)
+    return tuple(replace(item, flux=unit * item.flux) for item in detected.objects), detected.reason
 
 
 def _facts(found: FrameMotion, objects: tuple[SpaceObject, ...], method: str) -> dict[str, Any]:

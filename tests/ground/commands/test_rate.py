@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -253,6 +255,31 @@ def test_an_object_is_searched_with_the_stated_point_spread() -> None:
     pixels = frame_with(camera, turn, 1.0, 6, [(path, 2.5)], 6.0)
     found = MotionResult(StreakStatus.RATE, 0, 1.0, rate=turn)
     settings = LikelihoodSettings(saturation=camera.full_well, psf_sigma=1.6)
-    seen = rate._objects(pixels, pinhole, found, settings, 1.0)
-    assert len(seen) == 1
+    seen, reason = rate._objects(pixels, pinhole, found, settings, 1.0)
+    assert (len(seen), reason) == (1, "")
     assert np.linalg.norm(seen[0].endpoints.mean(axis=0) - path.mean(axis=0)) < 0.5
+
+
+def test_the_reason_why_no_objects_were_searched_is_stated(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    picture = tmp_path / "noise.png"
+    write_picture(picture, np.clip(random.normal(100.0, 3.0, (256, 256)), 0, 4095).astype(np.uint16), 0.2)
+    done = command("rate", picture, "--fov", FOV, "--json")
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["objects_reason"] == "the rate is not known"
+
+
+def test_a_rate_that_contradicts_the_streaks_is_stated(
+    scene: Scene, picture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimated: Any = vars(rate)["estimate_motion"]
+
+    def wrong(*arguments: Any) -> Any:
+        found = estimated(*arguments)
+        return replace(found, rate=1.5 * found.rate)
+
+    monkeypatch.setattr(rate, "estimate_motion", wrong)
+    words = ("rate", picture, "--fov", FOV, "--exposure", "0.2")
+    found = json.loads(command(*words, "--json").stdout)
+    assert "rate" in found["objects_reason"]
+    assert f"objects:       not searched: {found['objects_reason']}" in command(*words).stdout
