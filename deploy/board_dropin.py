@@ -5,8 +5,7 @@ knightcube.service is written to the file `flight` of the folder, that of knight
 and that of knightcube-link.service to `link`. The file `link` is empty if the configuration has no link. The
 file `tracker` is written if the star tracker needs the default sky index. Without FOLDER, the script prints
 the drop-in of knightcube.service. For an invalid configuration, the script prints one line and exits with
-status
-2.
+status 2.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from knightcube.errors import UsageError
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
 """Driver classes of pluggable devices: serial lines, video devices, and no class for I2C buses."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
-"""Driver classes by the kind of a device."""
+"""Driver classes of the devices, by section of the configuration."""
 
 
 def dropin(config: Config) -> str:
@@ -42,7 +41,7 @@ def dropin(config: Config) -> str:
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
     if config.simulation is None and config.body != "testbed":
-        lines.append("Restart=always")  # a satellite begins the next flight when the duration of one is over
+        lines.append("Restart=always")  # a satellite flies again after the duration of a flight
     if config.commands.udp is not None:  # UDP commands are accepted only from this machine
         lines += _network([LOOPBACK])
     return _text(lines)

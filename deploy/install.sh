@@ -1,5 +1,5 @@
 #!/bin/sh
-# Install the KnightCube flight software as a systemd service; run it again to update.
+# Install the KnightCube flight software as a systemd service. Run the script again to update the software.
 set -eu
 
 usage() {
@@ -94,7 +94,7 @@ run() {
     fi
 }
 
-# Install a file by one rename, unless an identical one is there: a second run changes nothing.
+# Install a file by one rename, unless an identical file is installed, so that a second run changes nothing.
 place() {
     if ! cmp -s "$2" "$3" 2>/dev/null; then
         run install -D -m "$1" "$2" "$3.part"
@@ -135,7 +135,7 @@ check_inputs() {
         fail "$flown is not what was accepted: was it edited? Then: install.sh --accept"
 }
 
-# systemd and udev are reloaded only if they run, which is not so in an image.
+# Return whether systemd runs. In an image, neither systemd nor udev runs, so they are not reloaded.
 systemd_runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
 
 in_root() { systemctl ${root:+--root="$root"} "$@"; }
@@ -143,7 +143,7 @@ in_root() { systemctl ${root:+--root="$root"} "$@"; }
 reload() {
     if systemd_runs; then
         run systemctl daemon-reload
-        [ -S /run/udev/control ] || return 0 # a container runs no udev
+        [ -S /run/udev/control ] || return 0 # udev does not run in a container
         run udevadm control --reload
         run udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev --subsystem-match=video4linux \
             --subsystem-match=usb
@@ -161,13 +161,14 @@ make_user() {
     done
     getent passwd "$user" >/dev/null ||
         run useradd --system --user-group --home-dir "$logs" --no-create-home --shell /usr/sbin/nologin "$user"
-    # The link is another user: it reads the logs and may command, and the flight cannot read its keys.
+    # The link runs as a separate user in the group of the flight. The link can read the logs and send commands to the
+    # flight, but the flight cannot read the keys of the link.
     getent passwd "$user-link" >/dev/null ||
         run useradd --system --gid "$user" --home-dir "$logs-link" --no-create-home --shell /usr/sbin/nologin \
             "$user-link"
 }
 
-# Build a release beside the one that flies, and test it; deploy/build_release.py has the steps.
+# Build and test a release beside the current release; deploy/build_release.py contains the steps.
 build_release() {
     if [ -n "$venv" ]; then
         builder=$venv/bin/python
@@ -185,7 +186,7 @@ build_release() {
     release=$prefix/releases/$("$builder" "$deploy/build_release.py" "$prefix" build "$@")
 }
 
-# The new release flies from the next start on. Its launcher is installed first, and can start both releases.
+# Make the new release current for the next start. Its launcher, which can start both releases, is installed first.
 switch_release() {
     programs='coils-off fly releases.py safe_state.py renewal.py open_bundle.py board_dropin.py'
     for folder in "$prefix/bin" "$prefix/spare"; do
@@ -193,7 +194,7 @@ switch_release() {
             place 755 "$deploy/$file" "$folder/$file"
         done
         place 644 "$source/hal/buses/smbus_byte.py" "$folder/smbus_byte.py"
-        # The checksums come last: an interrupted update leaves one folder that agrees with its checksums.
+        # The checksums are written last, so that after an interrupted update one folder matches its checksums.
         if [ -n "$dry" ]; then
             (cd "$folder" && sha256sum --check --strict --status sums) 2>/dev/null ||
                 echo "would write: $folder/sums"
@@ -206,7 +207,7 @@ switch_release() {
     run "$release/venv/bin/python" "$deploy/build_release.py" "$prefix" switch "$(basename "$release")"
 }
 
-# Older boards have their software here, and fly it until their units are replaced.
+# Older versions installed the software in $prefix/venv, and their systemd units start it from this folder.
 link_venv() {
     [ "$(readlink "$prefix/venv")" != current/venv ] || return 0
     run rm -rf "$prefix/venv"
@@ -222,7 +223,7 @@ install_settings() {
     fi
     made=$(mktemp -d)
     trap 'rm -rf "$made"' EXIT
-    # This comes first because it rejects a wrong configuration.
+    # This is the first step, because it rejects an invalid configuration.
     "$python" "$deploy/board_dropin.py" "$flown" "$made" || exit 2
     place 644 "$flown" "$settings/flight.yaml"
     sum_of "$flown" >"$made/sum"
@@ -240,7 +241,7 @@ install_settings() {
     [ -e "$made/tracker" ] || return 0
     wanted=$(XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" --wanted "$flown")
     if [ -n "$wanted" ]; then
-        run install -d "$cache" # systemd hands it to the service's user
+        run install -d "$cache" # systemd changes its owner to the service's user
         run env XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" "$flown"
     fi
 }
@@ -257,7 +258,7 @@ remove_link() {
     run rm -rf "$units/knightcube-link.service" "$units/knightcube-link.service.d"
 }
 
-# The rules are meant to be edited: edited rules are kept.
+# Install the udev rules, but keep rules that the user has edited.
 install_rules() {
     if [ -e "$rules" ] && [ -e "$shipped" ] && ! cmp -s "$rules" "$shipped"; then
         cmp -s "$deploy/99-knightcube.rules" "$shipped" ||
@@ -268,7 +269,8 @@ install_rules() {
     place 644 "$deploy/99-knightcube.rules" "$shipped"
 }
 
-# The board's hardware watchdog, and the module behind /dev/i2c-*, which nothing else loads: at each boot, and now.
+# Enable the hardware watchdog of the board, and load the kernel module i2c-dev, which provides /dev/i2c-*, at each boot
+# and now. No other software loads this module.
 install_modules() {
     place 644 "$deploy/modules.conf" "$modules"
     place 644 "$deploy/watchdog.conf" "$watchdog"
@@ -289,7 +291,8 @@ install_units() {
         run in_root enable --quiet knightcube.service
 }
 
-# The configuration accepted on the ground is the last one to which the command-loss timer returns.
+# Store the configuration that was accepted on the ground. It is the last version to which the command-loss timer
+# returns.
 keep_accepted() {
     [ ! -x "$prefix/bin/renewal.py" ] || [ -n "$dry" ] ||
         python3 -I -S "$prefix/bin/renewal.py" --root "${root:-/}" --accepted
@@ -326,7 +329,7 @@ roll_back() {
 
 say_next() {
     if [ -z "$dry" ]; then
-        sync # the board may lose its power at once
+        sync # the board may lose its power at any time
         verb=start
         if systemd_runs && systemctl is-active --quiet knightcube.service; then
             verb=restart # the previous version is flying

@@ -160,7 +160,7 @@ class Trials:
 
 
 def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
-    """Return the release to run, and a text if the current release is damaged, missing or not chosen."""
+    """Return the release to run, and the reason if the current release is damaged, missing or not chosen."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     found = [release for release in (current, previous) if release is not None]
     if not found:

@@ -312,7 +312,7 @@ class Board:
                 replace_file(path, contents[one])
 
     def linked(self, link: str) -> str:
-        """Return the name to which a symbolic link points, or an empty text for no link. Raises OSError."""
+        """Return the name to which a symbolic link points, or empty text if none exists. Raises OSError."""
         with suppress(FileNotFoundError):
             return Path(os.readlink(self.prefix / link)).name
         return ""
@@ -358,7 +358,7 @@ class Board:
             return subprocess.CompletedProcess(command, 127, "", f"{type(error).__name__}: {error}")
 
     def restart(self, *parts: str) -> None:
-        """Add restarts after this run; the default parts are flight and link. Raises OSError."""
+        """Request restarts of `parts` after this run, by default of flight and link. Raises OSError."""
         path, wanted = self.own / RESTART, parts or ("flight", "link")
         with suppress(FileNotFoundError):
             wanted += tuple(path.read_text(encoding="ascii", errors="replace").split())
@@ -495,7 +495,7 @@ class Renewal:
         return ""
 
     def _obey(self, name: str) -> None:
-        """Execute a request."""
+        """Execute a request, and report the reason if it is refused."""
         self._state.handled = [*self._state.handled, name][-KEPT_REQUESTS:]
         request: dict[str, Any] = {}
         with (
@@ -608,7 +608,7 @@ class Renewal:
         raise Refused(problems[0] if problems else missing)
 
     def _confirm(self, name: str, kind: str) -> None:
-        """End the trial and keep the new version. Raises Refused."""
+        """End the trial and keep the new version. Raises Refused if it cannot be confirmed."""
         state, trial = self._state, self._state.trial
         if trial is None or trial.stage != "fly" or trial.kind != kind:
             raise Refused(f"no {kind} is on trial")
@@ -628,7 +628,7 @@ class Renewal:
         self._tidy()
 
     def _withdraw(self, name: str, kind: str) -> None:
-        """Restore the version before the trial, or without a trial the previous version. Raises Refused."""
+        """Restore the version before the trial, or if there is no trial, the previous one. Raises Refused."""
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
@@ -681,7 +681,7 @@ class Renewal:
         self._save()
 
     def _built(self) -> str:
-        """Build the release of the bundle, and return its name. Raises Refused if it fails, and OSError."""
+        """Build the release of the bundle and return its name. Raises Refused if this fails, and OSError."""
         board, source = self._board, self._board.own / "staging/source"
         old = board.release("current")
         wheels = ["--wheels", source / "wheels"] if (source / "wheels").is_dir() else ["--reuse", old]
@@ -756,7 +756,7 @@ class Renewal:
     def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
         """Return to an earlier release or configuration.
 
-        Returns False without an undamaged earlier version that differs from the present one.
+        Returns False if there is no undamaged earlier version that differs from the present one.
         """
         state, board = self._state, self._board
         if what == "release":
@@ -817,7 +817,7 @@ class Renewal:
             text = f"no authentic frame for {state.silent_s:.0f} s: the {what} is used"
             if self._go_back(step, "", "command-loss", text):
                 return
-            # If the version to which this step returns does not exist, the timer's next step follows at once.
+            # If this step has no version to return to, the timer's next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _note(self, text: str) -> None:

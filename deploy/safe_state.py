@@ -4,12 +4,13 @@
 The service knightcube-safe.service runs this program, which needs only Python's standard library and the
 script `coils-off` in the same folder. The program ends with status 0 when the flight software is to be
 started again. The first start follows after 30 s, and the waiting time doubles with each further failure, up
-to an hour. The command `mode` ends the waiting time at once, and the command `safe` sets the waiting time to
-one hour from the command. The command `ping` is answered. Other commands are refused, and datagrams that are
-not commands get no answer.
+to an hour. The command `mode` ends the waiting time at once, and the command `safe` extends it to one hour
+after the command. The command `ping` is answered. Other commands are refused, and datagrams that are not
+commands get no answer.
 
-The environment variable KNIGHTCUBE_COMMANDS holds the path of the command socket; without it, no commands are
-received. The number of tries is stored in the folder RUNTIME_DIRECTORY until the next boot of the board.
+The environment variable KNIGHTCUBE_COMMANDS holds the path of the command socket. If the variable is missing,
+no commands are received. The number of tries is stored in the folder RUNTIME_DIRECTORY until the next boot of
+the board.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ FLEW_S = 600.0
 """Flight duration (s) after which the next restart has the shortest waiting time (`FIRST_S`) again."""
 
 COILS_S, RETRY_S = 30.0, 1.0
-"""Intervals (s) of setting the coils to zero: after an acknowledgement by the PWM chip, and without one.
+"""Intervals (s) between attempts to set the coils to zero, after a successful and after a failed attempt.
 
 The script `coils-off` is also killed after `COILS_S`, so that a hanging bus delays answers by no more than
 this time.
@@ -70,7 +71,7 @@ class Tries:
     def keep(self, now: float) -> None:
         """Store the number and the time `now` (s) of this attempt to start the flight.
 
-        Without a folder, and after a write error, nothing is stored.
+        Nothing is stored if there is no folder or writing fails.
         """
         if not self._path:
             return
