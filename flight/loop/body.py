@@ -96,7 +96,7 @@ class Steered(NamedTuple):
     """Result of steering in one control cycle.
 
     Attributes:
-        reference: reference motion at the time of the cycle, or None without a path.
+        reference: reference motion at the time of the cycle, or None if there is no path.
         dipole: commanded dipole (3,), A m^2.
         currents: currents (3,), A, sent to the driver, after reallocation and with the coil monitor's probe
             current. The sent currents are zero if a fault in this cycle switched the coils off.
@@ -234,7 +234,7 @@ class FlownPaths(Protocol):
     """The path being flown."""
 
     def sample(self, now_ns: int) -> Any | None:
-        """Return the reference motion at a time, or None without a path."""
+        """Return the reference motion at a time, or None if there is no path."""
 
     def is_following(self, now_ns: int) -> bool:
         """Return whether a path is being followed, as opposed to an attitude held after its end."""
@@ -335,8 +335,8 @@ class HorizonCameraUse(Protocol):
 class BodyEstimation(Protocol):
     """The estimation of a body, and the measurements that it uses.
 
-    Each kind of body inherits from `BodyEstimation`, and implements all methods without a default. The
-    default methods suit a body without an orbit.
+    Each kind of body inherits from `BodyEstimation`, and implements the methods that have no default. The
+    default methods suit a body that is not in orbit.
 
     Attributes:
         filter: filter that estimates attitude, rate and parameters of the body.
@@ -344,7 +344,7 @@ class BodyEstimation(Protocol):
         coil_monitor: monitor that detects broken coils.
         learned_problems: reasons why parameters that an earlier boot learned were rejected.
         uses_readings_without_rate: whether the feed accepts readings with an invalid rate.
-        horizon_cameras: use of the horizon cameras' frames, or None without these cameras.
+        horizon_cameras: use of the horizon cameras' frames, or None if there are no horizon cameras.
     """
 
     filter: Filter
@@ -381,7 +381,7 @@ class BodyEstimation(Protocol):
         return
 
     def is_accurate(self, estimate: Estimate) -> bool:
-        """Return whether an estimate without a gyro is accurate enough for driving the coils."""
+        """Return whether an estimate made without a gyro is accurate enough for driving the coils."""
         return True
 
     def rate_without_gyro(self, time_ns: int) -> FloatArray | None:

@@ -237,7 +237,7 @@ class Facts:
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str | Callable[[], str]) -> None:
         """Update a condition (`holds` is None if unknown); report a change as an event with `text`.
 
-        If `text` is a function, it returns the text, and is only called if the condition changes.
+        If `text` is a function that returns the text, it is called only if the condition changes.
         """
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:

@@ -294,7 +294,7 @@ class FlightEnding:
         coils_left_out: axes of the coils that were excluded because they are broken.
         coils_at_zero: whether the last command that the PWM chip acknowledged was zero current.
         coil_error: why the last write to the PWM chip failed; empty if it succeeded.
-        power: state of charge and energies of the battery; empty without a section `power`.
+        power: state of charge and energies of the battery; empty if there is no section `power`.
     """
 
     mission_time: float = 0.0

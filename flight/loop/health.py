@@ -167,7 +167,7 @@ class ClockWatch:
         self.steps = 0
 
     def look(self) -> float | None:
-        """Return the step (s) of the wall clock since the last call, or None. A drift is not a step."""
+        """Return the step (s) of the wall clock since the last call, or None for a drift or no change."""
         offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         before_ns, self._offset_ns = self._offset_ns, offset_ns
         if before_ns is None or abs(offset_ns - before_ns) <= _CLOCK_STEP_NS:
@@ -243,7 +243,7 @@ _SHORTEST_LIMIT_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class WorkerWatch:
-    """A worker to watch; `busy_since_ns` returns when the worker's job began (ns), or None without a job."""
+    """A worker to watch; `busy_since_ns` returns the start time (ns) of its job, or None if it is idle."""
 
     name: str
     busy_since_ns: Callable[[], int | None]

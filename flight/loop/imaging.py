@@ -73,7 +73,7 @@ _LEAST_PRIOR_SIGMA = 5e-4
 _COURSE_NODES = 17
 """Number of equally spaced times in an exposure at which the body rate is sampled."""
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
-"""Rate (3,) and covariance (3, 3) of a frame without a rate."""
+"""Rate (3,) and covariance (3, 3) of a frame in which no rate was measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class ImagingSettings:
         mounting: quaternion (4,) from body axes to camera axes.
         angular_acceleration_psd: function of a time that returns the power spectral density (3, 3),
             rad^2/s^3, of the body's white angular acceleration.
-        objects: settings of the search for objects, or None without a search.
+        objects: settings of the search for objects, or None if frames are not searched for objects.
         kept: storage of frames, or None if frames are not stored.
         velocity: function of a time that returns the velocity (3,), m/s, relative to the Sun, or None if the
             velocity in `tracker` is used.
@@ -150,7 +150,7 @@ class FrameMeasurer:
             tracker = replace(tracker, solve=replace(tracker.solve, velocity=velocity))
         estimator = self._settings.estimator
         if past is None and isinstance(estimator, LikelihoodSettings):
-            # Without a prior estimate of the attitude, the change of the rate in the exposure is also fitted.
+            # If there is no prior attitude estimate, the change of the rate in the exposure is also fitted.
             estimator = replace(estimator, rate_model="accelerating")
         return FrameJob(
             frame.pixels,
@@ -166,7 +166,7 @@ class FrameMeasurer:
         )
 
     def camera_attitude(self, time_ns: int) -> CameraAttitude | None:
-        """Return the estimated attitude of the camera at a past time, or None without an estimate."""
+        """Return the estimated attitude of the camera at a past time, or None if there is no estimate."""
         past = self._navigation.past(time_ns)
         if past is None:
             return None
@@ -202,14 +202,17 @@ class FrameMeasurer:
         return RatePrior(self._body_to_camera @ past.rate, rate_sigma, course), attitude
 
     def mean_rate(self, frame: Frame, motion: FrameMotion) -> MeanRateMeasurement | None:
-        """Return the mean body rate over the exposure, or None without a rate or an initial estimate."""
+        """Return the mean body rate over the exposure.
+
+        Returns None if no rate was measured, or if there was no estimate at the start of the exposure.
+        """
         start_ns = frame.exposure_start_ns
         if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
             return None
         return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self.rate_in_body(motion))
 
     def attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
-        """Return the measured attitude at mid-exposure, or None without a star fix."""
+        """Return the measured attitude at mid-exposure, or None if the frame gave no star fix."""
         fix = found.solution.fix if found.solution is not None else None
         if fix is None:
             return None
@@ -219,7 +222,7 @@ class FrameMeasurer:
         return AttitudeMeasurement(middle_ns(frame), quaternion, covariance, by_stars=True)
 
     def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
-        """Return the rate (3,) and its covariance (3, 3) in body axes, or NaN without a rate."""
+        """Return the rate (3,) and its covariance (3, 3) in body axes, or NaN if no rate was measured."""
         if found is None or found.rate is None or found.covariance is None:
             return _NAN
         turn = self._body_to_camera.T
@@ -398,7 +401,7 @@ class RepeatedRows:
 
 
 _UNKNOWN = [math.nan] * 3
-"""Recorded position (m) and velocity (m/s) of a body without an estimated orbit."""
+"""Recorded position (m) and velocity (m/s) of a body whose orbit is unknown."""
 _STEP_PX = 2.0
 """Standard deviation (px) of the predicted rotation of the camera from one frame to the next."""
 
@@ -457,7 +460,7 @@ class ObjectTracks:
         unknown = np.full(len(directions), np.nan)
         common = turn @ place.covariance @ turn.T
         sighted = MeasuredObjects(seen.points[kept], directions, covariance, unknown, common)
-        # Without an attitude, directions are in axes of the star field, whose orientation is unknown.
+        # If the attitude is unknown, directions are in axes of the star field, whose orientation is unknown.
         known = CameraAttitude(place.quaternion, np.eye(3)) if attitude is None else attitude
         to_estimate = attitude_matrix(known.quaternion).T @ turn.T
         self._track(sequence, middle_ns, sighted, now_ns, to_estimate)

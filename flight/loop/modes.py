@@ -133,7 +133,7 @@ TRANSITIONS: Table = {
     },
     Mode.HOLD: _USUAL,  # a repeated command holds the attitude at the time of the command
     Mode.SLEW: {**_USUAL, Trigger.REACT_HOLD: Mode.HOLD, Trigger.ARRIVED: Mode.HOLD},
-    # Without a plan, the demonstration holds the attitude until the next plan arrives.
+    # If no plan arrives in time, the demonstration holds the attitude until the next plan arrives.
     Mode.TESTBED_DEMO: {**_USUAL, Trigger.COMMAND_DEMO: TriggerAnswer.STAY},
     Mode.ACQUIRE: {
         **_USUAL,
@@ -266,7 +266,7 @@ class AttitudeWatch:
             timer.reset()
 
     def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
-        """Return the trigger that is due, or None. The flag `known` states that the attitude is known."""
+        """Return the trigger that is due, or None; `known` states whether the attitude is known."""
         if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
             return KNOWN[self.follows]
         if mode in POINTING and self._lost.update(not known, now_ns):
@@ -427,7 +427,7 @@ class ModeControl:
 
     @property
     def acquires_sun(self) -> bool:
-        """Whether the body is being turned to the Sun without an attitude: in SAFE, once the body is slow."""
+        """Whether Sun acquisition turns the body to the Sun: in SAFE, once the body is slow."""
         return self._attitude.acquires_sun
 
     def target(self, mission_time_ns: int) -> Target | None:
@@ -462,7 +462,7 @@ class ModeControl:
 
         Args:
             estimate: state estimate of this cycle, or None while the attitude is not known.
-            rate: magnitude (rad/s) of the newest body rate measured in this cycle, or None without a reading.
+            rate: magnitude (rad/s) of the newest body rate measured in this cycle, or None if none was.
             overdue: angle (rad) between the body and the presently required attitude, or None if no attitude
                 is required.
             coils_answer: whether the PWM chip acknowledges commands.

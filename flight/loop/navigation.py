@@ -157,9 +157,9 @@ class Navigation:
         self._has_rate = True
         self._gyro_rate = np.zeros(3)
         self.speed = 0.0
-        """Body rate (rad/s) of the newest gyro reading, without the estimated gyro bias. Without a gyro, the
-        value is the rate of the estimate, or the largest likely rate from the magnetometer, or infinity while
-        the rate is unknown."""
+        """Body rate (rad/s) of the newest gyro reading, corrected for the estimated gyro bias. If the gyro
+        gives no rate, the value is the rate of the estimate, or else the largest likely rate from the
+        magnetometer, or infinity while the rate is unknown."""
 
     def begin(self, time_ns: int) -> None:
         """Ignore readings made before the release of the body at `time_ns`."""
@@ -255,11 +255,11 @@ class Navigation:
         return self.is_accurate(estimate) and self._is_fresh(self._agreed_ns, now_ns)
 
     def is_accurate(self, estimate: Estimate | None) -> bool:
-        """Return whether there is an estimate that, without a gyro, is accurate enough for control."""
+        """Return whether there is an estimate; if the gyro gives no rate, it must also be accurate enough."""
         return estimate is not None and (self._has_rate or self._estimation.is_accurate(estimate))
 
     def _is_usable(self, reading: ImuReading, now_ns: int) -> bool:
-        """Return whether the filter can use a reading, and report a reading without a valid rate."""
+        """Return whether the filter can use a reading; a reading that has no valid rate is reported."""
         if reading.time_ns < self._since_ns:
             return False
         text = "the rate is valid again"
@@ -274,7 +274,7 @@ class Navigation:
         return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
 
     def estimate(self, now_ns: int) -> Estimate | None:
-        """Return the present estimate, measured or propagated by the model, or None without an estimate."""
+        """Return the present estimate, measured or propagated by the model, or None if there is none."""
         # During a long silence, the propagated estimate becomes inaccurate and slow to compute.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             self.speed = self.speed if self._has_rate else self._estimation.fastest_by_field()

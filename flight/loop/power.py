@@ -1,9 +1,9 @@
 """Power system: estimates the state of charge of the battery, and sheds loads while the battery is low.
 
 The state of charge is the integral of the measured current, which is slowly corrected towards the state of
-charge that follows from voltage, current and internal resistance. Without a trustworthy current monitor of
-the battery, the state of charge follows from the voltage of the bus. If no monitor can be trusted, the state
-of charge is unknown, and no load is shed or switched on.
+charge that follows from voltage, current and internal resistance. If the current monitor of the battery
+cannot be trusted, the state of charge follows from the voltage of the bus. If no monitor can be trusted, the
+state of charge is unknown, and no load is shed or switched on.
 """
 
 from __future__ import annotations

@@ -277,7 +277,7 @@ def start_from(
 ) -> tuple[SlowPrior, list[str]]:
     """Return the filter's prior, and the reasons why learned parameters were rejected.
 
-    Without learned parameters, the prior is `configured`. Each learned value may have changed by `changed`
+    If nothing was learned, the prior is `configured`. Each learned value may have changed by `changed`
     times its standard deviation in `configured`.
     """
     problems: list[str] = []
@@ -326,7 +326,7 @@ class LinuxFiles:
     """The file system calls for storing the state, which may raise OSError and be replaced in tests."""
 
     def read(self, path: Path) -> bytes | None:
-        """Return the content of a regular file of at most `LARGEST_FILE` bytes, or None without a file."""
+        """Return the content of a regular file of at most `LARGEST_FILE` bytes, or None if it is missing."""
         return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
@@ -634,7 +634,7 @@ class StateKeeper:
 
 
 def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
-    """Return the configured folder of the state, or systemd's state folder, or None without either."""
+    """Return the configured folder of the state, or systemd's for real devices; None if there is none."""
     if config.state.folder is not None:
         return Path(config.state.folder)
     if config.simulation is not None:

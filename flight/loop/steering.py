@@ -219,7 +219,7 @@ class Steering:
     without a gyro or, in detumbling, when there is no recent reading. The estimate is propagated by the model
     during a silence of the inertial unit, so that control returns smoothly. The currents are zero within a
     tenth of a second after the last reading. If the planner fails, the body follows its last path and is held
-    at the end of the path (event `holding`). Without a path, the currents are zero.
+    at the end of the path (event `holding`). If there is no path, the currents are zero.
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
@@ -229,8 +229,8 @@ class Steering:
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
         """Follow the path, or hold the attitude at its end.
 
-        Without a measured estimate, the coils are set to zero. The loss of control is reported only if the
-        filter has had an estimate in this flight (`ever_started`).
+        If there is no measured estimate, the coils are set to zero. The loss of control is reported only if
+        the filter has had an estimate in this flight (`ever_started`).
         """
         control = self._body.control
         reference = control.paths.sample(now_ns)
@@ -267,7 +267,7 @@ class Steering:
         return self._run_law(self._body.control.detumbling, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Turn the body to the Sun without an attitude, or keep the coils at zero without Sun acquisition."""
+        """Turn the body to the Sun in this cycle, or keep the coils at zero if the body has no law for it."""
         acquisition = self._body.control.sun_acquisition
         if acquisition is None:
             return self.rest(now_ns)
