@@ -337,7 +337,7 @@ class SatelliteEstimation(BodyEstimation):
         return float(np.linalg.norm(found.rate)) + sigma
 
     def velocity(self, time_ns: int) -> FloatArray | None:
-        """Return the satellite's velocity (3,), m/s, relative to the Sun (ICRS), or None without an orbit."""
+        """Return the velocity (3,), m/s, relative to the Sun (ICRS), or None while the orbit is unknown."""
         return self.environment.velocity(time_ns)
 
     def accept_fix(self, reading: GpsReading) -> FixVerdict:
@@ -401,7 +401,7 @@ class SatelliteControl(BodyControl):
         self._objects.accept(tracks, now_ns)
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first time (ns) from `from_ns` at which an exposure without coil switching can start."""
+        """Return the first start time (ns) from `from_ns` on of an exposure during which no coil switches."""
         return self._pauses.calm(from_ns, exposure_ns)
 
 
@@ -563,7 +563,7 @@ def _sun(
 
 
 def _sun_acquisition(config: OrbitConfig, services: Services) -> SunAcquisitionLaw | None:
-    """Return the law that turns the pointing axis to the Sun in SAFE, or None without solar cells."""
+    """Return the law that turns the pointing axis to the Sun in SAFE, or None if there are no solar cells."""
     section, coils = config.solar_strings, config.coils.map()
     if section is None:
         return None

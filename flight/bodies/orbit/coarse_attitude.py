@@ -289,7 +289,7 @@ class HorizonCameraFeed:
         return any(taken)
 
     def _field_sight(self, time_ns: int) -> VectorObservation | None:
-        """Return the magnetic field direction at a time, or None without a recent measurement."""
+        """Return the magnetic field direction at a time, or None if it was not measured recently."""
         measured_field = self._filter.newest_field()
         turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
         around = self._environment.at(time_ns)

@@ -85,7 +85,8 @@ def expected_field(
 ) -> Callable[[int], FieldPrediction | None]:
     """Return a function that predicts the magnetic field at `instants` (n,), s, after a time.
 
-    The field is in body axes, or in ICRS while the attitude is unknown. The result is None without an orbit.
+    The field is in body axes, or in ICRS while the attitude is unknown. The result is None if the orbit is
+    unknown.
     """
     field = FieldAhead()
 

@@ -52,10 +52,10 @@ _LEAST_FIXES, _SEQUENCES, _LONGEST_GAP = 5, 4, 200.0
 maximum number of fix sequences, each of which is a candidate orbit. `_LONGEST_GAP` is the longest time (s)
 between two fixes of one sequence."""
 FIRST_FIXES, TIGHT = 3, 1e4
-"""Number of consistent fixes that start an orbit without elements, and largest standard deviation (m) of
-elements with which a single fix starts an orbit."""
+"""Number of consistent fixes that start an orbit if there are no elements, and largest standard deviation (m)
+of elements with which a single fix starts an orbit."""
 UNCONFIRMED_SIGMA = 1e6
-"""Standard deviation (m) of a position that follows from a few fixes without elements."""
+"""Standard deviation (m) of a position that follows from a few fixes if there are no elements."""
 EXACT, STEEPEST = 3e3, 3.0
 """`EXACT` is a position error (m) that changes the magnetic field by less than the error of the field model.
 `STEEPEST` is the largest ratio between a relative change of the field and the relative change of the radius.
@@ -180,7 +180,7 @@ class EstimatedEnvironment:
     """
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
-        """`elements` are the two-line elements; without them the orbit is unknown until the first fixes."""
+        """`elements` are two-line elements; if they are None, the orbit is unknown until the first fixes."""
         self._elements = elements
         self._enlarged = 1.0  # factor of the elements' standard deviation: above 1 after a contradiction
         self._clock = clock

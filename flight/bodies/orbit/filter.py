@@ -221,7 +221,7 @@ class StepReplay:
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
-        """Append the newest step, discard steps beyond the history, and process the step if possible."""
+        """Append the newest step, discard steps older than the history, and process the step if possible."""
         self.steps.append(step)
         while self.steps[0].end_ns < step.end_ns - self._settings.history_ns:
             self.steps.popleft()
@@ -341,7 +341,7 @@ class StepReplay:
         return None
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field with the mean gyro rate (3,), rad/s, of its step, or None without a field.
+        """Return the newest field and the mean gyro rate (3,), rad/s, of its step, or None if there is none.
 
         The field's covariance includes the unknown magnetometer bias.
         """
@@ -532,7 +532,7 @@ class OrbitFilter:
         return self._replay.newest_field()
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
-        """Return the body's rotation (4,) between two times from gyro data, or None beyond the history."""
+        """Return the body's rotation (4,) between two times, or None if unknown (`StepReplay.turned`)."""
         self._close()
         return self._replay.turned(from_ns, to_ns)
 

@@ -10,9 +10,9 @@ estimated inertia, residual dipole and torques. The running path is followed unt
 new path arrives late, the satellite skips the part of the path that lies in the past.
 
 A satellite that follows an object points to the search direction first, then to the track of the object.
-Without a track, the boresight stays at the search direction. If there are several tracks, the satellite
-follows the brightest object until its track ends. The satellite follows the predicted direction of the track,
-so it follows the object also between detections.
+While there is no track, the boresight stays at the search direction. If there are several tracks, the
+satellite follows the brightest object until its track ends. The satellite follows the predicted direction of
+the track, so it follows the object also between detections.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class PointingPaths:
         return over
 
     def sample(self, now_ns: int) -> PathPoint | None:
-        """Return the planned motion at this time, or None without a path or after its end."""
+        """Return the planned motion at this time, or None if there is no path or the path has ended."""
         if self._next is not None and now_ns >= self._next.begin_ns:
             self._followed, self._next, self.off = self._next, None, 0.0
         followed = self._followed
@@ -296,7 +296,7 @@ class ObjectAim:
     """
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """Start without an object; without a search, `sensor` is None. `limit` (A m^2) limits dipoles."""
+        """Start without an object; `sensor` is None if there is no search. `limit` (A m^2) limits dipoles."""
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
         self._place: FloatArray | None = None
@@ -545,7 +545,7 @@ class PointingPlanner:
             self._after_ns = now_ns + REST_AGAIN_NS
 
     def _new_job(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> PointingJob | None:
-        """Return a job for a slew, or None without an orbit. Raises UsageError for parallel usable coils."""
+        """Return a job, or None if the orbit is unknown. Raises UsageError for parallel usable coils."""
         orbit, craft = self._environment.state(now_ns), self._craft
         if orbit is None:
             return None
@@ -594,7 +594,7 @@ class PointingPlanner:
                 self._events.report(events.SLEW_BEGUN, now_ns, text)
 
     def _continue(self, job: PointingJob, table: PointingTable | None, now_ns: int) -> None:
-        """Follow a new plan for the rest of the running slew; without a new plan, keep the present plan."""
+        """Follow a new plan for the rest of the running slew; if there is none, keep the present plan."""
         paths = self._paths
         self._unimproved = 0 if table is not None else self._unimproved + 1
         self._after_ns = job.origin_ns + min(1 + self._unimproved, MOST_WAITS) * REST_AGAIN_NS

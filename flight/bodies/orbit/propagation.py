@@ -128,9 +128,9 @@ class FilterStep:
             `spread` is the covariance (3, 3), rad^2/s^2, of this rate.
         impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end of the step,
             averaged over the readings.
-        field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None without a reading.
+        field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None if there are none.
         late: measurements whose time lies in the step, oldest first.
-        before: the estimate at the beginning of the step, or None without an estimate.
+        before: the estimate at the beginning of the step, or None if there was none.
     """
 
     begin_ns: int
@@ -190,7 +190,7 @@ class OpenStep:
     def close(
         self, dipole: FloatArray, doubt: float, around: FilterEnvironment, by_field: RateByField
     ) -> FilterStep:
-        """Return the finished step; without a gyro reading, its rate is estimated from the magnetometer."""
+        """Return the finished step; if it has no gyro reading, its rate is that from the magnetometer."""
         samples, fields = len(self._rates), len(self._fields)
         rate, spread = (np.mean(self._rates, axis=0), None) if samples else by_field
         return FilterStep(
