@@ -208,7 +208,7 @@ def _called(key: str, section: Any, function: Callable[..., Any], *arguments: An
 
 
 def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
-    """Open the device of a section by its driver, and return it, or None if it is not configured."""
+    """Return the device of a section, opened by its driver, or None if the device is not configured."""
     section = getattr(config, kind)
     return None if section is None else _opened(kind, section, rig, stack, kind)
 

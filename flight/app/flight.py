@@ -433,7 +433,7 @@ def _detection(camera: Camera) -> DetectionSettings:
 
 
 def _tracker(camera: Camera) -> TrackerSettings | None:
-    """Return the settings of the star tracker, or None without a star tracker."""
+    """Return the settings of the star tracker, or None if no star tracker is configured."""
     section = camera.star_tracker
     if section is None:
         return None

@@ -18,8 +18,8 @@ if TYPE_CHECKING:  # most commands that use this module do not need the flight l
 class RunRequest:
     """A request to fly. If given, `duration` (s) and `seed` replace the configured values.
 
-    The file `devices` belongs to a running server of simulated devices; without it, a server is started. The
-    folder `archive` contains the runs of a flight computer; if it is given, its next run folder is used
+    The file `devices` belongs to a running server of simulated devices; if it is None, a server is started.
+    The folder `archive` contains the runs of a flight computer; if it is given, its next run folder is used
     instead of `out`. If `accepted` is true and the file `config_path` is damaged, the last flown
     configuration is used instead. The simulated `faults` are injected in addition to the configured faults
     (`sim_hal.faults.schedule`).

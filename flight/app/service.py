@@ -184,7 +184,8 @@ class SeparationInhibit:
     inhibit nor begins it again. Flight and link count the time separately, each in its own folder.
 
     A damaged or missing file counts as the first power-up, because it does less harm to keep the coils off
-    for too long than to drive them too early. Without a folder, each start of the process begins the inhibit.
+    for too long than to drive them too early. If there is no folder, each start of the process begins the
+    inhibit.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -287,7 +288,7 @@ def renewal_note(environment: Mapping[str, str]) -> str:
 
 
 class FlownRelease:
-    """The software release in use; without a name, no release is recorded as proven."""
+    """The software release in use; a release whose name is unknown is not recorded as proven."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         """Read name and note of the release from the environment of the process."""

@@ -257,7 +257,7 @@ def _wrong_bits() -> dict[int, int]:
 
 
 def _syndrome(block: bytes) -> int:
-    """Return the syndrome of a codeblock, which is 0 without errors. The fill bit is ignored."""
+    """Return the syndrome of a codeblock, which is 0 if there are no errors. The fill bit is ignored."""
     return _bch_parity(block[:_BLOCK_DATA]) ^ (~block[_BLOCK_DATA] & _INVERTED)
 
 
@@ -340,7 +340,7 @@ class CommandCode:
         self.corrected = 0
 
     def encode(self, frame: bytes) -> bytes:
-        """Return the CLTU of a frame, or the frame itself without coding."""
+        """Return the CLTU of a frame, or the frame itself if frames are not coded."""
         return cltu(randomised(frame, self._kind)) if self._coded else frame
 
     def decode(self, unit: bytes) -> bytes:
@@ -348,11 +348,11 @@ class CommandCode:
         return next(iter(self.stream().add(unit)), b"") if self._coded else unit
 
     def marked(self, frame: bytes) -> bytes:
-        """Return the CLTU of a frame or, without coding, the sync marker and the frame."""
+        """Return the CLTU of a frame or, if frames are not coded, the sync marker and the frame."""
         return self.encode(frame) if self._coded else SYNC + frame
 
     def stream(self) -> FrameDecoder:
-        """Return a decoder of CLTUs or, without coding, of frames that follow sync markers."""
+        """Return a decoder of CLTUs or, if frames are not coded, of frames that follow sync markers."""
         return CltuStream(self._kind, self._add) if self._coded else telecommand_stream()
 
     def _add(self, corrected: int) -> None:

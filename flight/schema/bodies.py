@@ -221,8 +221,8 @@ class Craft(Section, frozen=True, kw_only=True):
 
     The satellite is a box with the edges `size` (m) along the body axes. The vector `centre_of_mass` (m)
     leads from the centre of the box to the centre of mass. The value `inertia` holds the moments of inertia
-    about the body axes, or the rows of the inertia tensor, kg m^2. Without `inertia`, the moments are those
-    of a homogeneous box of `mass` (kg). The coils are described in the section `coils`. The vector
+    about the body axes, or the rows of the inertia tensor, kg m^2. By default, the moments are those of a
+    homogeneous box of `mass` (kg). The coils are described in the section `coils`. The vector
     `residual_dipole` (A m^2) is the expected magnetic dipole of the satellite in shadow with the coils off.
     """
 
@@ -249,7 +249,7 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by a minimum-time plan of the angular momentum in the measured magnetic field.
 
     The noise `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. The noise
-    `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques; without it, it is computed
+    `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques, and is computed by default
     (`OrbitConfig.torque_noise`). The plan (`knightcube.gnc.control.field_detumbler`) covers `horizon` s and
     is renewed every `replan` s. A body that starts slower than `gentle` rad/s should not exceed its initial
     rate; a faster body may reach `spin_up` times its initial rate.
@@ -327,8 +327,8 @@ class PointingSection(Section, frozen=True, kw_only=True):
     for the magnetometer, which last as long as in detumbling. Plans are renewed every `replan_period` s. A
     coil that pointing rarely uses is tested by a short current every `coil_test` s; 0 switches the tests off.
     A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones` of
-    the star camera. The `planner` of slews is `collocation` or `vmc` (virtual motion camouflage). Without
-    `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`, `OrbitConfig.slew_duration`).
+    the star camera. The `planner` of slews is `collocation` or `vmc` (virtual motion camouflage). By
+    default, `dipole` and `slew` are computed (`OrbitConfig.dipole_weight`, `OrbitConfig.slew_duration`).
     """
 
     axis: Vector = (0.0, 0.0, 1.0)

@@ -164,8 +164,8 @@ class Winding(Section, frozen=True, kw_only=True):
     A positive current makes a dipole moment along `axis`, which may have any length. The dipole moment per
     ampere is `dipole_per_ampere` (m^2), or `turns` times `area` (m^2) of an air coil. On the testbed, the
     values of the coils are in the section `plant`. The value `current_limit` (A) replaces the limit in the
-    section `coils`. The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without
-    them, the coils use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose
+    section `coils`. The values `channels` are the PWM channels of the inputs A and B of the H-bridge; by
+    default, the coils use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose
     leads are swapped. The `position` (m, body axes) of the coil's centre relative to the inertial unit gives
     the field that `knightcube bringup` expects at the magnetometer.
     """
@@ -359,7 +359,7 @@ class Power(Section, frozen=True, kw_only=True):
     """The power system: a battery on an unregulated bus, which solar panels charge.
 
     The INA219 `battery_monitor` measures the current out of the battery, which is negative while the battery
-    is charged. The INA219 `bus_monitor` measures the current of all loads; without it (`null`), a stuck
+    is charged. The INA219 `bus_monitor` measures the current of all loads; if it is `null`, a stuck
     `battery_monitor` is not detected.
     """
 
@@ -429,8 +429,8 @@ class ObjectTracking(Section, frozen=True, kw_only=True):
     """Search for moving objects among the stars of each frame, and tracking of the detected objects.
 
     Detections fainter than the V magnitude `faintest` are ignored. A track begins after `needed` detections
-    in `within` frames, and ends after `coast` s without a detection. Without `star_tracker`, or with a sky
-    index that is missing or damaged, objects are detected by the common motion of the stars from frame to
+    in `within` frames, and ends after `coast` s without a detection. If there is no `star_tracker`, or if its
+    sky index is missing or damaged, objects are detected by the common motion of the stars from frame to
     frame; `faintest` then has no effect, because magnitudes are unknown.
     """
 
@@ -757,7 +757,7 @@ def axis_matrix(names: Sequence[str]) -> FloatArray:
 
 
 def fitted_devices(config: Any) -> list[tuple[str, str, Any]]:
-    """Return the dotted key, the kind and the section of each configured device, without the cameras."""
+    """Return the dotted key, the kind and the section of each configured device except the cameras."""
     found = [(kind, kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
     if config.power is not None:
         found += [(key, "power_monitor", one) for key, one in config.power.monitors().items()]

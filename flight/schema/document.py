@@ -386,7 +386,7 @@ def _merged(base: Any, own: Any, dotted: str, lines: dict[str, int]) -> Any:
 
 
 def _read_single(text: str, name: str) -> Document:
-    """Return the values of a YAML text without those of a file that it extends. Raises ConfigError."""
+    """Return the values of a YAML text, but not of a file that it extends. Raises ConfigError."""
     read = _read_once(text, name)
     return replace(read, values=copy.deepcopy(read.values), lines=dict(read.lines))
 

@@ -54,8 +54,8 @@ class Estimation(Section, frozen=True, kw_only=True):
 
     The initial standard deviations are `bias_start` (gyro bias, rad/s), `gain_start` (coil gains) and
     `latency_start` (age of an inertial unit's sample at its time stamp, s). A state whose initial standard
-    deviation is zero stays fixed. The latency has the random walk `latency_walk`, s per sqrt(s). Without
-    measurements, the estimate is propagated by the model for `coast` s, but the coils stay off
+    deviation is zero stays fixed. The latency has the random walk `latency_walk`, s per sqrt(s). While there
+    are no measurements, the estimate is propagated by the model for `coast` s, but the coils are off
     (`inertial_unit.max_age`). From one boot to the next, a learned value may change by the fraction `changed`
     of its initial standard deviation.
     """
@@ -187,19 +187,18 @@ class Link(Section, frozen=True, kw_only=True):
     """The link process (`knightcube link`), which exchanges protected frames with the ground.
 
     The folder `keys` contains keys and counters (`knightcube keys`), and `spacecraft` is the identifier in
-    each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
-    Without `peers`, a loopback address accepts frames only from this machine, and any other address accepts
-    frames only from its own /24 network (256 addresses). The value `serial` describes the serial line of a
-    radio. Telemetry is sent to authenticated senders, to `telemetry_to` (HOST:PORT, UDP), to `serial` and to
-    the TNC at `kiss` (HOST:PORT, TCP). With the two `call_signs` (to, from), KISS frames contain AX.25
-    frames. Telemetry frames have `frame_bytes` bytes, and telecommand frames have at most
-    `command_frame_bytes` bytes. Each communication line carries at most `rate` bytes/s of telemetry frames.
-    Idle frames raise the rate to `idle_rate` bytes/s. Telemetry is always authenticated, and readable without
-    a key if `encrypt_telemetry` is false. The section `coding` describes the channel coding. A flight
-    computer returns to its previous release if it has power and receives no authentic frame for
-    `command_loss` s. When `command_loss` s have passed a second time, the computer returns to its previous
-    configuration, and a third time, to the configuration accepted on the ground. A `command_loss` of 0
-    disables these returns.
+    each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`. By
+    default, a loopback address accepts frames only from this machine, and any other address accepts frames
+    only from its own /24 network (256 addresses). The value `serial` describes the serial line of a radio.
+    Telemetry is sent to authenticated senders, to `telemetry_to` (HOST:PORT, UDP), to `serial` and to the TNC
+    at `kiss` (HOST:PORT, TCP). With the two `call_signs` (to, from), KISS frames contain AX.25 frames.
+    Telemetry frames have `frame_bytes` bytes, and telecommand frames have at most `command_frame_bytes`
+    bytes. Each communication line carries at most `rate` bytes/s of telemetry frames. Idle frames raise the
+    rate to `idle_rate` bytes/s. Telemetry is always authenticated, and readable without a key if
+    `encrypt_telemetry` is false. The section `coding` describes the channel coding. A flight computer returns
+    to its previous release if it has power and receives no authentic frame for `command_loss` s. When
+    `command_loss` s have passed a second time, the computer returns to its previous configuration, and a
+    third time, to the configuration accepted on the ground. A `command_loss` of 0 disables these returns.
     """
 
     keys: Annotated[
@@ -233,8 +232,8 @@ class Telemetry(Section, frozen=True, kw_only=True):
 class State(Section, frozen=True, kw_only=True):
     """Storage of the state that survives a restart (`flight.loop.state`), written every `period` s.
 
-    Without `folder`, a flight with real devices uses systemd's STATE_DIRECTORY, and any other flight stores
-    nothing.
+    By default, a flight with real devices stores the state in systemd's STATE_DIRECTORY, and any other flight
+    stores nothing.
     """
 
     folder: Annotated[str, Meta(min_length=1)] | None = None
@@ -250,8 +249,8 @@ class Separation(Section, frozen=True, kw_only=True):
 class Config(Section, frozen=True, kw_only=True):
     """The configuration sections that all bodies share; the configuration of a body adds more sections.
 
-    The value `body` names the body; a body outside this repository is named as `module:object`. Without an
-    `inertial_unit`, the `magnetometer` becomes an inertial unit without a gyro.
+    The value `body` names the body; a body outside this repository is named as `module:object`. If
+    `inertial_unit` is none, the `magnetometer` becomes an inertial unit without a gyro.
     """
 
     name: Annotated[

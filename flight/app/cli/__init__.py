@@ -159,7 +159,7 @@ def _obey(words: Sequence[str]) -> int:
         _complete(parser)
         options = parser.parse_args(words)
         if "numpy" in sys.modules:
-            from flight.loop.worker import lean_imports  # noqa: PLC0415 - a command without numpy needs none of it
+            from flight.loop.worker import lean_imports  # noqa: PLC0415 - for commands that use numpy
 
             lean_imports()
         status: int = options.command(options)

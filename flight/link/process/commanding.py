@@ -172,7 +172,7 @@ class Verification:
 
 
 AT_MOST = 8
-"""Maximum number of commands without an answer."""
+"""Maximum number of commands that wait for their answers at the same time."""
 
 PATIENCE_NS = 5_000_000_000
 """Timeout (ns) for an answer from the control process, which reads commands every 0.1 s."""

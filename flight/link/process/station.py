@@ -121,7 +121,7 @@ class UdpLine:
         """Bind a UDP socket to the address HOST:PORT. Raises UsageError.
 
         The fixed address `to` receives telemetry. Only senders in the networks `peers` are accepted, or all
-        senders if `peers` is None. Without `codes`, frames are not coded.
+        senders if `peers` is None. If `codes` is None, frames are not coded.
         """
         self.name = f"UDP {address}"
         self._peers = peers
@@ -309,7 +309,7 @@ class TncLine(Line):
         self._next_ns = 0
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the received frames, or an empty list without a connection."""
+        """Return the received frames, or an empty list while there is no connection."""
         if self._socket is None:
             return []
         try:
@@ -354,7 +354,7 @@ class SerialLine(Line):
     """Serial line to a radio for frames that follow sync markers, or are coded as configured."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing | None = None) -> None:
-        """Use an open port, which reopens itself; without `framing`, frames follow sync markers."""
+        """Use an open port, which reopens itself; if `framing` is None, frames follow sync markers."""
         self.name, self._port = name, port
         self._framing = framing or LinkCodes().on_board()
         self._stream = self._framing.stream()
@@ -705,7 +705,7 @@ class Station:
         )
 
     def _utc_ns(self) -> int:
-        """Return the UTC of the flight, ns since 1970, or the host's UTC without a flight."""
+        """Return the UTC of the flight, ns since 1970, or the host's UTC if there is no flight."""
         if self._utc_offset_ns is None:
             return self._clock.utc_ns()
         return self._clock.now_ns() + self._utc_offset_ns
