@@ -25,9 +25,9 @@ Record = TypeVar("Record")
 def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:
     """Return the argument `name` of a public function as an array of finite numbers.
 
-    Raises ArgumentError for values that are not numbers, complex, infinite or NaN, for masked elements, whose
-    values are meaningless, and for an array whose shape is not one of `shapes`. If no `shapes` are given,
-    every shape is permitted.
+    Raises ArgumentError for values that are not numbers or are complex, infinite or NaN, for masked elements,
+    whose values are meaningless, and for an array whose shape is not one of `shapes`. If no `shapes` are
+    given, every shape is permitted.
     """
     if np.ma.is_masked(value):
         count = np.count_nonzero(np.ma.getmaskarray(np.ma.asarray(value)))

@@ -7,13 +7,13 @@ coil pauses to estimate all components of the body rate and the rotation of the 
 sample shows the rate along the field immediately.
 
 The momentum plan uses the field predicted along the orbit, if the orbit is known. If the attitude is unknown,
-the predicted field is rotated so that its direction and change agree with the measured field. Without a known
-orbit, the measured field is assumed to continue to rotate at the present rate. In an orbit near the equator,
-however, the field's direction only oscillates by some 20 deg. In contrast to B-dot control, this detumbler
-also removes a spin along the field as soon as the field has rotated. The coils stay off until `TRUSTED`
-consecutive samples, also from outside the pauses, agree with the prediction of the filter and the standard
-deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no sample was
-accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
+the predicted field is rotated so that its direction and change agree with the measured field. If the orbit is
+unknown, the measured field is assumed to continue to rotate at the present rate. In an orbit near the
+equator, however, the field's direction only oscillates by some 20 deg. In contrast to B-dot control, this
+detumbler also removes a spin along the field as soon as the field has rotated. The coils stay off until
+`TRUSTED` consecutive samples, also from outside the pauses, agree with the prediction of the filter and the
+standard deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no
+sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
 
 The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
 obeys h' = m x B, where m is the dipole moment and B the field. The equation contains neither the inertia nor
@@ -348,7 +348,7 @@ class FieldDetumbler:
         """Create a detumbler whose rate filter has not started.
 
         The function `expected` predicts the field at `braking.instants` after a given time, in the body axes
-        at that time or, without a known attitude, in inertial axes. The function `expected` returns None
+        at that time or, if the attitude is unknown, in inertial axes. The function `expected` returns None
         while the orbit is unknown.
         """
         self._schedule = schedule

@@ -489,7 +489,7 @@ def prepare() -> None:
 def run(job: PointingJob) -> PointingTable | None:
     """Return the pointing table, whose times are in s after the job's time `origin_ns`.
 
-    The result is None if the remaining part of a slew was replanned without a better plan than the present
+    The result is None if the remaining part of a slew was replanned, and no plan was better than the present
     plan. The computation takes about one second, two seconds with a slew, and a tenth of a second for the
     remaining part of a slew. Raises KnightCubeError if the magnetic field is unknown, and UsageError if the
     target does not define an attitude.

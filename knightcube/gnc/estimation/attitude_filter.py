@@ -112,7 +112,7 @@ class CommandCheck:
     def judge(self, newest: Checkpoint) -> int | None:
         """Return the time (ns) from which the currents are unknown, if the newest checkpoint raises an alarm.
 
-        The result is None without an alarm. Only a checkpoint of a gyro rate can raise an alarm.
+        The result is None if there is no alarm. Only a checkpoint of a gyro rate can raise an alarm.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
@@ -234,7 +234,7 @@ class FilterSettings:
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
         field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
-        rate_walk: random walk of the rate due to torque noise, without the coils, rad/s per sqrt(s).
+        rate_walk: random walk of the rate due to torque noise except that of the coils, rad/s per sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
         gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
             probable than a one-dimensional deviation of this size.

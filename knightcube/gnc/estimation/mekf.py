@@ -772,7 +772,7 @@ class CheckpointHistory:
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
         """Return times (n,) ns and rates (n, 3) rad/s of the checkpoints that enclose an interval.
 
-        Without a checkpoint at or after `end_ns`, the rates end with the newest checkpoint. Return None if no
+        If no checkpoint is at or after `end_ns`, the rates end with the newest checkpoint. Return None if no
         checkpoint is as old as `begin_ns`.
         """
         first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)

@@ -106,7 +106,7 @@ class RigidBody:
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         dipole_per_ampere: dipole moment per current of each coil (turns times area), m^2.
-        field: default magnetic field (3,) in reference axes, for commands without a field, T.
+        field: magnetic field (3,), T, in reference axes, which is the default field of a command.
         suspended: whether the body hangs on the thread and rotates only about its y axis.
         stiffness: nominal torsion stiffness k of the thread, N m/rad.
         damping: nominal damping constant c of the thread, N m s/rad.
