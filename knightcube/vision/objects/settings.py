@@ -165,7 +165,7 @@ FLOOR_PX = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldPoints:
-    """Points of light in a frame whose stars are not identified, the brightest first.
+    """Points of light in a frame whose stars are not identified: moving points first, then the brightest.
 
     Attributes:
         points: positions at mid-exposure (n, 2), px.

@@ -47,7 +47,7 @@ _MOST_UNLIKE = 1.5
 # Tolerance (px) of the distance of two points, because of their errors and of a distortion of the lens.
 _APART_TOLERANCE = 1.0
 # Largest ratio of the highest to the lowest image scale for which a search is made. Largest number of
-# candidates of a frame; a pair of points that would exceed this number is not searched.
+# candidates of a frame; the search ends before this number would be exceeded.
 _WIDEST_SCALE, _MOST_CANDIDATES = 1.15, 600_000
 # Number of candidates in one batch, and number of further iterations that determine their image scales.
 _TOGETHER, _SCALE_STEPS = 20_000, 3

@@ -765,8 +765,8 @@ def attitude_by(
         points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
-    # At an angle a from the boresight, the angle of a pixel is proportional to cos^2 a along the radius.
-    # Across the radius, the angle of a pixel is proportional to cos a.
+    # At an angle a from the boresight, the angle that a pixel subtends is proportional to cos^2 a in the
+    # radial direction, and to cos a in the tangential direction.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
     fix = solver(seen, reference[fit.agree], sigma)
     # The loss function of a solver is half of the sum of the stars' chi-squares.

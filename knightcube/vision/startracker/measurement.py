@@ -214,7 +214,7 @@ def _crowded(middle: IntArray) -> BoolArray:
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return at most four of the `chosen` stars in each sixteenth of the frame area, and their weights.
+    """Return at most four `chosen` stars in each sixteenth of the area of all stars, and their weights.
 
     Each sixteenth of the area has the same total weight. Stars are in all parts of the frame, but foreground
     sources, such as the leaves of a tree, are in one part.
@@ -307,7 +307,8 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
 def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float) -> Centroid:
     """Return the vertices of parabolas fitted to the logarithm of the counts.
 
-    If too few pixels exceed the noise, the initial centroid of the star is returned.
+    If too few pixels exceed the noise, or if the vertex is far from the initial centroid of the star, the
+    initial centroid is returned.
     """
     x, y = (np.broadcast_to(step, clean.shape) for step in _steps(clean))
     used: BoolArray = clean > _STANDS_OUT * np.sqrt(variance)
@@ -419,7 +420,7 @@ def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
-    """Return the rms systematic error (px) of a centroid method over all positions within a pixel."""
+    """Return the rms systematic error (px) of a centroid method over positions along one axis of a pixel."""
     place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
     stars = light(place, np.full(len(_PHASES), psf_sigma), half)
     places, _ = _places(stars, np.full_like(stars[:, 1:-1, 1:-1], _FAINTEST**2), psf_sigma, method)

@@ -365,7 +365,8 @@ def _settle(matcher: _Matcher, first: _Matching, start: Refinement) -> tuple[_Ma
     """Return the matched stars and the attitude after repeated matching and refinement.
 
     Refinement of the attitude and matching alternate until the matched stars no longer change. `first` is the
-    matching at the attitude `start`. Returns None if the refinement diverges.
+    matching at the attitude `start`. Returns None if the refinement diverges, if too few stars match, or if
+    the fitted scale is not possible.
     """
     field, sky = matcher.field, matcher.sky
     matching, refined = first, start

@@ -157,7 +157,7 @@ def ensure_default_index() -> None:
 
 @cache
 def default_index() -> SkyIndex:
-    """Return the default sky index, which is built and stored if it is missing, and read once per process."""
+    """Return the default sky index, which is built and stored if no usable file exists."""
     path = PATH
     try:
         return load(path)
