@@ -159,7 +159,8 @@ class EdgeSettings:
         threshold: brightness above which a pixel counts as bright, as a fraction of the range from the dark
             level to the bright level.
         contrast: minimum step height of an edge, as a fraction of the range from dark to bright level.
-        most: maximum number of edges per scan line; the edges with the darkest dark side are kept.
+        most: maximum number of edges in an image, as a multiple of the number of lines; the edges with the
+            darkest dark side are kept.
         psf_sigma: standard deviation of the blur of the optics, px. A larger blur is fitted if the brightness
             profiles of the limb show it clearly.
         response: response of the detector, or None for a linear detector.

@@ -151,7 +151,7 @@ class StarTargets:
         return len(self.middle)
 
 
-# Length (px) of a star's path below which the path is neglected. It widens a PSF of 1 px by 0.2 %.
+# Length (px) of a star's path below which the path is neglected. Such a path widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
 # Number of quadrature nodes, for an error of 0.1 % of the flux on paths of four PSF widths.
 _NODES = 4
