@@ -299,7 +299,7 @@ def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int, flo
     return "", 0, 0.0
 
 
-def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
+def find(config: Config, rig: Rig) -> Iterator[Found]:
     """Yield the answer of each configured device, or a finding with its remedy."""
     serial = {
         kind: one for kind in ("inertial_unit", "gps") if hasattr(one := getattr(config, kind), "device")
@@ -315,7 +315,8 @@ def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
         place = _place(config, key, section, driver)
         try:
             if camera and rig.cameras is None:
-                open_camera(section, rig, stack)
+                with ExitStack() as opened:  # a camera cannot be opened a second time for a later step
+                    open_camera(section, rig, opened)
             answer = "opens" if driver is None or camera else driver.probe(rig, section)
             finding = _wrong_part(key, section, rig, serial)
         except DeviceError as error:

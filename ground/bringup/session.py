@@ -35,7 +35,7 @@ _DENSITIES = math.radians(0.0035), 1.4e-8, 0.14e-3 * 9.80665
 
 def step_find(session: Session) -> Outcome:
     """Find each device and identify it."""
-    found = list(find(session.config, session.rig, session.stack))
+    found = list(find(session.config, session.rig))
     answers = {one.part: f"{one.place}: {one.answer or 'no answer'}" for one in found}
     findings = [one.finding for one in found if one.finding]
     changes = {one.part: dict([one.setting]) for one in findings if one.setting is not None}

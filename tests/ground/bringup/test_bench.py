@@ -12,8 +12,10 @@ import pytest
 
 from flight.schema import reader
 from flight.schema.devices import Battery, Power, PowerMonitorSection
+from ground.bringup import bench
 from ground.bringup.bench import Outcome, Session, StepSkipped, chip_at, talker
 from ground.bringup.diagnosis import Finding
+from ground.bringup.session import step_find
 from hal.drivers.vn100 import BAUD_RATES
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS
@@ -201,6 +203,27 @@ def test_the_emulated_cameras_are_numbered_after_the_star_camera() -> None:
     ]
     assert session.section("wide_cameras[1]") == ("camera", session.config.wide_cameras[1])
     assert session.section("coils") == ("coils", session.config.coils)
+
+
+def test_a_camera_that_the_search_has_opened_can_be_opened_by_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search closes a camera, because a second opening of a streaming camera is refused as busy."""
+    in_use: list[str] = []
+
+    def opened(section: Any, rig: Any, stack: ExitStack) -> str:
+        if in_use:
+            raise NotResponding("camera", "another program uses the camera")
+        in_use.append("camera")
+        stack.callback(in_use.clear)
+        return "open camera"
+
+    monkeypatch.setattr(bench, "open_camera", opened)
+    monkeypatch.setattr(bench, "fitted_devices", lambda _: [])
+    session = bench_session({}, wide_cameras=())
+    session.known["find"] = step_find(session)
+    assert session.known["find"].findings == []
+    assert session.device("camera") == "open camera"
+    session.stack.close()
+    assert in_use == []
 
 
 def test_closing_sets_the_coils_to_zero_before_the_devices_are_closed() -> None:
