@@ -118,7 +118,7 @@ def injected_faults(request: RunRequest, text: str) -> tuple[str, ...]:
 
 
 def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
-    """Open the emulated devices of a configuration with the requested faults. Raises UsageError."""
+    """Open the emulated devices of a configuration. Raises UsageError if a requested fault is invalid."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.open_rig(_simulation_request(request, text), config, stack)
@@ -255,8 +255,8 @@ def real_rig(config: Config, stack: ExitStack, patient: bool = False, exclusive:
 def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     """Open the bus of the coils, and switch the coils off before anything else can fail.
 
-    Raises ConfigError. Raises DeviceError for missing hardware, unless `patient` is true: the flight then
-    waits for the hardware.
+    Raises ConfigError if the coils' driver gives no I2C writes that switch the coils off. Raises DeviceError
+    for missing hardware, unless `patient` is true: the flight then waits for the hardware.
     """
     rig = real_rig(config, stack, patient, exclusive=True)
     off = driver_of("coils", config.coils).off(config.coils)
@@ -273,7 +273,7 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
 
 
 def _write_patiently(bus: I2cBus, write: tuple[int, int, int]) -> None:
-    """Write a byte to a register of a coil chip, with two retries. Raises NotResponding."""
+    """Write a byte to a register of a coil chip. Raises NotResponding if the write and two retries fail."""
     for left in (2, 1, 0):
         try:
             bus.write_byte_data(*write)
@@ -348,7 +348,7 @@ def open_vn100(rig: Rig, unit: InertialUnitSection) -> Vn100:
 
 
 def probe_vn100(rig: Rig, unit: InertialUnitSection) -> str:
-    """Ask a VN-100 for its model number. Raises DeviceError."""
+    """Ask a VN-100 for its model number. Raises DeviceError if it does not answer."""
     return f"answers: {open_vn100(rig, unit).model()}"
 
 
@@ -404,7 +404,7 @@ def _started(part: Callable[..., Any], rig: Rig, sensor: Sensor) -> Any:
 
 
 def probe_sensors(rig: Rig, unit: SensorsSection) -> str:
-    """Start all sensors, which writes their settings. Raises NotResponding."""
+    """Start all sensors, which writes their settings. Raises NotResponding if a sensor does not answer."""
     opened = open_sensors(rig, unit)
     try:
         opened.configure()

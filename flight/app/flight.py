@@ -286,7 +286,10 @@ def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Op
 
 
 def _judge(request: RunRequest) -> _Judged:
-    """Read the configuration once, and validate it. Raises UnreadConfigError and UsageError."""
+    """Read the configuration once, and validate it.
+
+    Raises UnreadConfigError if it cannot be read, and UsageError if it or the request is invalid.
+    """
     path = request.config_path
     chosen = accepted_config(path, os.environ) if request.accepted else Chosen(path, read_text(path))
     request = replace(request, config_path=chosen.path)
@@ -341,7 +344,7 @@ BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodi
 
 
 def body_kind(config: Config) -> BodyKind:
-    """Return the kind of body that the configuration selects. Raises ConfigError."""
+    """Return the kind of body that the configuration selects. Raises ConfigError for any other object."""
     kind = imported("body", config.body, BODIES, os.environ)
     if not isinstance(kind, BodyKind):
         raise ConfigError("body", f"is {config.body!r}: this object is not a BodyKind of flight.loop.body")

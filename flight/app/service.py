@@ -691,8 +691,8 @@ def _text(path: Path, data: bytes) -> str:
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
     """Return the configuration as text (`text`, or the file's text) and as values.
 
-    Changes that the request makes to a configuration affect only the values. Raises ConfigError and
-    UsageError.
+    Changes that the request makes to a configuration affect only the values. Raises ConfigError for an
+    invalid configuration, and UsageError if the configuration cannot be changed as requested.
     """
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))

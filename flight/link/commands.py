@@ -287,7 +287,7 @@ Command = Ping | ChangeMode | Slew | Clear | Point | LoadParameters | DumpParame
 
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the pointing target in the fields of a POINT packet. Raises CommandError."""
+    """Return the pointing target in the fields of a POINT packet. Raises CommandError for wrong values."""
     goal = Goal(number)
     try:
         counts = NUMBERS.get(goal, (0,))
@@ -654,7 +654,10 @@ def _bound_unix(path: Path) -> socket.socket:
 
 
 def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
-    """Bind a UDP socket to HOST:PORT for senders in `peers`, or for all senders. Raises UsageError."""
+    """Bind a UDP socket to HOST:PORT for senders in `peers`, or for all senders.
+
+    Raises UsageError if the socket cannot be bound.
+    """
     host, _, port = address.rpartition(":")
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

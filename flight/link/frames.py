@@ -245,7 +245,10 @@ def _packet_starts(data: bytes) -> list[int]:
 
 
 def open_telemetry(frame: bytes, spacecraft: int) -> tuple[bytes, bytes, int]:
-    """Return header, protected data and virtual channel of a frame of the spacecraft. Raises FrameError."""
+    """Return header, protected data and virtual channel of a telemetry frame.
+
+    Raises FrameError for a frame that is too short, or that belongs to another spacecraft.
+    """
     if len(frame) < TELEMETRY_HEADER.size + CRC_BYTES:
         raise FrameError("its length is wrong")
     (first,) = struct.unpack_from(">H", frame)

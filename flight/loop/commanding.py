@@ -152,7 +152,10 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a configuration section with values replaced by a table. Raises ValidationError."""
+    """Return a configuration section with values replaced by a table.
+
+    Raises ValidationError for values that the schema rejects.
+    """
     changes = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
     return msgspec.convert({**msgspec.to_builtins(section), **changes}, type(section))
 
@@ -280,7 +283,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the single command of a step of the configured time line. Raises CommandError."""
+    """Return the command of a step of the time line. Raises CommandError unless there is exactly one."""
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

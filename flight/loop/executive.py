@@ -338,7 +338,10 @@ class WorkerProcess:
     """A worker process, used by one thread only; it is `ready` once it has imported its function."""
 
     def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
-        """Start the process on the given cores; an empty set permits all cores. Raises OSError."""
+        """Start the process on the given cores; an empty set permits all cores.
+
+        Raises OSError if the process cannot be started.
+        """
         self._name = worker.name
         self._received = bytearray()
         self.ready = False

@@ -110,7 +110,7 @@ class Sheddable:
 
 
 class PowerTask:
-    """Task of the housekeeping rate group: estimates the state of charge, sheds loads, and reports both."""
+    """Task of the housekeeping rate group that estimates the state of charge, and sheds loads."""
 
     def __init__(
         self, section: Power, monitors: Sequence[PowerMonitor], loads: Sheddable, services: Services

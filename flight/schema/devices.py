@@ -278,7 +278,11 @@ class Coils(Section, frozen=True, kw_only=True):
         return tuple(coil.current_limit or self.current_limit for coil in self.slots)
 
     def map(self) -> CoilMap:
-        """Return the map from dipole moments to currents. Raises ConfigError and UsageError."""
+        """Return the map from dipole moments to currents.
+
+        Raises ConfigError unless each coil has one dipole moment per ampere, and UsageError if the coils
+        cannot produce a dipole moment in every direction.
+        """
         strength = np.array([coil.strength() for coil in self.slots])
         dipoles = np.array([coil.direction() for coil in self.slots]).T * strength
         return CoilMap(dipoles, np.array(self.limits), np.array(self.resistance))
@@ -479,13 +483,13 @@ FAST = 0.02
 class Camera(Section, frozen=True, kw_only=True):
     """The star camera: properties that are needed to process its frames, and the real camera `device`.
 
-    A frame in which stars form streaks is exposed for a time within the range `streak_exposure` (s) that
-    depends on the body's rate. Frames without streaks, and all frames if `streak_exposure` is omitted, are
-    exposed for `exposure` s. A frame is taken every `period` s or, if `fine_period` is given, every
-    `fine_period` s while the attitude is fine and the body rotates slower than 0.02 rad/s. If `max_rate` is
-    given, no exposure begins while the body rotates faster than `max_rate` rad/s. A frame counts as late
-    `late_after` s after the end of its exposure, and vision counts as slow if a frame takes longer than
-    `vision_slow_after` s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
+    The exposure time of a frame in which stars form streaks depends on the body's rate, within the range
+    `streak_exposure` (s). Frames without streaks, and all frames if `streak_exposure` is omitted, are exposed
+    for `exposure` s. A frame is taken every `period` s or, if `fine_period` is given, every `fine_period` s
+    while the attitude is fine and the body rotates slower than 0.02 rad/s. If `max_rate` is given, no
+    exposure begins while the body rotates faster than `max_rate` rad/s. A frame counts as late `late_after` s
+    after the end of its exposure, and vision counts as slow if a frame takes longer than `vision_slow_after`
+    s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
 
     With `learn_lens`, the star tracker estimates lens parameters, line time and point spread from its solved
     frames, and the next boot continues with the estimates. Nothing is estimated for a camera that is exact
@@ -603,14 +607,20 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:
-    """Return the calibrated lens of a camera, or a pinhole with its field of view. Raises LensError."""
+    """Return the calibrated lens of a camera, or else a pinhole with its field of view.
+
+    Raises LensError for lens parameters outside their ranges.
+    """
     if camera.lens is None:
         return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
     return lens_model(camera.lens, camera.columns, camera.rows)
 
 
 def lens_model(lens: CameraLens, columns: int, rows: int) -> Lens:
-    """Return a lens in front of a detector of `columns` x `rows` pixels. Raises LensError."""
+    """Return a lens in front of a detector of `columns` x `rows` pixels.
+
+    Raises LensError for lens parameters outside their ranges.
+    """
     shape = lens.aspect, lens.shear, lens.p1, lens.p2
     return Lens(columns, rows, lens.focal_length, lens.centre, lens.k1, lens.k2, *shape)
 
@@ -765,7 +775,7 @@ def fitted_devices(config: Any) -> list[tuple[str, str, Any]]:
 
 
 def driver_of(kind: str, section: Any, key: str = "") -> Driver:
-    """Return the registration of the driver that a section names. Raises ConfigError.
+    """Return the registration of the driver that a section names. Raises ConfigError if there is none.
 
     A flight computer imports only permitted objects (`flight.schema.document.imported`).
     """

@@ -171,7 +171,9 @@ class LinkSerial(Section, frozen=True, kw_only=True):
 
 
 class LinkCoding(Section, frozen=True, kw_only=True):
-    """Channel coding for a radio without a coding modem, equal at both ends (`flight.link.coding`).
+    """Channel coding for a radio that has no coding modem (`flight.link.coding`).
+
+    Satellite and ground station must have equal settings.
 
     Telemetry is randomised by the `short` or `long` sequence of CCSDS 131.0-B, and protected by the
     Reed-Solomon code (255,223) with interleaving depth `reed_solomon`. Telecommands are sent in CLTUs of

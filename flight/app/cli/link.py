@@ -132,7 +132,10 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
 
 
 def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
-    """Return a valid configuration, and why it replaces the requested configuration. Raises ConfigError."""
+    """Return a valid configuration, and why it replaces the requested one (or "").
+
+    Raises ConfigError if there is no valid configuration, or if it has no link or no command socket.
+    """
     # A service stores the flown configurations in the folder that also contains its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
@@ -188,7 +191,10 @@ def _witness(keys: Path) -> Path:
 
 
 def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: ExitStack) -> list[Line]:
-    """Open the configured communication lines, which `stack` closes. Raises UsageError and DeviceError."""
+    """Open the configured communication lines, which `stack` closes.
+
+    Raises UsageError if an address cannot be bound, and DeviceError if the serial port cannot be used.
+    """
     peers, lines = peer_networks(section), list[Line]()
 
     def add(line: Line) -> None:

@@ -445,7 +445,10 @@ class Receiver:
         self.keep()
 
     def keep(self) -> None:
-        """Sync the received data to disk and then store the record of received ranges. Raises FileError."""
+        """Sync the received data to disk, and then store the record of received ranges.
+
+        Raises FileError if the record cannot be stored.
+        """
         if not self._dirty:
             return
         if self._file >= 0:
@@ -646,7 +649,7 @@ class Entity:
     def send(
         self, path: Path, name: str, destination: int, kind: int, utc_ns: int, now_ns: int, origin: Origin
     ) -> Progress:
-        """Begin to send a file with a checksum of type `kind`. Raises FileError.
+        """Begin to send a file with a checksum of type `kind`. Raises FileError if the file cannot be sent.
 
         An open transfer of this file is resumed by sending metadata and EOF, so that the receiver requests
         the missing ranges.

@@ -329,7 +329,10 @@ class Timetable:
         return entry
 
     def remove(self, number: int) -> None:
-        """Remove one entry, or all entries for number 0, from the schedule. Raises TimetableError."""
+        """Remove an entry by its number, or all entries for number 0.
+
+        Raises TimetableError if there is no such entry, or if the schedule cannot be stored.
+        """
         left = tuple(entry for entry in self._now.entries if number and entry.number != number)
         if number and len(left) == len(self._now.entries):
             raise TimetableError(f"no command is scheduled with the number {number}")
@@ -472,7 +475,10 @@ class Scheduling:
 
 
 def utc_of(text: str) -> int:
-    """Return the ns since 1970 of a UTC in ISO 8601 format, at most 2262-04-11. Raises CommandError."""
+    """Return the ns since 1970 of a UTC in ISO 8601 format.
+
+    Raises CommandError for any other text, and for a time after 2262-04-11.
+    """
     try:
         time = datetime.fromisoformat(text)
         if len(text) <= _DATE_LENGTH:

@@ -412,7 +412,10 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
-    """Yield the segments of a packet as packets, with times from `utc_ns` on. Raises CommandError."""
+    """Yield the segments of a packet as packets, with times from `utc_ns` on.
+
+    Raises CommandError if the packet is longer than `LONGEST_IN_PORTIONS`.
+    """
     total = -(-len(packet) // _PORTION_BYTES)
     if len(packet) > LONGEST_IN_PORTIONS:
         raise CommandError(f"{len(packet)} bytes exceed the longest command")

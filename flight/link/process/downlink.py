@@ -205,7 +205,7 @@ _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
     for packet in (RUN, TARGET, MODE, PLAN, STREAK, STARS, EVENT, COMMAND)
 }
-"""Identifiers of packet types of which every packet must be sent."""
+"""Identifiers of the packet types that are never thinned out."""
 
 _BURST_S = 0.1
 _WAITING_S = 0.5

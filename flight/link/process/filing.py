@@ -81,7 +81,10 @@ class Filing:
     """Executes the file commands and manages the file transfers on board. Not thread-safe."""
 
     def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
-        """Continue the transfers in `folder`; `log` contains the recorded runs. Raises UsageError."""
+        """Continue the transfers in `folder`; `log` contains the recorded runs.
+
+        Raises UsageError if the folder cannot be used.
+        """
         self._folder = folder
         self._store = Store(folder)
         self._roots = {"log": log, "received": self._store.received}
@@ -215,7 +218,7 @@ class Filing:
         return ""
 
     def _write_listing(self, under: str) -> Path:
-        """Write the list of files, sorted by name, and return the path of the list. Raises FileError."""
+        """Write the list of files, sorted by name, and return its path. Raises FileError on a disk error."""
         files = []
         for name, root in self._roots.items():
             for path in root.rglob("*"):

@@ -118,7 +118,7 @@ class UdpLine:
         peers: Sequence[IPv4Network] | None = None,
         codes: LinkCodes | None = None,
     ) -> None:
-        """Bind a UDP socket to the address HOST:PORT. Raises UsageError.
+        """Bind a UDP socket to the address HOST:PORT. Raises UsageError if the socket cannot be bound.
 
         The fixed address `to` receives telemetry. Only senders in the networks `peers` are accepted, or all
         senders if `peers` is None. If `codes` is None, frames are not coded.
@@ -197,7 +197,7 @@ class TcpLine:
     def __init__(
         self, address: str, peers: Sequence[IPv4Network] | None = None, framing: Framing | None = None
     ) -> None:
-        """Listen for connections at the address HOST:PORT. Raises UsageError.
+        """Listen for connections at the address HOST:PORT. Raises UsageError if it cannot be bound.
 
         Connections are accepted from the networks `peers`, or from everywhere if `peers` is None. Without a
         `framing`, frames are not coded, and each frame follows a sync marker.
@@ -610,9 +610,9 @@ class Station:
         self._hand_over(sent, admitted.data, now_ns)
 
     def _joined(self, admitted: Admitted) -> Admitted:
-        """Return the content of a frame. Raises CommandError.
+        """Return the content of a frame. For the last segment of a packet, this is the whole packet.
 
-        For the last segment of a packet, the content is the whole packet.
+        Raises CommandError for a damaged directive, or if a segment is missing.
         """
         if is_unit(admitted.data, UP) or not isinstance(portion := directives.unpack(admitted.data), Portion):
             return admitted
@@ -711,7 +711,10 @@ class Station:
         return self._clock.now_ns() + self._utc_offset_ns
 
     def _seal(self, header: bytes, data: bytes) -> bytes:
-        """Protect a frame with the primary SPI, or else the reserve SPI. Raises KnightCubeError."""
+        """Protect a frame with the primary SPI, or else the reserve SPI.
+
+        Raises KnightCubeError if neither SPI can protect it.
+        """
         problem: KnightCubeError | None = None
         for sealer in self._sealers.values():
             try:

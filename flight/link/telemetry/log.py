@@ -494,7 +494,10 @@ class FlightLog:
 
 
 def _clear(folder: Path, stem: str, overwrite: bool) -> None:
-    """Create the folder of a log, and remove an old log if `overwrite`. Raises UsageError and OSError."""
+    """Create the folder of a log, and remove an old log if `overwrite`.
+
+    Raises UsageError if there is an old log that must not be removed, and OSError if the disk fails.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     old = find_segments(folder, stem)
     if old and not overwrite:

@@ -64,7 +64,10 @@ ADDED = (
 
 
 def read(path: Path) -> Source:
-    """Return the columns of a parquet file, which may be a member of a Python wheel. Raises UsageError."""
+    """Return the columns of a parquet file, which may be a member of a Python wheel.
+
+    Raises UsageError if pyarrow is not installed, or if the file is not the source of the star table.
+    """
     try:
         import pyarrow  # noqa: PLC0415 - needed for the build only, not on board
         import pyarrow.parquet  # noqa: PLC0415

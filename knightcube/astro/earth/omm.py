@@ -34,8 +34,8 @@ from knightcube.errors import UsageError
 
 _SGP4_EPOCH = datetime(1949, 12, 31, tzinfo=UTC)
 _ANY_NUMBER, _LARGEST_NUMBER = 999_999_999, 339_999
-"""Largest satellite number in an OMM (first value) and in two-line elements (second value), in which 0 is
-written for a larger number."""
+"""Largest satellite number in an OMM, and in two-line elements. In two-line elements, 0 replaces a larger
+number."""
 _FIXED = {
     "CENTER_NAME": ("EARTH",),
     "REF_FRAME": ("TEME",),

@@ -81,8 +81,8 @@ _PROOF = 1.0
 _SHARE_SIGMA = 0.2
 """Largest standard deviation of the fitted response g at which the commands can be confirmed."""
 _WHITE = 0.5
-"""Minimum ratio of half the mean squared successive difference of the residuals to their mean square, for
-which they count as white. The expected ratio is one for white noise (von Neumann 1941) and near zero for a
+"""Residuals count as white if half the mean square of their successive differences is at least this fraction
+of their mean square. The expected fraction is one for white noise (von Neumann 1941) and near zero for a
 drift."""
 _SCALE_OVER = 64.0
 """Number of gyro samples over which the scale factor of the gyro noise is averaged."""

@@ -733,8 +733,8 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Time (ns) by which the oldest checkpoint may exceed the length of the history before all checkpoints older
-than the history are dropped."""
+"""Time (ns) by which the oldest checkpoint may be older than the history. Beyond this time, all checkpoints
+older than the history are dropped."""
 _TIME = attrgetter("time_ns")
 
 
