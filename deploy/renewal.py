@@ -312,7 +312,7 @@ class Board:
                 replace_file(path, contents[one])
 
     def linked(self, link: str) -> str:
-        """Return the name to which a symbolic link points, or empty text if none exists. Raises OSError."""
+        """Return the target name of a symbolic link, or an empty text if none exists. Raises OSError."""
         with suppress(FileNotFoundError):
             return Path(os.readlink(self.prefix / link)).name
         return ""

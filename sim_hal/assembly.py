@@ -165,7 +165,7 @@ def assemble(
 
 
 def _power(given: Emulation, camera: EmulatedCamera | None) -> EmulatedPower | None:
-    """Return the power system with its monitors. Raises ConfigError for panels without an orbit."""
+    """Return the power system with its monitors. Raises ConfigError if panels have no orbit."""
     section, truth = given.config.power, given.section.power
     if section is None:
         return None
@@ -202,7 +202,7 @@ def _star_camera(
 
 
 def _true_description(config: Config, section: Simulation, world: World) -> dict[str, FloatArray] | None:
-    """Return the fields of the packet `true_description`, or None for a world without a satellite."""
+    """Return the fields of the packet `true_description`, or None if the world has no satellite."""
     craft = getattr(world, "craft", None)
     if craft is None or not isinstance(config, OrbitConfig):
         return None
@@ -404,7 +404,7 @@ def _horizon_camera(
     now_ns: Callable[[], int],
     expose: ExposeWide,
 ) -> EmulatedCamera:
-    """Return a horizon camera. Raises ConfigError in a world without an orbit."""
+    """Return a horizon camera. Raises ConfigError if the world has no orbit."""
     from sim_hal.earth_camera import EarthScene  # noqa: PLC0415 - see above
     from sim_hal.worlds.orbit import sun_position  # noqa: PLC0415 - see above
 

@@ -110,7 +110,7 @@ class EarthScene:
         return np.asarray(vectors @ self.earth_matrix.T)
 
     def on_unit_sphere(self) -> tuple[FloatArray, FloatArray]:
-        """Return the camera's position (3,), and the matrix (3, 3) from camera axes, in the scaled axes.
+        """Return the camera's position (3,) in scaled axes, and the matrix (3, 3) from camera to scaled axes.
 
         The scaled axes are Earth-fixed axes in which the ellipsoid is the unit sphere.
         """

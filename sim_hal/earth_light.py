@@ -214,7 +214,7 @@ _DARKEST = -0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarthIntersection:
-    """First intersections of n lines of sight with the Earth's ellipsoid, or their nearest points to it.
+    """First intersections of n lines of sight with the ellipsoid, or nearest points of lines that miss it.
 
     The heights (n,), m, are 0 for lines that meet the ground and infinite for lines that point away from the
     Earth. The points `places` (n, 3) are in Earth-fixed axes that are scaled so that the ellipsoid is the
@@ -229,10 +229,10 @@ class EarthIntersection:
 def intersect(rays: Floats, origin: FloatArray, into_earth: FloatArray) -> EarthIntersection:
     """Return the intersections of rays (3, n) of any length, in camera axes, with the Earth.
 
-    `origin` (3,) and `into_earth` (3, 3) are the camera's position, and the matrix from camera axes, in the
-    scaled axes. The precision is that of `rays`. For 32-bit rays from altitudes up to 2,000 km, the errors of
-    all heights are below 2 m, and the errors of 99.9 % of the places are below 20 m. Places near the limb
-    have larger errors along the line of sight.
+    `origin` (3,) is the camera's position in the scaled axes, and `into_earth` (3, 3) is the matrix from
+    camera axes to the scaled axes. The precision is that of `rays`. For 32-bit rays from altitudes up to
+    2,000 km, the errors of all heights are below 2 m, and the errors of 99.9 % of the places are below 20 m.
+    Places near the limb have larger errors along the line of sight.
     """
     start = origin.astype(rays.dtype)
     axes: Floats = semi_axes().astype(rays.dtype)
@@ -297,14 +297,15 @@ class AirTables(NamedTuple):
     """Functions of the air at evenly spaced arguments, for linear interpolation.
 
     Attributes:
-        sight: air density at the lowest point divided by the density at the ground, optical depth, and
-            1 - exp(-optical depth) (3, 2 x `_STEPS` + 3) of lines of sight. The first `_STEPS` + 1 columns
-            are for lines that meet the ground, with cosines of the zenith angle from 0 to 1. The other
-            columns are for lines above the ground, with tangent heights from 0 to `TOP`.
-        sun: optical depth towards the Sun, and sunlight that reaches horizontal ground (2, `_SUN_STEPS` + 2),
-            at cosines of the Sun's zenith angle from `_DARKEST` to 1.
-        share: mean transmission (1, `_STEPS` + 2) of scattered sunlight at 1/(1 + x) from 0 to 1, where x is
-            the mean optical depth that the sunlight has passed (`Atmosphere.scattered`).
+        sight: table (3, 2 x `_STEPS` + 3) for lines of sight. The rows are the air density at the lowest
+            point divided by the density at the ground, the optical depth, and 1 - exp(-optical depth). The
+            first `_STEPS` + 1 columns are for lines that meet the ground, with cosines of the zenith angle
+            from 0 to 1. The other columns are for lines above the ground, with tangent heights from 0 to
+            `TOP`.
+        sun: table (2, `_SUN_STEPS` + 2) at cosines of the Sun's zenith angle from `_DARKEST` to 1. The rows
+            are the optical depth towards the Sun, and the sunlight that reaches horizontal ground.
+        share: table (1, `_STEPS` + 2) of the mean transmission of scattered sunlight, at 1/(1 + x) from 0 to
+            1, where x is the mean optical depth that the sunlight has passed (`Atmosphere.scattered`).
     """
 
     sight: Float32Array
@@ -409,12 +410,12 @@ def light(
     share_table: Float32Array,
     noise: npt.NDArray[np.int64],
 ) -> tuple[Float32Array, BoolArray]:
-    """Return the Earth's radiance (n,) along rays, and whether a line of sight shows air above the limb (n,).
+    """Return the Earth's radiance (n,) along rays, and the mask (n,) of rays with visible air above the limb.
 
-    Air with a radiance below `FAINTEST` counts as not shown.
+    Air is visible if its radiance exceeds `FAINTEST`.
 
     Args:
-        rays: unit vectors (3, n) in camera axes; NaN gives no light.
+        rays: unit vectors (3, n) in camera axes; the radiance along a ray of NaN is 0.
         origin: position (3,) of the camera in the scaled axes.
         into_earth: matrix (3, 3) from camera axes into the scaled axes.
         axes: semi-axes (3,) of the ellipsoid, m.
@@ -467,9 +468,9 @@ def light(
 def _earthward(
     origin: FloatArray, into_earth: FloatArray, axes: FloatArray
 ) -> tuple[tuple[np.float32, np.float32, np.float32], np.float32]:
-    """Return the unit vector (3,) to the centre of the Earth, in camera axes, and a cosine.
+    """Return the unit vector (3,) to the centre of the Earth, in camera axes, and a limit.
 
-    A unit ray whose product with the vector is below the cosine stays above the height `TOP`.
+    A unit ray stays above the height `TOP` if its scalar product with the vector is below the limit.
     """
     x, y, z = origin[0] * axes[0], origin[1] * axes[1], origin[2] * axes[2]
     distance = math.sqrt(x * x + y * y + z * z)
@@ -488,7 +489,7 @@ def _earthward(
 def _steepest(
     rays: Float32Array, start: int, size: int, down: tuple[np.float32, np.float32, np.float32]
 ) -> np.float32:
-    """Return the largest product of `down` (3,) with `size` rays (3, n) from the column `start` on.
+    """Return the largest scalar product of `down` (3,) with `size` rays (3, n) from the column `start` on.
 
     Rays that are not numbers are ignored.
     """
@@ -513,8 +514,8 @@ def _trace(
     """Store the quantities of `size` lines of sight (3, n), from the column `start` on, that `light` needs.
 
     The array `traced` (6 x `_BLOCK`) has, for each line of sight, the column number of `AirTables.sight`, the
-    column number of `AirTables.sun` (-1 for a line of sight without light), the cosine of the scattering
-    angle, and the point on the ground (3), m.
+    column number of `AirTables.sun` (-1 for a dark line of sight), the cosine of the scattering angle, and
+    the point on the ground (3), m.
     """
     m = into_earth.astype(np.float32)
     m11, m12, m13, m21, m22, m23 = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]
@@ -596,7 +597,7 @@ def _between(table: Float32Array, row: int, low: int, step: np.float32) -> np.fl
 def _find_albedo(
     points: Float32Array, count: int, noise: npt.NDArray[np.int64], heights: Float32Array
 ) -> None:
-    """Overwrite the first coordinates of points (3 x `_BLOCK`) on the ground, m, with the albedo.
+    """Compute the albedo of points (3 x `_BLOCK`) on the ground, m, and overwrite their first coordinates.
 
     `heights` (2 x `_BLOCK`) is overwritten with noise.
     """

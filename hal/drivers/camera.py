@@ -157,7 +157,7 @@ class ServedCamera:
             raise type(self._failure)(self._failure.device, self._failure.message)
 
     def _serve(self) -> None:
-        """Periodic job: pass requests to the camera device and take frames from it."""
+        """Pass requests to the camera device and take frames from it. The clock calls this periodically."""
         if not self._open and not self._reopened():
             return
         with self._lock:

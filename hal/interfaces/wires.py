@@ -66,7 +66,7 @@ class Clock(Protocol):
         """Running tickers in the order of their creation."""
 
     def utc_ns(self) -> int:
-        """Return UTC in ns since 1970. UTC may jump, so it dates data but never times the control loop."""
+        """Return UTC in ns since 1970. UTC may jump, so the control loop never measures time by it."""
 
 
 class SerialPort(Protocol):

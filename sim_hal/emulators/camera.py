@@ -55,8 +55,7 @@ class EmulatedCamera:
     """An emulated camera, which implements FrameSource and EmulatedDevice.
 
     Attributes:
-        fault: present fault, "off", "frozen", "torn" or a key of `SPOILT`; empty for a camera without a
-            fault.
+        fault: present fault, which is "off", "frozen", "torn" or a key of `SPOILT`, or an empty text.
         late_ns: additional delay of the frames, ns.
         one_of: number n of triggers per frame; a camera with n > 1 has a fault and reacts only to every n-th
             trigger.

@@ -81,7 +81,7 @@ class EmulatedPower:
         rails: measured supply lines of battery and bus.
         cells_lost: number of cells without voltage.
         weakness: factor by which the internal resistance is multiplied and the capacity is divided.
-        lost_panel: number of the failed panel, 0 if all panels have failed, or None without a failure.
+        lost_panel: number of the failed panel, 0 if all panels have failed, or None if no panel has failed.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class EmulatedPower:
         camera: EmulatedCamera | None,
         start_ns: int,
     ) -> None:
-        """Connect battery, panels and loads. Raises ConfigError for a panel without a direction."""
+        """Connect battery, panels and loads. Raises ConfigError if the normal of a panel is zero."""
         self._battery = truth.battery or battery
         self._truth, self._world, self._supply, self._camera = truth, world, supply, camera
         self.charge = truth.charge

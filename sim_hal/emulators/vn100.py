@@ -365,9 +365,9 @@ class AttitudeCommands:
 
 
 def flag(fields: tuple[str, ...]) -> bool:
-    """Return the field of a command with one field, 0 or 1, as a bool.
+    """Return the only field of a command as a bool.
 
-    Raises UnitError for a field other than 0 or 1.
+    Raises UnitError unless the command has one field, which is 0 or 1.
     """
     expect_count(fields, 1, 1)
     if fields[0] not in {"0", "1"}:
@@ -378,7 +378,7 @@ def flag(fields: tuple[str, ...]) -> bool:
 def _yaw_of(fields: tuple[str, ...]) -> float:
     """Return the yaw (rad) from the fields: a heading (deg), three angles (deg) or a quaternion.
 
-    Raises UnitError.
+    Raises UnitError for any other fields.
     """
     expect_count(fields, 1, 4)
     if len(fields) == 2:
@@ -468,7 +468,7 @@ class OutputStreams:
         self._streams = streams
 
     def next_tick(self, passed: int) -> int | None:
-        """Return the first tick after the tick `passed` on which a stream is due, or None without streams."""
+        """Return the first tick after the tick `passed` on which a stream is due, or None for no stream."""
         return min(((passed // s.divisor + 1) * s.divisor for s in self._streams.values()), default=None)
 
     def due(self, tick: int) -> list[Stream]:

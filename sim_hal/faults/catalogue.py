@@ -73,7 +73,7 @@ class Bench:
         generator: random generator of the faults.
         host: host end of a serial line in memory, or None for a pseudo-terminal.
         flight_process: process identifier of the flight process, or None in lock-step.
-        gps_line: serial line of the GPS receiver, or None without a receiver.
+        gps_line: serial line of the GPS receiver, or None if there is no receiver.
     """
 
     hardware: Hardware

@@ -178,7 +178,7 @@ _LONGEST_WAIT_S = 0.05
 
 
 def emulate(options: argparse.Namespace) -> int:
-    """Serve the bus until the given program ends or, without a program, until a signal or a time limit."""
+    """Serve the bus until the given program ends, or until a signal or a time limit if there is none."""
     config = configuration.load(options.config)
     text = options.config.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(options.config), Simulation)

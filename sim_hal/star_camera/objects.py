@@ -209,7 +209,7 @@ class SkyObjects:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FreeFall:
-    """Trajectory of about one second from a position (3,), m, and a velocity (3,), m/s, at time `at`, s."""
+    """Trajectory over about 1 s, given the position (3,), m, and velocity (3,), m/s, at time `at`, s."""
 
     at: float
     position: FloatArray

@@ -211,7 +211,7 @@ class OrbitingWorld(World, Protocol):
 
 
 def orbiting(world: World, section: str) -> OrbitingWorld:
-    """Return `world` if it has an orbit, else raise ConfigError with the name `section`."""
+    """Return `world`. Raises ConfigError, with the name `section`, if the world has no orbit."""
     if not isinstance(world, OrbitingWorld):
         raise ConfigError(section, "needs a world with an orbit, such as `simulation.world: free_body`")
     return world
