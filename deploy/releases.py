@@ -133,7 +133,8 @@ class Trials:
     def _persistently_read(self) -> str:
         """Return the text of the record. Raises OSError and ValueError.
 
-        A single failed disk access does not mean damage, and the next write would drop the proven releases.
+        Several attempts are made, because a single failed disk access does not mean damage. If the record
+        were ignored, the next write would discard the list of proven releases.
         """
         for _ in range(TRIES - 1):
             with suppress(OSError):

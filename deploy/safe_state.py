@@ -131,7 +131,7 @@ def pack(obeyed: bool, name: str, count: int, text: str) -> bytes:
 
 
 def say(text: str) -> None:
-    """Write a line to standard error, from where it enters the journal of the board, if possible."""
+    """Write a line to standard error, which systemd records in the journal. Errors are ignored."""
     with contextlib.suppress(OSError):
         sys.stderr.write(f"safe state: {text}\n")
         sys.stderr.flush()

@@ -13,7 +13,7 @@ and outputs back, and after a brown-out it configures the chip again. After any 
 zero.
 
 Zero current is commanded by low levels at both inputs of all bridges, because the chip executes a write to
-its register ALL_LED_OFF_H even without a configuration. If a leg of a bridge is stuck high, low inputs would
+its register ALL_LED_OFF_H even if it is not configured. If a leg of a bridge is stuck high, low inputs would
 drive current through the coil, so this bridge is braked (both inputs high) immediately afterwards.
 
 Instead of a PWM chip with H-bridges, DRV8830 bridges (TI SLVSAB2) with an I2C interface and a regulated
@@ -262,7 +262,7 @@ _Answer = TypeVar("_Answer")
 
 
 class PwmOutputs(Protocol):
-    """Interface of a PWM chip, or of bridges that imitate one; each method raises DeviceError on failure."""
+    """Interface of a PWM chip or of bridges that act like one. Every method raises DeviceError on failure."""
 
     name: str
 
@@ -286,7 +286,7 @@ class CoilOutputs:
     """Writes the coils' signed counts to the PWM chip, and records the last acknowledged outputs.
 
     Attributes:
-        written: signed PWM counts of the coils that the chip acknowledged last.
+        written: signed PWM counts of the last write that the chip acknowledged.
         braked: indices of the braked bridges.
         written_ns: host time at which these counts were first written, ns; -1 before the first write.
         failing: whether the last transaction failed, so that the state of the chip is unknown.

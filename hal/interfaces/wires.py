@@ -25,7 +25,7 @@ class Ticker(Protocol):
 
     Attributes:
         name: name of the periodic job.
-        period_ns: period (ns) of the job, which the method `kick` can run earlier.
+        period_ns: period of the job, ns; the method `kick` runs the job earlier.
         error: exception of the last run as text, or an empty text if the run succeeded.
         served_ns: time (ns) at which a run last succeeded, initially the time of creation.
     """
