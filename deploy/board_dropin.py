@@ -11,6 +11,7 @@ status 2.
 from __future__ import annotations
 
 import os
+import re
 import stat
 import string
 import sys
@@ -31,6 +32,8 @@ SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
 """Driver classes of pluggable devices: serial lines, video devices, and no class for I2C buses."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 """Driver classes of the devices, by section of the configuration."""
+_PLAIN = re.compile(r"[A-Za-z0-9_./:+,@=-]+")
+"""Paths without a line break or another character that has a meaning in a unit file."""
 
 
 def dropin(config: Config) -> str:
@@ -51,7 +54,7 @@ def safe_dropin(config: Config) -> str:
     """Return the drop-in of knightcube-safe.service, which accesses the coils and the command socket."""
     lines = ["[Service]", *(_bus(config) if config.simulation is None else [])]
     if config.commands.socket is not None:
-        lines.append(f'Environment="KNIGHTCUBE_COMMANDS={config.commands.socket}"')
+        lines.append(f'Environment="KNIGHTCUBE_COMMANDS={plain(config.commands.socket)}"')
     return _text(lines)
 
 
@@ -60,7 +63,7 @@ def link_dropin(config: Config, root: Path = Path("/")) -> str:
     link = config.link
     if link is None:
         return ""
-    lines = ["[Service]", f"ReadWritePaths=-{Path(link.keys).absolute()}"]
+    lines = ["[Service]", f"ReadWritePaths=-{plain(str(Path(link.keys).absolute()))}"]
     if peers := peer_networks(link):
         lines += _network(peers)
     if link.serial is not None:
@@ -79,6 +82,16 @@ def _line(device: str, root: Path) -> list[str]:
     """
     opened = allowed(device, SERIAL, root)
     return opened if len(opened) > 1 else [*opened, "PrivateDevices=yes", f"BindPaths={device}"]
+
+
+def plain(path: str) -> str:
+    """Return a path of the configuration, which root writes to a unit file.
+
+    Raises UsageError for a path with a character that could change the meaning of the unit file.
+    """
+    if not _PLAIN.fullmatch(path):
+        raise UsageError(f"{path!r}: a path of a board consists of letters, digits and _ . / : + , @ = -")
+    return path
 
 
 def device_unit(path: str) -> str:
@@ -105,7 +118,7 @@ def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list
         of_device = root / f"sys/dev/char/{os.major(number)}:{os.minor(number)}"
         on_usb = stat.S_ISCHR(mode) and any(part.startswith("usb") for part in of_device.resolve().parts)
         classes = _driver_classes(os.major(number), root) if on_usb else ()
-    return [f"DeviceAllow={what} rw" for what in (path, *(f"char-{name}" for name in classes))]
+    return [f"DeviceAllow={what} rw" for what in (plain(path), *(f"char-{name}" for name in classes))]
 
 
 def _driver_classes(major: int, root: Path) -> tuple[str, ...]:

@@ -130,3 +130,29 @@ def test_the_unit_knows_the_writes_that_stop_other_bridges(tmp_path: Path) -> No
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     words = "0x61 0x00 0x00 0x62 0x00 0x00 0x63 0x00 0x00"
     assert f'Environment=KNIGHTCUBE_I2C=/dev/i2c-1 "KNIGHTCUBE_PWM={words}"\n' in dropin(path)
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("commands", "socket", '/run/a"\nExecStartPre=+/bin/sh'),
+        ("commands", "socket", "/run/%n"),
+        ("link", "keys", "/keys\nUser=root"),
+        ("link", "serial", {"device": "/dev/ttyS0\n"}),
+        ("coils", "bus", "/dev/i2c-1\n"),
+        ("inertial_unit", "device", "/dev/imu\nUser=root"),
+    ],
+)
+def test_no_path_of_a_configuration_adds_a_setting_to_a_unit(
+    section: str, key: str, value: object, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = yaml.safe_load(TESTBED.read_text(encoding="utf-8"))
+    tree["commands"] = {"socket": "/run/knightcube/commands"}
+    tree["link"] = {"keys": "/keys", "udp": "127.0.0.1:5000"}
+    changed = tmp_path / "flight.yaml"
+    changed.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    assert board_dropin.main([str(changed), str(tmp_path)]) == 0
+    tree[section][key] = value
+    changed.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    assert board_dropin.main([str(changed), str(tmp_path)]) == 2
+    assert "a path of a board consists of" in capsys.readouterr().err
