@@ -414,7 +414,8 @@ def command_of_words(text: str, stored: bool = False) -> Command:
         numbers = [_number(field, word) for word in [*taken, *[""] * (field.count - len(taken))]]
         fields[field.name] = numbers if field.count > 1 else numbers[0]
     if words:
-        raise CommandError(f"{text}: unexpected words after {packet.fields[-1].name}")
+        last = packet.fields[-1].name if packet.fields else name
+        raise CommandError(f"{text}: unexpected words after {last}")
     command = command_of(packet, fields)
     CommandPacker().pack(command, 0)
     return command

@@ -191,6 +191,7 @@ def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> 
     assert "is not a UTC" in refused("2099-01-01", "ping 1"), "the time of day is missing"
     assert "is not a command" in refused(later, "schedule x ping")
     assert "must lie within" in refused(later, "slew 3")
+    assert "unexpected words after dump-parameters" in refused(later, "dump-parameters 1")
     assert "no command is scheduled with the number 5" in texts(link, send(link, Deletion(5)))[-1]
     for _ in range(MOST_ENTRIES):
         link.terminal.send(directives.pack(Scheduled(later, "ping 1"), 1))
@@ -353,7 +354,7 @@ def test_words_are_read_by_the_table() -> None:
     assert command_of_words("safe end of pass") == ChangeMode(Mode.SAFE, "end of pass")
     assert command_of_words("mode hold") == ChangeMode(Mode.HOLD)
     assert command_of_words("point sun") == Point(PointingTarget(Goal.SUN, (), None))
-    for wrong in ("", "mode up", "ping", "ping x", "slew 0.1 0.2", "point sun roll"):
+    for wrong in ("", "mode up", "ping", "ping x", "slew 0.1 0.2", "point sun roll", "dump-parameters 1"):
         with pytest.raises(CommandError):
             command_of_words(wrong)
 
