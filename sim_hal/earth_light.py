@@ -10,9 +10,10 @@ valid for a Sun below the horizon. The model omits refraction (which raises the 
 
 Lines of sight are intersected exactly with the WGS 84 ellipsoid, in axes that are scaled so that the
 ellipsoid is the unit sphere. The ground is Lambertian. Direct sunlight is attenuated by the air on the way to
-the ground and again on the way to the camera. Land, sea and cloud are noise with a power-law spectrum,
-sampled on a sphere in a periodic volume at two scales: continents and weather, and coasts and single clouds.
-The map does not show the real Earth, but has bright edges inside the limb, which disturb a horizon detector.
+the ground and again on the way to the camera. The map of land, sea and cloud is noise with a power-law
+spectrum, sampled on a sphere within a periodic volume. The noise has two scales: continents and weather
+systems, and coasts and single clouds. The map does not show the real Earth, but has bright edges inside the
+limb, which disturb a horizon detector.
 
 The radiance along many lines of sight has a numpy form and a compiled form (`knightcube.compiled`). Both
 forms read the air's functions from tables with linear interpolation. For scale heights from 8 km, the
@@ -513,9 +514,9 @@ def _trace(
 ) -> None:
     """Store the quantities of `size` lines of sight (3, n), from the column `start` on, that `light` needs.
 
-    The array `traced` (6 x `_BLOCK`) has, for each line of sight, the column number of `AirTables.sight`, the
-    column number of `AirTables.sun` (-1 for a dark line of sight), the cosine of the scattering angle, and
-    the point on the ground (3), m.
+    For each line of sight, the array `traced` (6 x `_BLOCK`) contains the column number of `AirTables.sight`,
+    the column number of `AirTables.sun` (-1 for a dark line of sight), the cosine of the scattering angle,
+    and the point on the ground (3), m.
     """
     m = into_earth.astype(np.float32)
     m11, m12, m13, m21, m22, m23 = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]

@@ -13,8 +13,8 @@ later (M9, M10, F9) are configured by CFG-VALSET (u-blox F9 interface descriptio
 receivers (u-blox 7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version
 in MON-VER. If the receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa.
 No call blocks. If bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud
-rates, and switches a receiver that it finds to the configured baud rate. Consumer receivers stop working
-above 18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
+rates. When it finds the receiver, it commands the configured baud rate. Consumer receivers stop working above
+18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
 
 A receiver with the driver `nmea` sends sentences by itself, about once a second. The sentence RMC contains
 date, time, ground speed and course, and the sentence GGA contains the position with altitude, quality and

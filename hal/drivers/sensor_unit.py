@@ -4,7 +4,7 @@ A unit without a gyro gives readings without a rate. `CheckedUnit` rejects impla
 that is not part of this package.
 
 CircuitPython drivers of motion sensors have the properties `gyro` (rad/s), `magnetic` (microtesla) and
-`acceleration` (m/s^2), take an I2C bus with the methods of `busio.I2C`, and sleep while they start. All
+`acceleration` (m/s^2). They use an I2C bus with the methods of `busio.I2C`, and wait while they start. All
 sensors are started before the control loop, and are read by a separate periodic job, never by the control
 loop. After a failure the job starts all sensors again, because a brown-out clears their settings. A gyro or
 magnetometer that repeats the same value for three seconds counts as a failure, because after a brown-out many

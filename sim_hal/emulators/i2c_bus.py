@@ -101,7 +101,7 @@ class _Fault:
 
 
 class EmulatedI2cBus:
-    """An I2C bus (`hal.interfaces.wires.I2cBus`) with emulated chips, which is safe for several threads."""
+    """A thread-safe I2C bus (`hal.interfaces.wires.I2cBus`) with emulated chips."""
 
     def __init__(self, parts: Sequence[I2cPart] = (), wait: Callable[[int], None] | None = None) -> None:
         """Connect the chips.

@@ -290,7 +290,7 @@ def _irradiance(
 ) -> FloatArray:
     """Return the irradiances (n,), relative to sunlight at normal incidence, that the solar strings use.
 
-    If the cosine of the incidence angle is below `grazing`, the used light decreases with its square.
+    If the cosine of the incidence angle is below `grazing`, the used light decreases with the cosine squared.
 
     Args:
         normals: unit normals (n, 3) of the strings, ICRS.

@@ -738,10 +738,10 @@ def expected_electrons(
     """Return the charge (rows, columns) of an exposure, e-, without noise, dark current and saturation.
 
     `directions` (n, 3) are ICRS unit vectors to the stars and `magnitudes` (n,) their Johnson V magnitudes.
-    `quaternions` (k, 4), ICRS into camera, at `times` (k,), s, give the attitude from the start to the end of
-    the exposure, which for a rolling shutter is the end of the last row's exposure. The model is a corrected
-    version of Sease, eqs. 2.1 to 2.9 and 2.12. Raises ValueError for arrays of the wrong shape or with values
-    that are not finite, and OutOfRange for an invalid attitude.
+    `quaternions` (k, 4), ICRS into camera, are the attitudes at `times` (k,), s, from the start to the end of
+    the exposure. The exposure of a rolling shutter ends with the exposure of the last row. The model is a
+    corrected version of Sease, eqs. 2.1 to 2.9 and 2.12. Raises ValueError for arrays of the wrong shape or
+    with values that are not finite, and OutOfRange for an invalid attitude.
     """
     history = AttitudeHistory(times, quaternions)
     return _light(model, directions, magnitudes, history, extra).astype(np.float64)

@@ -13,9 +13,9 @@ changes only while the Earth covers part of the Sun as seen from the object.
 Stellar aberration by the camera's motion is modelled as a rotation of the whole frame by the aberration at
 the boresight (26" at most). The variation of the aberration across 20 deg, 4", is not modelled. An object in
 orbit shares the Earth's motion, so the aberration that the Earth's motion causes is subtracted from its
-track. The frame saturates if the Sun or sunlit ground is in the field of view, or if its angle to the
-boresight is less than the exclusion angle of the camera's baffle (`SkySection`). The dark Earth hides the
-stars behind it.
+track. The frame saturates if the Sun or sunlit ground is in the field of view, or if the boresight is closer
+to one of them than the exclusion angle of the camera's baffle (`SkySection`). The dark Earth hides the stars
+behind it.
 """
 
 from __future__ import annotations

@@ -180,8 +180,8 @@ class OrbitTruth(WorldTruth):
         rate: rotation rate (3,), rad/s, body axes.
         position, velocity, field, sun, sunlit: as in `OrbitEnvironment`.
         residual_dipole: residual dipole (3,), A m^2, body axes.
-        torques: function that returns the torque (3,), N m, body axes, of each cause in `CAUSES`, or an empty
-            dict if the world does not provide separate torques.
+        torques: function that returns a dict from each cause in `CAUSES` to its torque (3,), N m, body axes.
+            The dict is empty if the world does not provide separate torques.
     """
 
     utc: float
