@@ -154,7 +154,7 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices, None or empty if not configured; `supply` begins with the battery's monitor."""
+    """The open devices; a missing device is None or empty. `supply` begins with the battery's monitor."""
 
     unit: InertialUnit
     magnetometer: InertialUnit | None

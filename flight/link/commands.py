@@ -351,7 +351,7 @@ def check(packet: Packet, fields: Mapping[str, Any]) -> None:
 
 
 class CommandPacker:
-    """Encoder of commands as packets, which counts the packets of each type."""
+    """Encodes commands as packets, and counts the packets of each type."""
 
     def __init__(self) -> None:
         self._packer = Packer(LAYOUTS)

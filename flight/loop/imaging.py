@@ -85,8 +85,8 @@ class ImagingSettings:
         fine_rest_ns: minimum time (ns) between exposures while the attitude estimate is accurate, the body
             rotates slowly and no object is searched for.
         seeks: function that returns whether the body searches for an object.
-        calm: function of a time and an exposure time that returns the first later start time of an exposure
-            during which no coil is switched.
+        calm: function of a time and an exposure time that returns the first start time, from this time on, of
+            an exposure during which no coil is switched.
         late_ns: time (ns) after the end of an exposure from which its frame counts as late.
         max_rate: body rate (rad/s) above which no exposure is made.
         slow_ns: processing time (ns) of a frame above which vision is reported as slow.
@@ -141,8 +141,8 @@ class FrameMeasurer:
     def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
         """Return the vision worker's job for a frame.
 
-        The checksum `last_checksum` of the previous frame serves to detect a repeated frame. If `spare` is
-        true, there is enough time to search for objects.
+        The checksum `last_checksum` of the previous frame serves to detect a repeated frame. The frame is
+        searched for objects only if there is enough time (`spare`).
         """
         past, kept = self._navigation.past(middle_ns(frame)), self._settings.kept
         tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
@@ -380,7 +380,7 @@ _ROWS = 32
 _FRAMES = 4
 """Number of frame buffers of a camera driver, any of which may contain old rows."""
 _LEAST_CHANGES = 0.125
-"""Minimum fraction of pixels that differ from the next pixel, in an image row that contains noise."""
+"""Minimum fraction of the pixels of a row that differ from the next pixel if the row contains noise."""
 
 
 class RepeatedRows:
@@ -471,7 +471,7 @@ class ObjectTracks:
             self._body.control.accept_tracks(tracks, now_ns)
 
     def _predicted(self, middle_ns: int, motion: FrameMotion, attitude: CameraAttitude | None) -> FloatArray:
-        """Return the attitude (4,) relative to the star field, from the estimate or the streaks' rate."""
+        """Predict the camera's attitude (4,) in the star field by the estimate or by the streaks' rate."""
         if self._located is None:
             return np.array([0.0, 0.0, 0.0, 1.0]) if attitude is None else attitude.quaternion
         then_ns, quaternion, before = self._located

@@ -202,7 +202,7 @@ class ModeMachine:
         return self._table[self.mode][trigger]
 
     def fire(self, trigger: Trigger, now_ns: int) -> ModeChange | None:
-        """Apply a trigger, and return the mode change, or None if the mode does not change."""
+        """Apply a trigger, and return the mode change, or None if the trigger has no effect."""
         after = self.answer(trigger)
         if isinstance(after, TriggerAnswer):
             return None

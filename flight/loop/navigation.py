@@ -8,8 +8,7 @@ the PWM driver fails, after the loop has stalled, and while the supply current c
 All horizon cameras are triggered together, more often while the body needs their frames. A camera is reported
 if it delivers no frame, repeats an image, or delivers images that contradict a fine attitude. The task runs
 once a second, or ten times a second for cameras with a `period` or `fine_period` below 2 s, independently of
-the control cycle.
-A frame is a measurement at the time of its exposure.
+the control cycle. A frame is a measurement at the time of its exposure.
 """
 
 from __future__ import annotations

@@ -323,7 +323,7 @@ LARGEST_FILE = 1 << 20
 
 
 class LinuxFiles:
-    """The file system calls for storing the state, which may raise OSError and be replaced in tests."""
+    """The file system calls that store the state. They may raise OSError, and tests can replace them."""
 
     def read(self, path: Path) -> bytes | None:
         """Return the content of a regular file of at most `LARGEST_FILE` bytes, or None if it is missing."""

@@ -138,7 +138,7 @@ class CoilDrive:
         self._watch.tumble_rate = modes.tumble_rate
 
     def isolate(self) -> None:
-        """Exclude the axes with broken coils: the reaction to the event `coil-broken`."""
+        """Exclude the axes with broken coils, as the reaction to the event `coil-broken`."""
         self.available = self._watch.available
         self._all_available = bool(self.available.all())
 

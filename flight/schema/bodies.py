@@ -128,7 +128,7 @@ class Cage(Section, frozen=True, kw_only=True):
     """A Helmholtz cage that reproduces the magnetic field of an orbit by UTC (`bodies.testbed.control`).
 
     The orbit is given by the two-line elements `elements`, and `scale` is the ratio of the cage's field to
-    the orbit's field. With a cage, `plant.field` is the weakest field that plans assume.
+    the orbit's field. If there is a cage, `plant.field` is the weakest field that plans assume.
     """
 
     elements: Annotated[tuple[str, str], Meta(description="two lines of two-line elements")]

@@ -332,7 +332,7 @@ class ObjectAim:
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return a job that points the boresight at the object's track, or in the search direction."""
+        """Return a job; if an object is the target, it points at the object's track or search direction."""
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:

@@ -249,7 +249,7 @@ class _Motion(NamedTuple):
     Attributes:
         seconds: duration, s.
         dipole: mean commanded dipole, A m^2, body axes.
-        rotation: quaternion from the body axes at the beginning into those at the end.
+        rotation: quaternion from the body axes at the beginning into the body axes at the end.
         rate: body rate at the end, rad/s.
         middle, field: body rate, rad/s, and magnetic field, T, in body axes, at the middle of the
             propagation.
@@ -474,10 +474,10 @@ def _spread_numpy(
 ) -> FloatArray:
     """Return the covariance (size, size) after a motion, in the order of the loop's estimates.
 
-    The covariance of the filter's states (n, n) was `before`. The noise during the motion increases the
-    covariance of the rate by `grown` (3, 3). The indices of the states on which attitude and rate depend are
-    `moving` (21,), and the states `picked` (k,) have the indices `placed` (k,) in the result. Attitude and
-    rate are the first of these states. See `_transition` for the other arguments.
+    The covariance (n, n) of the filter's states before the motion is `before`. The noise during the motion
+    increases the covariance of the rate by `grown` (3, 3). The indices of the states on which attitude and
+    rate depend are `moving` (21,), and the states `picked` (k,) have the indices `placed` (k,) in the result.
+    Attitude and rate are the first of these states. See `_transition` for the other arguments.
     """
     seconds, transition = moved[0], _transition(inertia, inverse, moved)
     spread = np.zeros((size, size))

@@ -223,11 +223,12 @@ class CoilMap:
         return self._strength is not None
 
     def error_covariance(self, gain: float | FloatArray, axes: float) -> FloatArray:
-        """Return the covariance (9, 9) of the matrix, row by row, from commanded to actual dipole moment.
+        """Return the covariance (9, 9) of the elements of the matrix from commanded to actual dipole moment.
 
-        The errors of the coils are independent and uniformly distributed. The largest relative error of a
-        coil's dipole moment is `gain`, a single number for all coils or an array (n,). The largest
-        misalignment of a coil axis is `axes` (rad) in each of the two directions normal to the axis.
+        The elements are listed row by row. The errors of the coils are independent and uniformly distributed.
+        The largest relative error of a coil's dipole moment is `gain`, a single number for all coils or an
+        array (n,). The largest misalignment of a coil axis is `axes` (rad) in each of the two directions
+        normal to the axis.
         """
         found: FloatArray = np.zeros((3, 3, 3, 3))
         gains = np.broadcast_to(gain, len(self.current_limits))

@@ -224,7 +224,7 @@ class _FieldPreview:
     """The predicted magnetic field during a momentum plan, in the axes of the plan.
 
     Attributes:
-        field: (n, 3) T.
+        field: predicted magnetic field (n, 3), T.
         effect: elements (n, 9) of the matrices B^2 I - B B^T, each multiplied by the time step.
         reach: maximum magnitude L of the dipole moment, A m^2.
         rest: residual momentum r of the plan, N m s.

@@ -218,8 +218,8 @@ class FilterSettings:
     """Noise and limits of the attitude filter.
 
     Attributes:
-        current_noise: standard deviation of the current of a driven coil, A, which is independent from
-            control cycle to control cycle.
+        current_noise: standard deviation of the current noise of a driven coil, A. The noise is independent
+            from control cycle to control cycle.
         control_period: duration of a control cycle, s.
         disturbance_walk: random walk of the unmodelled angular acceleration, rad/s^2 per sqrt(s).
         disturbance_start: initial standard deviation of the unmodelled angular acceleration, rad/s^2.
@@ -232,7 +232,8 @@ class FilterSettings:
         latency_start: initial standard deviation of the age that the inertial unit's samples have at their
             time stamps, s; zero if the age is known.
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
-        field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
+        field_bias_start: initial standard deviation of the magnetometer bias, T; zero if there is no
+            magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
         rate_walk: random walk of the rate due to torque noise except that of the coils, rad/s per sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.

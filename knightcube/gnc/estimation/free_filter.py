@@ -337,7 +337,7 @@ class FreeFilter:
         driven: commanded dipole (3,) of the coils in body axes during the last step, A m^2.
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
-        sun_cameras: bit mask of the cameras that measured the Sun most recently; 0 before the first.
+        sun_cameras: bit mask of the cameras that measured the Sun most recently; 0 if none has measured it.
         changes: number of changes of the estimate until now.
         refused: number of measurements that did not pass the gate.
         newest_square: normalised square of the newest innovation.

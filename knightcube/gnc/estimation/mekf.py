@@ -477,7 +477,7 @@ def _rotate(rows: FloatArray, correction: FloatArray) -> None:
 def keep_attitude(
     state: FilterState, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[FilterState, FloatArray]:
-    """Return state and covariance extended by a copy of the present attitude, as an exposure begins now."""
+    """Return state and covariance with a copy of the present attitude, because an exposure begins now."""
     pick = [*range(len(covariance)), 0, 1, 2]
     kept = (*state.kept, (measurement, state.quaternion))
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
