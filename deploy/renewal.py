@@ -586,7 +586,7 @@ class Renewal:
             raise Refused(f"{name} is not the file that was activated: its SHA-256 is {digest.hexdigest()}")
 
     def _opened(self, kind: str, staging: Path, utc: str) -> dict[str, Any]:
-        """Return the result of `open_bundle.py` for the bundle at the mission time `utc` (s), if it is known.
+        """Return the result of `open_bundle.py` at the mission time `utc` (s), an empty text if unknown.
 
         Raises Refused if `open_bundle.py` refuses the bundle in every attempt.
         """

@@ -69,7 +69,7 @@ class Watch:
         """Return whether the guardian may end.
 
         The guardian may end if the flight process is dead, and the coils are at zero or have not answered for
-        a while.
+        `PATIENCE_NS`.
         """
         return self.orphaned and (self._zeroed >= FINAL_ZEROS or now_ns > self._last_ns)
 

@@ -204,10 +204,10 @@ def map_noise(seed: int) -> npt.NDArray[np.int64]:
 TOP = 120e3
 """Height (m) above which the air has less than a millionth of the limb's brightness."""
 FAINTEST = 2e-4
-"""Radiance of air above the limb, relative to sunlit white ground, below which the air counts as not visible.
+"""Smallest radiance of visible air above the limb, relative to sunlit white ground.
 
-The mean radiance of such air within a pixel of 10 km at the limb differs from the radiance at the centre of
-the pixel by less than 5e-5.
+For fainter air, the mean radiance within a pixel of 10 km at the limb differs from the radiance at the centre
+of the pixel by less than 5e-5.
 """
 _DARKEST = -0.2
 """Cosine of the Sun's zenith angle below which only air above `TOP` is lit (11.5 deg below the horizon)."""

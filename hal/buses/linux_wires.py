@@ -50,7 +50,7 @@ class PySerialPort:
 
     Attributes:
         baud_rate: baud rate of the port, bits per second.
-        lost_bytes: number of received bytes that were dropped because `receive` was not called for too long.
+        lost_bytes: number of received bytes that were dropped because `receive` was called too rarely.
     """
 
     def __init__(

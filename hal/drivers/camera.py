@@ -337,7 +337,7 @@ _UNPACK = {"mipi10": _mipi10, "mipi12": _mipi12, "bits10": _bits10}
 
 
 def _luma(mosaic: Pixels) -> Pixels:
-    """Return the grey image of a Bayer mosaic, with the type of the mosaic.
+    """Return the grey image of a Bayer mosaic, with the numpy type of the mosaic.
 
     The edges are extended by reflection.
     """

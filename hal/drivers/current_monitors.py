@@ -238,7 +238,7 @@ def conversion_of(channel: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class StringWiring:
-    """A/D converter (I2C address) and input (0 to 3) of a string, and amplifier voltage per current, V/A."""
+    """I2C address and input (0 to 3) of a string's A/D converter, and the amplifier's gain (V/A)."""
 
     address: int
     channel: int

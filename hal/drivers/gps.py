@@ -583,7 +583,7 @@ _FIELDS = {"RMC": 10, "GGA": 12}
 _VERTICAL_SPEED_S = 10.0
 """Longest time (s) between two fixes from which a vertical velocity is computed."""
 _VERTICAL_SPEED_SIGMA = 50.0
-"""Standard deviation (m/s) of an unknown vertical velocity, for low orbits of an eccentricity up to 0.007."""
+"""Standard deviation (m/s) of an unknown vertical velocity, in low orbits with eccentricities up to 0.007."""
 _NOT_MEASURED = {"", "0", "6", "7", "8"}
 """GGA qualities of a position that was not measured: no fix, extrapolated, manual input, simulator."""
 _NO_FIX = "the receiver has no fix: check the antenna and the view of the sky"

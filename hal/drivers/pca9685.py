@@ -70,7 +70,7 @@ class Pca9685:
     def configure(self) -> None:
         """Configure the chip with all outputs off, and read the configuration back.
 
-        All outputs are switched off first, in case a dead process left the chip running. If the chip has
+        All outputs are switched off first, because a process that died may have left them on. If the chip has
         switched to an external clock because of a bit flip, it is reset by a general call. The general call
         also resets other chips on the bus, for example an ADS1115, which loses its conversion. Raises
         NotResponding if the chip does not answer, and Refused if a register does not keep its value.
@@ -151,7 +151,7 @@ def _checked_values(name: str, first: int, counts: tuple[PwmCounts, ...]) -> tup
     """Return the register values of `counts` for the channels from `first` on.
 
     Raises OutOfRange, with the `name` of the chip, for counts without a defined effect. The values of the
-    newest blocks are kept, because most cycles write the same block.
+    newest blocks are cached, because most cycles write the same block.
     """
     if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
         raise OutOfRange(name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")

@@ -181,7 +181,7 @@ class Sentence:
 
 @dataclass(frozen=True, slots=True)
 class AsciiLine:
-    """Received ASCII sentence with a valid checksum, with the host time of its last byte and its length."""
+    """Received ASCII sentence with a valid checksum, the host time of its last byte, and its length."""
 
     arrival_ns: int
     length: int

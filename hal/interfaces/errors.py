@@ -16,7 +16,7 @@ class DeviceError(Exception):
         self.message = message
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return the parts for pickling; `args` has only the text, not the arguments of `__init__`."""
+        """Return the parts for pickling, because `args` contains the text instead of the arguments."""
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 

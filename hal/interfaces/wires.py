@@ -157,7 +157,7 @@ class HostFaults(Protocol):
     """Simulated faults inside the flight process, in its workers and file operations."""
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return copies of the worker specifications with functions that can fail by simulated faults."""
+        """Return copies of the worker specifications whose functions fail during simulated faults."""
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
         """Return a wrapper of the job runner `runner` that can fail.

@@ -319,7 +319,7 @@ def _irradiance(
 
 @loop_helper
 def _used(cosine: float, grazing: float) -> float:
-    """Return the used fraction of the light at the cosine of an incidence angle."""
+    """Return the fraction of the light that a cell uses at the cosine of an incidence angle."""
     lit = max(cosine, 0.0)
     return lit * lit / grazing if lit < grazing else lit
 

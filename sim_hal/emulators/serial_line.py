@@ -32,7 +32,7 @@ class LineFaults:
     """Faults of one direction of a serial line, which affect bytes sent after the beginning of a fault.
 
     Attributes:
-        silent: whether a fault loses all bytes.
+        silent: whether all bytes are lost.
         garbage: whether every byte is replaced by a random byte.
         cut_probability: probability that a message loses a random run of its bytes.
         flip_probability: probability that a bit arrives inverted.

@@ -178,7 +178,10 @@ _LONGEST_WAIT_S = 0.05
 
 
 def emulate(options: argparse.Namespace) -> int:
-    """Serve the bus until the given program ends, or until a signal or a time limit if there is none."""
+    """Serve the bus until the given program ends.
+
+    If no program is given, serve the bus until a signal arrives or the time limit is reached.
+    """
     config = configuration.load(options.config)
     text = options.config.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(options.config), Simulation)

@@ -719,7 +719,7 @@ class SourceTrack:
         object.__setattr__(self, "directions", directions)
 
     def directions_at(self, times: FloatArray) -> FloatArray:
-        """Return the unit vectors (m, 3) to the source at `times` (m,), s, with extrapolation."""
+        """Return the unit vectors (m, 3) to the source at `times` (m,), s, extrapolated if needed."""
         before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         share = (times - self.times[before]) / (self.times[before + 1] - self.times[before])
         start, end = self.directions[before], self.directions[before + 1]

@@ -350,7 +350,7 @@ def sunlit_ground_angle(position: FloatArray, sun: FloatArray, boresight: FloatA
     """Return the smallest angle (rad) between `boresight` (3,) and visible ground under sunlit air.
 
     `position` (3,) is geocentric, m, and `sun` (3,) is the direction to the Sun; all vectors have the same
-    axes. The angle is found to about 1.5 deg, and exactly if the nearest point of the limb is lit. Returns pi
+    axes. The error of the angle is about 1.5 deg, or zero if the nearest point of the limb is lit. Returns pi
     if all visible ground is dark.
     """
     distance = float(np.linalg.norm(position))

@@ -357,7 +357,7 @@ class Chunk:
 class Environment:
     """Environment of the craft in orbit from time 0 s on.
 
-    Times within a chunk of 1,000 s may be requested in any order, but times before the present chunk may not.
+    Times within a chunk of 1,000 s may be requested in any order, but no times before the present chunk.
     """
 
     def __init__(
