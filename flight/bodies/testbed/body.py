@@ -158,7 +158,7 @@ class UnitFeed:
         return ReadingAgreement(False, f"the angle computed from the magnetic field, {angle:.4f} rad,")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Return False, because only the inertial unit's attitude starts this filter."""
+        """Return False, because only readings of the inertial unit start this filter."""
         return False
 
 

@@ -367,7 +367,7 @@ class Planning:
         return _ARRIVED_NS < self._goal_ns - now_ns < self._settings.least_horizon * 1e9
 
     def _has_arrived(self, now_ns: int) -> bool:
-        """Return whether the goal time has passed, after which plans hold the target."""
+        """Return whether the goal time is at most `_ARRIVED_NS` ahead; plans then hold the target."""
         goal_ns = self._goal_ns if self._settings.strategy is Strategy.GOAL else None
         return goal_ns is not None and goal_ns - now_ns <= _ARRIVED_NS
 

@@ -192,7 +192,7 @@ class ControlLine(Generic[T]):
     """Client of the control process's command socket. The type T identifies a command for the caller."""
 
     def __init__(self, target: Path, folder: Path) -> None:
-        """Create the sockets for answers in `folder`, to which the control process must have access."""
+        """Send to the socket `target`; answers arrive on sockets in `folder`, which `target` must reach."""
         self._target = str(target)
         self._folder = folder
         self._waiting: list[_Waiting[T]] = []

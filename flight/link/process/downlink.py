@@ -205,7 +205,7 @@ _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
     for packet in (RUN, TARGET, MODE, PLAN, STREAK, STARS, EVENT, COMMAND)
 }
-"""Identifiers of the packet types that are never thinned out."""
+"""Identifiers of the packet types that are thinned out only if the queue is four times as full as usual."""
 
 _BURST_S = 0.1
 _WAITING_S = 0.5
@@ -218,7 +218,10 @@ class LiveQueue:
     """Queue of live telemetry packets; `thinned` counts packets replaced by newer packets of their type."""
 
     def __init__(self, room: float) -> None:
-        """Create a queue that keeps only the newest packet of each type once it contains `room` bytes."""
+        """Create a queue that keeps only the newest packet of each type once it contains `room` bytes.
+
+        For the packet types in `_SINGLE`, this limit is four times as large.
+        """
         self._room = room
         self._waiting: deque[bytes] = deque()
         self._bytes = 0

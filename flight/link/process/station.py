@@ -502,7 +502,7 @@ class Station:
 
     @property
     def obeyed(self) -> int:
-        """Number of commands that were accepted and executed."""
+        """Number of accepted frames, excluding those whose command was refused or failed."""
         return self._gate.admitted - self._refused_commands
 
     def report_problem(self, name: str, text: str) -> None:
