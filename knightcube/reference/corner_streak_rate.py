@@ -131,7 +131,7 @@ def estimate_rate(
 def _rate(
     streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
 ) -> StreakResult:
-    """Return the streak result `seen`, completed by the rate without sign or by the reason of the failure."""
+    """Return the result `seen`, completed by the rate, whose sign is unknown, or by the failure status."""
     seen = replace(
         seen,
         endpoints=streaks.endpoints,
@@ -233,9 +233,9 @@ def fit_rotation(
 ) -> RotationFit | None:
     """Return the rotation with which most streaks agree.
 
-    The endpoints `raw` (n, 2, 2), px, are without bias correction and have the expected errors `sigma` (n,),
-    px, the strongest streak first. Returns None unless half of the streaks and at least `least_streaks`
-    agree.
+    The endpoints `raw` (n, 2, 2), px, are not corrected for bias and have the expected errors `sigma` (n,),
+    px. The strongest streak is the first. Returns None unless half of the streaks and at least
+    `least_streaks` agree.
     """
     needed = max(settings.least_streaks, _LEAST_AGREEMENT * len(raw))
     outward = chord_outward(raw)

@@ -106,8 +106,8 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
 LINES = 3
 """Default number of scan lines, as in the example of Meller et al."""
 _ON_AXIS = 1e-6
-"""Distance (px) between optical axis and circle centre below which nadir is assumed to be on the optical
-axis."""
+"""Distance (px) between optical axis and circle centre below which the direction to the centre is unknown and
+is assumed to be the x axis."""
 
 
 class NoHorizonError(KnightCubeError):

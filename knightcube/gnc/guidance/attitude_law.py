@@ -320,7 +320,8 @@ def _unit(vector: FloatArray) -> FloatArray:
 
 
 POLE = inertial(np.array([0.0, 0.0, 1.0]))
-"""The Sun is always at least 66 deg from the celestial pole, so the two directions are never parallel."""
+"""Direction of the celestial pole. The Sun is always at least 66 deg from the pole, so the two directions are
+never parallel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -348,7 +349,7 @@ def law_of(
 def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
     """Return the functions for the direction of a goal and for the direction that defines zero roll.
 
-    The goal INERTIAL is not supported, because it is defined by a quaternion and not by two directions.
+    The goals INERTIAL, which is defined by a quaternion, and OBJECT are not supported.
     """
     if target.goal is Goal.GROUND:
         return ground(*target.numbers), velocity

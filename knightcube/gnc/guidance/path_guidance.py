@@ -111,7 +111,7 @@ class PathGuidance:
         self._aimed_ns = now_ns
 
     def hold(self, angle: float, now_ns: int) -> None:
-        """Command the attitude `angle` (rad) from now on, and reject plans that were made earlier.
+        """Command the attitude `angle` (rad) from now on, and reject plans that start before `now_ns`.
 
         Raises UsageError when the angle is not finite.
         """
@@ -172,7 +172,7 @@ class PathGuidance:
         return self.state(now_ns) is GuidanceState.FOLLOWING
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return whether an attitude other than the target is held, because no new plan arrived in time."""
+        """Return whether an attitude is held because the path has ended and no new plan arrived in time."""
         if self._path is None or not self._path.has_ended(now_ns):
             return False
         if not self._arrives and self._path.horizon > 0.0:

@@ -285,7 +285,7 @@ class CubicPrey:
     def between(
         cls, start: float, start_slope: float, end: float, end_slope: float, horizon: float
     ) -> CubicPrey:
-        """Return the cubic from `start` to `end` in `horizon` s with the given end slopes q2', 1/s."""
+        """Return the cubic from `start` to `end` in `horizon` s for given slopes q2', 1/s, at both ends."""
         c2 = (3.0 * (end - start) - (2.0 * start_slope + end_slope) * horizon) / horizon**2
         c3 = (end_slope - start_slope - 2.0 * c2 * horizon) / (3.0 * horizon**2)
         return cls(start, start_slope, c2, c3)
@@ -369,7 +369,7 @@ class PolynomialPath:
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> PathSample:
-        """Return the motion at `now_ns`: the initial motion before the path, a coast after the path."""
+        """Return the motion at `now_ns`, which is the initial motion before the path and a coast after it."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
             angle = self.end_angle + self.end_rate * (elapsed - self.horizon)

@@ -109,7 +109,7 @@ EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the components A(q) v (n, 3) of vectors v in body axes.
 
-    If q is not a unit quaternion, the returned components are those of a unit quaternion times |q|^2.
+    If q is not a unit quaternion, the result is that of the normalised quaternion multiplied by |q|^2.
     """
     v, s = q[:, :3], q[:, 3:]
     inner = np.sum(v * vector, axis=1, keepdims=True)
@@ -159,7 +159,7 @@ class SlewDynamics:
             self._parts[:, part, columns] = np.eye(part.stop - part.start)
 
     def part(self, which: slice) -> SlewDynamics:
-        """Return the equations of motion at some of the times."""
+        """Return the equations of motion at the times that the slice `which` selects."""
         found = copy(self)
         found._forms, found._pushes = self._forms[which], self._pushes[which]
         found._parts = self._parts[which]
@@ -443,7 +443,10 @@ class BoresightEnd:
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return whether the boresight at an attitude (4,) of zero error is not opposite the direction."""
+        """Return whether the boresight at an attitude (4,) of zero error points along the direction.
+
+        The sines of the pointing error are also zero if the boresight is opposite to the direction.
+        """
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
@@ -577,7 +580,7 @@ class SlewTask:
 
 
 def check(task: SlewTask) -> None:
-    """Raise PlanningError for invalid values, and for a start or an end inside an exclusion cone."""
+    """Raise PlanningError for invalid values, and for a start or end that an exclusion cone prohibits."""
     craft = task.craft
     arrays = (
         craft.inertia,
@@ -614,7 +617,7 @@ def check(task: SlewTask) -> None:
 
 
 def _check_cones(task: SlewTask) -> None:
-    """Raise PlanningError for a start, or an end at rest, inside an exclusion cone."""
+    """Raise PlanningError for a start inside an exclusion cone, or an end at rest deep inside a cone."""
     end = task.end(task.horizon)
     for cone in task.cones:
         inside = -math.degrees(float(cone.clearance(task.quaternion[None], np.zeros(1))[0]))
@@ -646,8 +649,8 @@ def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
         shown = end.quaternion[None]
         return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
     for cone in task.cones:
-        # The largest angle between two directions that are rotated about each other is the sum of their
-        # angles from the axis of the rotation.
+        # If one of two directions rotates about an axis, the largest angle between the directions is the sum
+        # of their angles from the axis.
         pairs = ((end.axis, cone.axis), (end.direction, cone.direction(time)[0]))
         apart = sum(math.acos(min(max(float(one @ other), -1.0), 1.0)) for one, other in pairs)
         if min(apart, 2.0 * math.pi - apart) < cone.angle:

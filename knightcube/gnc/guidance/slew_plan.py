@@ -134,8 +134,8 @@ _ROOM = math.radians(0.005)
 the camera axis approaches a cone by less than this angle, and therefore does not enter the cone."""
 
 _RESERVE = 0.3
-"""Part of the deviation of a clearance from its chord that is added to the margin of a similar path. A larger
-part means fewer corrections of paths, but a larger distance from the cones and more heat."""
+"""Fraction of the deviation of a clearance from its chord that is added to the margin (see `_margins`). A
+larger fraction means fewer corrections of paths, but a larger distance from the cones and more heat."""
 
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
@@ -566,10 +566,11 @@ def _check_window(window: float) -> None:
 
 
 def _ephemeris(elements: tuple[str, str], time: datetime, duration: float) -> Ephemeris:
-    """Return the ephemeris from `LEAD` s before a time to `LEAD` s after slews that last until `duration` s.
+    """Return the ephemeris for slews that begin at `time` and end at most `duration` s later.
 
-    Raises UsageError for invalid elements, OrbitError for elements of another time, and GeomagneticError
-    outside the years of the magnetic field model.
+    The ephemeris begins `LEAD` s before `time`, and ends at least `LEAD` s after the last slew. Raises
+    UsageError for invalid elements, OrbitError for elements of another time, and GeomagneticError outside the
+    years of the magnetic field model.
     """
     dates, satellite = julian_date(time) + np.array([0.0, duration / DAY]), elements_of(elements)
     for year in julian_epoch(dates).tolist():
@@ -626,13 +627,13 @@ def plan_slew(
             planned; if it is None, the duration is fixed.
         pointing_axis: body axis (3,) that points to the targets. All three axes may have any length.
         across_axis: body axis (3,) from which a roll is measured; its part along `pointing_axis` is ignored.
-        camera_axis: body axis (3,) outside the cones, or None for `pointing_axis`.
+        camera_axis: body axis (3,) that stays outside the cones, or None for `pointing_axis`.
         cones: half angles of the exclusion cones of Sun and Moon, and angle from the Earth's limb, rad.
         nodes: number of collocation intervals, 8 to 96.
 
     Raises:
         UsageError: if an argument is invalid; the message gives the argument, its value and the remedy.
-        PlanningError: if no slew is found, or if a duration or limit is out of range. It is a UsageError.
+        PlanningError: if no slew is found, or if a duration or limit is out of range; a kind of UsageError.
         OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
         GeomagneticError: if the slew is outside the years 2025 to 2030 of the magnetic field model.
     """

@@ -79,7 +79,7 @@ _TRIED = 3
 """Number of guesses of `slew_search` that serve as initial guesses for one duration."""
 _AXES = np.arange(3)
 _STEP = 1e-30
-"""Imaginary step of the complex-step derivatives, which have no rounding error."""
+"""Imaginary step of the complex-step derivatives, in which no nearly equal numbers are subtracted."""
 _NEAR, _LOST, _EASED = 0.9, 1.1, 4
 """The limit of the dipole is imposed at points where the dipole exceeds the first value times the usable
 limit. A path is abandoned if, after integration, its dipole exceeds the second value times the limit. The

@@ -542,7 +542,8 @@ class PlanJob:
 def run(job: PlanJob) -> StepPlan:
     """Return the plan for `job`.
 
-    Raises PlanningError. The planning function is at module level, so that a worker process can import it.
+    Raises PlanningError as `plan` does. The function is at module level, so that a worker process can import
+    it.
     """
     return plan(
         job.plant,
