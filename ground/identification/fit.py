@@ -489,7 +489,8 @@ FIELD_ERROR = 0.1
 MAGNETOMETER_ERROR = 0.02
 """Prior relative errors of inertia, dipole per ampere, field, and the magnetometer's scale factor."""
 DURATION = 200.0
-"""Default duration (s) of the flight: pauses, and each manoeuvre once in each of its two directions."""
+"""Default duration (s) of the flight, in which all pauses and each manoeuvre in both directions take
+place."""
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
 _TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])
 """Coefficients of ln J, ln n A, ln B, ln g, kappa and delta in the constraint."""

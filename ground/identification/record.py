@@ -1,10 +1,11 @@
-"""Signals of a flight log for identification: rotation about the thread and currents, without the truth log.
+"""Signals of a flight log for identification: the rotation about the thread and the coil currents.
 
-Attitude and rate are samples of the inertial unit with the times of the unit's own clock, because a busy host
-timestamps some samples late. The currents are the commanded currents after limiting and quantisation. Each
-current is assumed to flow from the cycle that requested it until the next cycle. A coil driver with its own
-thread reports a current one control cycle after the cycle that requested it. The field is measured while all
-coils are off, because an active coil disturbs the magnetometer.
+The truth log of a simulated flight is not used. Attitude and rate are samples of the inertial unit with the
+times of the unit's own clock, because a busy host timestamps some samples late. The currents are the
+commanded currents after limiting and quantisation. Each current is assumed to flow from the cycle that
+requested it until the next cycle. A coil driver with its own thread reports a current one control cycle after
+the cycle that requested it. The field is measured while all coils are off, because an active coil disturbs
+the magnetometer.
 """
 
 from __future__ import annotations
@@ -86,8 +87,8 @@ def read_record(run: Run, stale_after: float) -> Record:
     """Return the identification record of a run.
 
     After `stale_after` s without a command the driver sets the coil currents to zero. Raises UsageError for a
-    run in which another coil was driven too, IdentificationError for a run that is too short or whose log is
-    damaged.
+    run in which another coil was driven too, and IdentificationError for a run that is too short or whose log
+    is damaged.
     """
     control, imu, label = run["control"], run["imu"], run["run"]
     if len(control) < 2 or len(imu) < MIN_SAMPLES or not len(label):
@@ -175,7 +176,8 @@ def _currents(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return switch times, coil currents, and whether each current is at the `limit`.
 
-    A current of zero is inserted where the driver switched the coils off because of a stale command.
+    A current of zero is inserted at each time at which the driver switched the coils off because of a stale
+    command.
     """
     time = control["time_ns"] * 1e-9
     requested, written = (
@@ -195,7 +197,8 @@ def _currents(
 
 
 _OFFSET_SIGMAS, _OFFSET_SHARE, _MOST_OFFSET = 6.0, 0.01, 0.5
-"""Smallest significance of an offset of the magnetometer, and its smallest and largest share of the field."""
+"""Smallest magnetometer offset that is subtracted, in standard deviations and as a fraction of the field, and
+largest offset, as a fraction of the field."""
 _LEAST_ROTATION = 0.1
 """Smallest rotation (rad, standard deviation) that separates an offset of the magnetometer from the field."""
 
