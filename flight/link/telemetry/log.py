@@ -8,8 +8,10 @@ separate performance log. The flight log of a lock-step simulation is reproducib
 
 Each boot creates a new run folder such as `run-000042`, into which no later boot writes. Runs are ordered by
 number, because the wall clock of the flight computer may be wrong. The oldest runs are deleted if the archive
-exceeds its budget or the disk is full; a full disk alone does not delete the last run. If the disk cannot be
-written, the flight continues without a log.
+exceeds its budget. They are also deleted, and then the oldest segments of the present run, if the disk has
+less than `LEAST_FREE_BYTES` free bytes, because the link needs free space for requests and files from the
+ground. Little free space alone does not delete the newest earlier run. If the disk cannot be written, the
+flight continues without a log.
 """
 
 from __future__ import annotations
@@ -85,7 +87,7 @@ class SegmentStore:
     Attributes:
         packets: number of completely written packets.
         doubtful: number of written packets that may be lost because a sync to disk failed.
-        dropped: number of segment files deleted to stay within the budget.
+        dropped: number of segment files deleted because of the budget or of little free space.
     """
 
     def __init__(
@@ -95,10 +97,14 @@ class SegmentStore:
         segment_bytes: int,
         budget_bytes: int,
         opener: Callable[[Path], SegmentFile] = open_segment,
+        spare_bytes: int = 0,
     ) -> None:
-        """Create the first segment file. Raises OSError if the file cannot be created."""
+        """Create the first segment file. Raises OSError if the file cannot be created.
+
+        The disk keeps `spare_bytes` free bytes, if that is possible by deleting segments and earlier runs.
+        """
         self._folder, self._stem, self._segment_bytes = folder, stem, segment_bytes
-        self._budget_bytes, self._opener = budget_bytes, opener
+        self._budget_bytes, self._opener, self._spare_bytes = budget_bytes, opener, spare_bytes
         self._finished: deque[tuple[Path, int]] = deque()  # paths and sizes (bytes), oldest first
         self._number = self.packets = self.doubtful = self.dropped = 0
         self._unsynced = 0  # written packets since the last sync
@@ -181,13 +187,34 @@ class SegmentStore:
         self._unsynced += len(chunk)
 
     def _make_room(self, coming: int) -> None:
-        """Delete finished segment files, oldest first, until `coming` further bytes fit into the budget."""
+        """Delete old files until `coming` further bytes fit into the budget and leave `spare_bytes` free."""
         total = self._size + coming + sum(size for _, size in self._finished)
         while self._finished and total > self._budget_bytes:
-            path, size = self._finished.popleft()
-            path.unlink(missing_ok=True)
-            self.dropped += 1
-            total -= size
+            total -= self._drop_segment()
+        while self._spare_bytes and _free(self._folder) < self._spare_bytes + coming:
+            if self._drop_run():
+                continue
+            if not self._finished:
+                break
+            self._drop_segment()
+
+    def _drop_segment(self) -> int:
+        """Delete the oldest finished segment file, and return its size, bytes. Raises OSError."""
+        path, size = self._finished.popleft()
+        path.unlink(missing_ok=True)
+        self.dropped += 1
+        return size
+
+    def _drop_run(self) -> bool:
+        """Delete the oldest earlier run, but not the newest one. Return whether a run was deleted."""
+        runs: list[Path] = []
+        with suppress(OSError):
+            runs = find_runs(self._folder.parent)
+        earlier = runs[: runs.index(self._folder)] if self._folder in runs else []
+        if len(earlier) < 2:
+            return False
+        _drop(earlier[0])
+        return not os.path.lexists(earlier[0])
 
     def _keep_whole(self, chunk: list[bytes], written: int) -> None:
         """Count the complete packets of `chunk` within `written` bytes, and truncate the file after them."""
@@ -208,8 +235,8 @@ class SegmentStore:
 MOST_RUNS = 1000
 """Maximum number of runs, which limits the runs of a flight computer that crashes at every start."""
 
-LEAST_FREE_BYTES = 64 << 20
-"""Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""
+LEAST_FREE_BYTES = 256 << 20
+"""Free disk space (bytes) that the runs of an archive leave, enough for the largest update in orbit."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EUCLEAN, errno.EBADMSG})
 """Error numbers (errno) of a full, failing or damaged disk. A different error number indicates a wrong path
@@ -340,7 +367,8 @@ class FlightLog:
 
         If `sync_period_ns` is None, fsync is called only at the end of each segment file, for example in a
         lock-step simulation, which runs faster than real time. If `patient` is true, a failing disk raises no
-        error, and writing is retried. Raises UsageError if the folder contains a log of the same name and
+        error, writing is retried, and the folder is that of a run in an archive, which leaves
+        `LEAST_FREE_BYTES` free. Raises UsageError if the folder contains a log of the same name and
         `overwrite` is false, if the sizes are invalid, or if the folder cannot be written.
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
@@ -365,7 +393,8 @@ class FlightLog:
             nonlocal overwrite
             _clear(folder, stem, overwrite)
             overwrite = True  # a retry may overwrite the files of a failed attempt
-            return SegmentStore(folder, stem, segment_bytes, budget_bytes, opener)
+            spare_bytes = LEAST_FREE_BYTES if patient else 0
+            return SegmentStore(folder, stem, segment_bytes, budget_bytes, opener, spare_bytes)
 
         self._begin = begin
         try:
@@ -394,7 +423,7 @@ class FlightLog:
 
     @property
     def dropped_segments(self) -> int:
-        """Number of segment files deleted to stay within the budget."""
+        """Number of segment files deleted because of the budget or of little free space."""
         return self._store.dropped if self._store is not None else 0
 
     def error(self) -> str:

@@ -10,8 +10,11 @@ from types import SimpleNamespace
 import pytest
 
 from flight.link.telemetry import log
-from flight.link.telemetry.log import LEAST_FREE_BYTES, MOST_RUNS, begin_run, find_runs
+from flight.link.telemetry.log import LEAST_FREE_BYTES, MOST_RUNS, FlightLog, begin_run, find_runs
 from knightcube.errors import UsageError
+from tests.flight.link.telemetry.samples import timing_packets
+from tests.flight.link.telemetry.small_disk import content
+from tests.manual_clock import ManualClock
 
 
 def fill(folder: Path, size: int) -> None:
@@ -167,3 +170,34 @@ def test_an_attempt_that_fails_leaves_no_folder(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(UsageError, match="Too many open files"):
         begin_run(tmp_path, 1000, 100)
     assert find_runs(tmp_path) == []
+
+
+def test_a_run_that_fills_the_disk_deletes_earlier_runs_and_then_its_oldest_segments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link could store no request and no file of the ground if the log used the whole disk."""
+    for _ in range(4):
+        fill(begin_run(tmp_path, 10**6, 100).folder, 2000)
+    packets = timing_packets(400)
+    size = len(packets[0])
+    run = begin_run(tmp_path, 10**6, 100).folder
+    capacity, frees = LEAST_FREE_BYTES + 8000 + 50 * size, []
+
+    def statvfs(_: object) -> SimpleNamespace:
+        frees.append(capacity - sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()))
+        return SimpleNamespace(f_bavail=frees[-1], f_frsize=1)
+
+    monkeypatch.setattr(os, "statvfs", statvfs)
+    clock = ManualClock(0)
+    flight = FlightLog(run, clock=clock, segment_bytes=10 * size, patient=True)
+    for packet in packets:
+        flight.write(packet)
+        clock.advance(250_000_000)
+    flight.close()
+    statvfs(tmp_path)
+    assert names(tmp_path) == ["run-000004", "run-000005"], "the newest earlier run is kept"
+    assert frees[-1] >= LEAST_FREE_BYTES
+    assert (flight.lost, flight.error()) == (0, "")
+    stored = content(run)
+    assert 0 < flight.dropped_segments < 40
+    assert stored == b"".join(packets[-(len(stored) // size) :]), "the newest packets are kept"
