@@ -37,7 +37,7 @@ from knightcube.gnc.guidance.plant import Q2_LIMIT
 from knightcube.gnc.guidance.pointing_target import ROLLS, Goal, PointingTarget
 
 FOLDER = Path(__file__).parent / "configurations"
-"""Folder of the configurations in the package, a link to the folder config of the repository."""
+"""Folder of the packaged configurations, which is a link to the folder `config` of the repository."""
 EXTENDS = "extends"
 """Key whose value names the file that a configuration extends."""
 _LONGEST = 1 << 20

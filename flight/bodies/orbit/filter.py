@@ -144,7 +144,7 @@ FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradiction by the gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
 _KNOWN_RATE = 0.01
-"""Largest standard deviation (rad/s) of a rate from the magnetometer with which a direction is propagated."""
+"""Largest standard deviation (rad/s) of a magnetometer rate that is used to propagate a direction."""
 _MEASURED_SIGMA = 0.7
 """Standard deviation (rad) of the attitude below which a measured attitude updates the estimate linearly
 instead of restarting the filter."""

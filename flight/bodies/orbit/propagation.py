@@ -346,7 +346,7 @@ class EstimatePropagation:
         return np.asarray(rows @ moving @ rows.T + seconds**2 / 3.0 * self._grown(begun, moved))
 
     def _covariance(self, begun: _Beginning, moved: _Motion) -> FloatArray:
-        """Return the covariance (19, 19) at the end, with the states in the order of the loop's estimates."""
+        """Return the covariance (19, 19) at the end of a motion, in the state order of `Estimate`."""
         motion = begun.motion
         # numba accepts a tuple faster than a NamedTuple.
         grown = self._grown(begun, moved)

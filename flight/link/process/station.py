@@ -199,8 +199,8 @@ class TcpLine:
     ) -> None:
         """Listen for connections at the address HOST:PORT. Raises UsageError if it cannot be bound.
 
-        Connections are accepted from the networks `peers`, or from everywhere if `peers` is None. Without a
-        `framing`, frames are not coded, and each frame follows a sync marker.
+        Connections are accepted from the networks `peers`, or from everywhere if `peers` is None. If
+        `framing` is None, frames are not coded, and each frame follows a sync marker.
         """
         self.name = f"TCP {address}"
         self._peers = peers

@@ -139,7 +139,7 @@ def _measured(fix: GpsFix) -> FloatArray:
 def elements_of(lines: Sequence[str]) -> TwoLineElements:
     """Return the two-line elements in the argument `elements` of a public function.
 
-    Raises ArgumentError for another number of lines, and UsageError for invalid lines as `TwoLineElements`.
+    Raises ArgumentError unless there are two lines, and UsageError for lines that `TwoLineElements` rejects.
     """
     if isinstance(lines, str) or len(lines) != 2 or not all(isinstance(line, str) for line in lines):
         raise ArgumentError("elements", f"{lines!r}: give the two lines of the element set as texts")

@@ -4,7 +4,7 @@ The errors x of the body relative to a reference motion are a small rotation and
 axes of the reference motion. With the predicted field b(t) in the axes of the reference motion, the errors
 obey the linear equations
 
-    turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f,
+    turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f.
 
 The matrix G is the stiffness of the gravity gradient, and f is the torque that the reference motion requires
 in addition to the modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2
