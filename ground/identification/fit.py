@@ -125,7 +125,7 @@ class Innovations:
         error: measured minus predicted angle and rate (n - 1, 2).
         covariance: covariances (n - 1, 2, 2) of the errors.
         gradient: derivatives (n - 1, 2, 6) of the predictions with respect to the constants, or an empty
-            array (0, 2, 6).
+            array (0, 2, 6) if the derivatives were not requested.
         taken: indices (n - 1,) of the samples that have an innovation.
         restarts: indices of the samples at which the filter restarted and which have no innovation.
     """
@@ -306,7 +306,7 @@ def fit(record: Record, noise: MotionNoise, progress: Callable[[int, float], Non
     """Fit the constants to a record, beginning with an assumed noise.
 
     The function `progress` is called with the number of each round and its step in standard deviations.
-    Raises IdentificationError if the record does not determine the torque constant, or no constants fit.
+    Raises IdentificationError if the record does not determine the torque constant, or if the fit fails.
     """
     if not np.any(record.current):
         raise IdentificationError("the coil on x was never driven: the flight does not show its torque")
@@ -375,7 +375,7 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(record: Record, constants: MotionConstants, noise: MotionNoise, gate: float) -> frozenset[int]:
     """Return the samples beyond the gate, at which the filter restarts.
 
-    Raises IdentificationError if they are too many.
+    Raises IdentificationError if there are too many such samples.
     """
     passed = innovations(record, constants, noise, gate=gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
@@ -522,8 +522,8 @@ class ScaledValue:
     """An estimated value, its standard deviation, and the contribution of its own prior.
 
     The attribute `own_prior` is the derivative of the value's logarithm with respect to the logarithm of its
-    prior, which is 1 if the motion added no information. The attribute `own_prior` is None for a value
-    without a prior.
+    prior. The derivative is 1 if the motion added no information. The attribute `own_prior` is None for a
+    value without a prior.
     """
 
     value: float

@@ -73,7 +73,7 @@ class LearnedQuantity:
 
     @property
     def change(self) -> FloatArray:
-        """Changes (n,) of the learned values in estimated standard deviations, or NaN if these are zero."""
+        """Changes (n,) of the learned values in estimated standard deviations, or NaN if `claim` is zero."""
         known = np.where(self.claim > 0.0, self.claim, math.nan)
         return np.asarray((self.value - self.described) / known)
 
@@ -237,7 +237,7 @@ def _largest(matrix: LearnedQuantity) -> tuple[float, float]:
 
 
 def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
-    """Return the smallest configured `moments` and `axes_deg` that cover the inertia's uncertainty."""
+    """Return the smallest `moments` and `axes_deg` that cover the uncertainty of the learned inertia."""
     one, accuracy = found.quantities["inertia"], found.config.craft.accuracy
     inertia = tensor(one.value)
     trace = float(np.trace(inertia))

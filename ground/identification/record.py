@@ -49,7 +49,7 @@ class HorizontalField:
         magnitude: field, T.
         sigma: standard deviation of the magnitude from the scatter, T.
         samples: number of samples.
-        offset: offset of the magnetometer that is subtracted, T; 0 without a significant offset.
+        offset: offset of the magnetometer that is subtracted, T; 0 if the offset is not significant.
     """
 
     magnitude: float

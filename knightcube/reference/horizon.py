@@ -55,7 +55,7 @@ def high_average(lines: Image) -> FloatArray:
 
 
 def first_edges(binary: BoolArray) -> IntArray:
-    """Return the index (n,) of the first change from 0 to 1 in each binary line (n, m), or -1 without one."""
+    """Return the index (n,) of the first 0-to-1 change in each binary line (n, m), or -1 if there is none."""
     rises = binary[:, 1:] & ~binary[:, :-1]
     return np.where(np.any(rises, axis=1), np.argmax(rises, axis=1) + 1, -1)
 
@@ -131,7 +131,10 @@ class ScannedHorizon:
 
 
 def scan_horizon(frame: Image, camera: CameraModel, lines: int = LINES) -> ScannedHorizon:
-    """Return the circle through the first edges in scan lines, or raise NoHorizonError without a circle."""
+    """Return the circle through the first edges in scan lines.
+
+    Raises NoHorizonError if the edges define no circle.
+    """
     points = _first_edges(frame, lines)
     rays = camera.unit_vectors(points) if len(points) else np.zeros((0, 3))
     seen = np.isfinite(rays[:, 0])

@@ -171,7 +171,7 @@ class ScaledField:
 
 
 def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField]:
-    """Yield the field at several image scales within the uncertainty of the scale, most likely scale first.
+    """Yield the field at image scales within the uncertainty of the scale, beginning with the most likely.
 
     Raises FieldUnknown if more scales are needed than the settings allow.
     """
@@ -574,7 +574,7 @@ class PreviousAttitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedRate:
-    """Body rate (3,) in camera axes, rad/s, with its covariance (3, 3), that most observed points share.
+    """Body rate (3,) that most observed points share, in camera axes, rad/s, with its covariance (3, 3).
 
     The flags `shares` (n,) mark the points whose motion agrees with the rate.
     """

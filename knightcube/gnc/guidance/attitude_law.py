@@ -131,7 +131,7 @@ Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
 
 
 def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
-    """Return commanded attitudes, and rates and accelerations by central differences, at times (n,), s."""
+    """Return the commanded motion at times (n,), s, with rates and accelerations by central differences."""
     shifted = np.concatenate([times - DIFFERENCE, times, times + DIFFERENCE])
     before, now, after = np.split(attitudes(ephemeris, shifted), 3)
     back = to_rotation_vector(multiply(before, conjugate(now)))

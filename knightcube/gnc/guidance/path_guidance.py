@@ -94,7 +94,7 @@ class PathGuidance:
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path that is followed or whose end attitude is held, or None without a path."""
+        """The path that is followed or whose end attitude is held, or None if there is no path."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
@@ -152,7 +152,7 @@ class PathGuidance:
         return PlanVerdict(True)
 
     def sample(self, now_ns: int) -> PathSample | None:
-        """Return the commanded motion at `now_ns`, or None without a path."""
+        """Return the commanded motion at `now_ns`, or None if there is no path."""
         path = self._path
         if path is None:
             return None

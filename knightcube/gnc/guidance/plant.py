@@ -11,8 +11,8 @@ equal shape.
 The coils are driven by pulse-width modulation with a period of 20 ms (Sease 2013, chapter 5). The time
 constant L/R of a coil, 0.1 ms, is short compared with the period, so the coil current is V/R while the
 H-bridge drives the coil, and otherwise zero. At a mean coil current I the supply delivers the power V |I|
-with V = R Imax, which is dissipated in the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady
-current, which equals V |I| times the duty cycle.
+with V = R Imax. This power is dissipated in the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a
+steady current I, and equals V |I| times the duty cycle.
 
 The motion is discretised by the pseudospectral method of Sease, eq. (5.8). The n nodes are -1, 1 and the
 roots of P'(x), where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact for

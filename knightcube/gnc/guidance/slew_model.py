@@ -7,9 +7,10 @@ are
     q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
 
 The vector d is the sum of the torques of `knightcube.astro.earth.disturbance`: a constant torque in body
-axes, and the aerodynamic and solar radiation torques c x A(q) v, which depend on the attitude. The torque of
-the coils has no component along the field, so not every path is feasible. All derivatives are analytic,
-because A(q) v is a quadratic form of q whose second derivatives are twice Davenport's matrix.
+axes, and the aerodynamic and solar radiation torques c x A(q) v, with a constant vector c in body axes and a
+pressure vector v in ICRS axes. The torque of the coils has no component along the field, so not every path is
+feasible. All derivatives are analytic, because A(q) v is a quadratic form of q whose second derivatives are
+twice Davenport's matrix.
 
 Paths are cubic Hermite curves (de Boor 1978, chapter IV). This module evaluates the curves, because
 scipy.interpolate would need 20 MiB of memory in each process that executes or plans a slew.
@@ -512,7 +513,7 @@ def along(
 def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float) -> tuple[Cone, ...]:
     """Return the exclusion cones of a body `axis` (3,), one for each of `angles`, rad.
 
-    The keys of `angles` are `sun` and `moon`, from the centre, and `earth`, from the limb.
+    The angles `sun` and `moon` are measured from the centre of the disc, and `earth` from the Earth's limb.
     """
     date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
     moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)

@@ -260,7 +260,7 @@ def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
 
 
 def refusal(task: SlewTask, tried: int, least: float = math.inf) -> str:
-    """Return the error message for a task without a path, with possible remedies.
+    """Return the error message, with possible remedies, for a task for which no path was found.
 
     The argument `least` is the smallest ratio of the peak dipole to the dipole limit that the search found
     without the dipole limit (`SlewSearch.least`).

@@ -386,8 +386,9 @@ LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors by which the requested duration is multiplied, one after the other, until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
 """Factor by which the first step shortens a slew (first value). The shortening ends when the shortest
-duration with a path divided by the longest duration without a path is below the second value. The three pairs
-are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
+duration for which a path was found, divided by the longest duration for which none was found, is below the
+second value. The three pairs are for the coarse grid, for the fine grid, and for slews without a time cost on
+the fine grid."""
 _CROSSED = 1.3
 """Angle by which a cone that a path crosses between two points is widened, divided by the depth of the path
 inside the cone."""
@@ -590,7 +591,7 @@ class SlewSearch:
 
     The attribute `tried` counts the initial guesses. The attribute `least` is the smallest ratio of the peak
     dipole to the dipole limit among the paths of the requested duration that were found without the dipole
-    limit, or infinity without such a path.
+    limit, or infinity if no such path was found.
     """
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:

@@ -192,11 +192,11 @@ the dense grid, the path then exceeds a limit by less than the fraction 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
 """Fraction by which an imposed limit is tightened, so that peaks between the imposed points do not exceed the
-limit. Without a margin of the imposed limits, the exchange method converges slowly."""
+limit. Without this margin, the exchange method converges slowly."""
 
 SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
-"""Exceptions that a run of NLopt without a result raises. NLopt 2.11 raises `nlopt.runtime_error`, and older
-versions raise Python's RuntimeError."""
+"""Exceptions that NLopt raises if a run ends without a result. NLopt 2.11 raises `nlopt.runtime_error`, and
+older versions raise Python's RuntimeError."""
 CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 """Results of converged runs of NLopt."""
 _EXCHANGES = 10
