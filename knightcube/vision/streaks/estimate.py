@@ -50,6 +50,7 @@ from knightcube.vision.streaks.geometry import (
     Shutter,
     StreakScene,
     azimuth_differences,
+    complete_streaks,
     exposure_bounds,
     mid_exposure_positions,
     path_lengths,
@@ -384,11 +385,8 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     in_place = ends[both].all(axis=1)
     confirmed = np.count_nonzero(in_place) >= _CONFIRMING and float(np.mean(in_place)) >= _TRUE_ENDS[0]
     dark = np.count_nonzero(lit == 0.0)
-    for worst, (least_ends, most_broken) in zip(
-        (StreakVerdict.REJECTED, StreakVerdict.DOUBTFUL),
-        zip(_TRUE_ENDS[::-1], _BROKEN[::-1], strict=True),
-        strict=True,
-    ):
+    verdicts = StreakVerdict.REJECTED, StreakVerdict.DOUBTFUL
+    for worst, least_ends, most_broken in zip(verdicts, _TRUE_ENDS[::-1], _BROKEN[::-1], strict=True):
         if right < least_ends or dark > max(1.0, most_broken * len(lit)):
             return StreakVerdict.CONFIRMED if confirmed and worst is StreakVerdict.DOUBTFUL else worst
     unconfirmed = bool(known.any()) and not both.any()
@@ -417,10 +415,7 @@ def chained_stars(
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
     """Return whether most flux of bright, complete streaks belongs to stars that contradict the motion."""
-    times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
-    inside = np.ones(len(scene.stars), dtype=np.bool_)
-    for time in times.T:
-        inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
+    inside = complete_streaks(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     # Stars fainter than all stars in the fit are ignored, because they were not compared with the motion.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
@@ -510,6 +505,8 @@ _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # Last step of a joint fit (standard deviations) above which the fit has not converged.
 _UNSETTLED = 2.0
+# Distance (point-spread widths) from the border of the frame at which the end of a streak is visible.
+_END_WIDTHS = 2.0
 # Minimum decrease of chi-square for which a rotation that reverses during the exposure is assumed.
 _REVERSED = 30.0
 # Largest distance (px) between the two streaks of a double image, which a vibration causes.
@@ -599,7 +596,10 @@ def _rejection(
     distance = np.linalg.norm(result.stars[result.used, None] - result.stars, axis=2)
     bright = result.flux > _DOUBLE_RATIO * result.flux[result.used, None]
     double = float(np.mean((bright & (distance > 0.0) & (distance < _DOUBLE)).any(axis=1)))
+    used, margin = result.stars[result.used], _END_WIDTHS * last.scene.width
+    whole = complete_streaks(camera.pinhole, last.scene.motion, camera.shutter, used, margin)
     checks = (
+        (not whole.any(), "no streak has both ends in the frame: expose for a shorter time"),
         (last.last_step > _UNSETTLED, "the fit did not settle"),
         (
             not result.misfit < settings.worst_misfit and not known.aside < settings.worst_displacement,

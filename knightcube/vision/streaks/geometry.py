@@ -612,6 +612,19 @@ def exposure_bounds(
     return times
 
 
+def complete_streaks(
+    pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, stars: FloatArray, margin: float = 0.0
+) -> BoolArray:
+    """Return which of the streaks of `stars` (n, 2), px, have both ends on the detector.
+
+    The ends must be `margin` px or more inside the border of the detector.
+    """
+    complete = np.ones(len(stars), dtype=np.bool_)
+    for time in exposure_bounds(pinhole, motion, shutter, stars).T:
+        complete &= pinhole.contains(positions(pinhole, motion, stars, time), -margin)
+    return complete
+
+
 def mid_exposure_positions(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, middles: FloatArray
 ) -> FloatArray:

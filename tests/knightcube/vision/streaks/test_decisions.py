@@ -302,6 +302,17 @@ def _rated(
     return with_rate(change(seen), camera, replace(last, last_step=last_step), verdict)
 
 
+def _moved(result: MotionResult, stars: list[int], place: float) -> MotionResult:
+    """Return the result with the first of both ends of some streaks at the column `place` of the frame."""
+    moved = result.stars.copy()
+    for _ in range(5):
+        # The point-spread width is 1.1 px, so that an end is visible from the column 1.7 on.
+        first = positions(_PINHOLE, _MOTION, moved, np.full(len(moved), -0.5))
+        last = positions(_PINHOLE, _MOTION, moved, np.full(len(moved), 0.5))
+        moved[stars, 0] += place - np.minimum(first, last)[stars, 0]
+    return replace(result, stars=moved)
+
+
 def test_an_accepted_motion_has_a_rate_with_its_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
     found = _rated(monkeypatch, _known())
     assert found.status is StreakStatus.AMBIGUOUS
@@ -321,6 +332,7 @@ def test_an_accepted_motion_has_a_rate_with_its_covariance(monkeypatch: pytest.M
         ({"common_motion": CommonMotion(0.01, 0.06)}, {}, "0.01 px across and 6 %"),
         ({"model_error": 0.0081}, {}, "uncertain by 0.8 %"),
         ({}, {"reversed_": 31.0}, "reversed within the exposure"),
+        ({}, {"change": lambda one: _moved(one, [0, 1], 1.6)}, "no streak has both ends in the frame"),
     ],
 )
 def test_a_rejected_motion_has_a_reason(
@@ -342,6 +354,8 @@ def test_a_rejected_motion_has_a_reason(
         ({"common_motion": CommonMotion(0.049, 0.049)}, {}),
         ({"model_error": 0.0079}, {}),
         ({}, {"reversed_": 29.0}),
+        ({}, {"change": lambda one: _moved(one, [0, 1], 1.8)}),
+        ({}, {"change": lambda one: _moved(one, [0], 1.6)}),
     ],
 )
 def test_a_motion_within_all_limits_is_accepted(

@@ -15,6 +15,7 @@ from knightcube.vision.streaks.geometry import (
     Course,
     Shutter,
     azimuth_differences,
+    complete_streaks,
     exposure_bounds,
     image_flow,
     mid_exposure_positions,
@@ -241,6 +242,20 @@ def test_rows_are_exposed_later_with_their_distance_from_the_middle_row() -> Non
     shutter = Shutter(2e-3, 100.0)
     assert shutter.delay(np.array([100.0, 150.0, 60.0])) == pytest.approx([0.0, 0.1, -0.08])
     assert shutter.delay(np.array([1.0], dtype=np.float32)).dtype == np.float32
+
+
+def test_a_streak_is_complete_if_both_ends_are_far_enough_inside_the_detector() -> None:
+    shutter, stars = Shutter(3e-4, 411.5), np.array([[500.0, 300.0], [100.0, 400.0], [1018.0, 400.0]])
+    first, last = (
+        positions(_PINHOLE, _MOTION, stars, time)
+        for time in exposure_bounds(_PINHOLE, _MOTION, shutter, stars).T
+    )
+    assert complete_streaks(_PINHOLE, _MOTION, shutter, stars).tolist() == [True, True, False]
+    # The left border of the detector is at -0.5 px.
+    inside = min(first[1, 0], last[1, 0]) + 0.5
+    for margin, complete in ((inside - 0.01, True), (inside + 0.01, False)):
+        found = complete_streaks(_PINHOLE, _MOTION, shutter, stars, margin)
+        assert found.tolist() == [True, complete, False]
 
 
 def test_a_star_is_exposed_while_its_row_is_exposed() -> None:
