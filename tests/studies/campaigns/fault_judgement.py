@@ -19,7 +19,7 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.faults.catalogue import FaultKind
 from sim_hal.settings import FaultEntry
-from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, demo_world
+from tests.support.flights import FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, demo_world
 
 _STARS = {"stars-refused", "streak-refused", "vision-failed"}
 
@@ -108,6 +108,11 @@ def events_of(flown: Run) -> list[tuple[float, str, str]]:
     return [(float(e["time_ns"]) * 1e-9, to_text(e["name"]), to_text(e["text"])) for e in flown["event"]]
 
 
+def duration_of(flown: Run) -> float:
+    """Return the planned duration (s) of a flight, from its configuration."""
+    return float(flown["run"]["duration"][0])
+
+
 def warnings_in(
     reported: Sequence[tuple[float, str, str]], at: float, end: float, duration: float
 ) -> list[tuple[float, str, str]]:
@@ -122,11 +127,11 @@ def warnings_in(
 
 def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
     """Return the evaluation of a fault from the logs of its flight."""
-    at = entry.at or 0.0
-    span = DURATION - at if entry.span is None else entry.span
-    end = at if kind.momentary else min(at + span, DURATION)
+    at, duration = entry.at or 0.0, duration_of(flown)
+    span = duration - at if entry.span is None else entry.span
+    end = at if kind.momentary else min(at + span, duration)
     reported = events_of(flown)
-    warned = [(time, name) for time, name, _ in warnings_in(reported, at, end, DURATION)]
+    warned = [(time, name) for time, name, _ in warnings_in(reported, at, end, duration)]
     own = [(time, name) for time, name in warned if name in own_events(kind)]
     reactions = {EVENT_KINDS[name].reaction for _, name in warned} - {Reaction.NOTE}
     control = flown["control"]
@@ -146,7 +151,7 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
         "task_failed": any(name == "task-failed" for _, name, _ in reported),
         "service_failing": any(name == "service-failing" for _, name, _ in reported),
         "log_intact": all(log.intact for log in flown.logs.values())
-        and len(control) == round(DURATION / CYCLE),
+        and len(control) == round(duration / CYCLE),
     }
 
 
@@ -224,13 +229,13 @@ def _is_upset(flown: Run, device: str, at: float) -> bool:
 
 def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
     """Return whether the fault affected a frame that was due."""
-    due = np.arange(0.0, DURATION, FRAME_PERIOD) + FRAME_EXPOSURE + FRAME_READOUT
+    due = np.arange(0.0, end, FRAME_PERIOD) + FRAME_EXPOSURE + FRAME_READOUT
     spoiled = due[(due >= at) & (due < end)]
     if kind == "torn":
         spoiled = spoiled[spoiled > FRAME_PERIOD]  # the first frame has no previous one
     if kind == "slow":
         # Triggers are lost, not frames that are already read out.
-        triggers = np.arange(0.0, DURATION, FRAME_PERIOD)
+        triggers = np.arange(0.0, end, FRAME_PERIOD)
         spoiled = triggers[(triggers >= at) & (triggers < end)]
     if kind == "delayed":
         spoiled = spoiled[end - spoiled > FRAME_LATE]
@@ -260,7 +265,8 @@ def _recovered(
                 later = _first(time[finite], float(lost[-1]))
                 found = None if later is None else float(lost[-1]) + later - end
             # This packet is sent four times a second, the housekeeping packet once.
-            known = [t for t, name, _ in reported if name == "power-recovered" and t < DURATION - CYCLE]
+            last = duration_of(flown) - CYCLE
+            known = [t for t, name, _ in reported if name == "power-recovered" and t < last]
             back = _first(np.array(known), end)
             if back is not None:
                 found = back if found is None or kind.momentary else min(found, back)

@@ -23,12 +23,12 @@ from tests.studies.campaigns.fault_judgement import (
     LOOKED,
     OWN,
     differs,
+    duration_of,
     events_of,
     own_events,
     part_of,
     warnings_in,
 )
-from tests.studies.campaigns.orbit_fault_flights import DURATION
 
 FIELD_GRACE = 8.2
 """Longest time (s) to zero current after the last valid field.
@@ -68,7 +68,7 @@ _AT_ZERO_COMMAND = ("bridge", "coil", "pwm", "bus")
 def judge(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> Result:
     """Return the evaluation of a fault from `at` to `end` s."""
     reported = events_of(flown)
-    warned = warnings_in(reported, at, end, DURATION)
+    warned = warnings_in(reported, at, end, duration_of(flown))
     own = [(time, name) for time, name, text in warned if is_own(kind, name, text)]
     return {
         "at": at,
@@ -189,7 +189,7 @@ def works(flown: Run, mode: str) -> bool:
     attitude must be fine, and in pointing modes the coils must act.
     """
     truth, known = flown["truth"], flown["navigation"]["knowledge"]
-    last = seconds(truth) > DURATION - LAST
+    last = seconds(truth) > duration_of(flown) - LAST
     acts = bool((np.abs(truth["current"][last]) > ACTS).any())
     if mode == "safe":
         return acts
@@ -206,7 +206,7 @@ def works(flown: Run, mode: str) -> bool:
 def _rate_off(flown: Run) -> float:
     """Return the median error (rad/s) of the rate from the magnetometer in the last seconds."""
     spin, truth = flown["spin"], flown["truth"]
-    spin = spin[(seconds(spin) > DURATION - LAST) & (spin["known"] == 1)]
+    spin = spin[(seconds(spin) > duration_of(flown) - LAST) & (spin["known"] == 1)]
     if not len(spin):
         return float("inf")
     place = np.minimum(np.searchsorted(truth["time_ns"], spin["time_ns"]), len(truth) - 1)

@@ -24,7 +24,7 @@ from ground.campaigns.runner import Case, Result, Summary, summary
 from sim_hal.faults.catalogue import CATALOGUE, FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.orbit_fault_flights import DURATION, MODES, config_for, world_for
+from tests.studies.campaigns.orbit_fault_flights import MODES, config_for, world_for
 from tests.studies.campaigns.orbit_fault_judgement import judge
 from tests.support.flights import fly
 
@@ -86,7 +86,7 @@ def fly_with(
     config = config_for(mode, elements, replans=kind.device == "planner", wide_often=kind.device == "wide")
     at = entries[0].at or 0.0 if entries else 0.0
     span = entries[0].span if entries else None
-    end = at if kind.momentary else min(at + (span or DURATION), DURATION)
+    end = at if kind.momentary else min(at + (span or config.duration), config.duration)
     with tempfile.TemporaryDirectory(prefix="orbit-faults-") as place:
         flown = fly(config, Path(place), section=world_for(mode, seed, entries))
         return judge(flown, kind, mode, at, end)

@@ -81,7 +81,7 @@ def test_an_upset_of_the_monitor_is_met_where_it_shows_nothing_for_a_while() -> 
     house = np.zeros(10, dtype=[("time_ns", "i8"), ("coil_current", "f8")])
     house["time_ns"] = np.arange(10) * 1_000 * MS
     control = of_control(np.zeros(400))["control"]
-    flown = cast("Run", {"housekeeping": house, "control": control})
+    flown = cast("Run", {"housekeeping": house, "control": control, "run": {"duration": [10.0]}})
     assert not fault_judgement._is_exercised(flown, kind, 4.0, 4.0)
     house["coil_current"][5:7] = np.nan
     assert fault_judgement._is_exercised(flown, kind, 4.0, 4.0)

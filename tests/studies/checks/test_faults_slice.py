@@ -25,8 +25,7 @@ BRIEF = 14.0
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the flights of the campaign."""
-    for module in (faults, fault_judgement):
-        monkeypatch.setattr(module, "DURATION", BRIEF)
+    monkeypatch.setattr(faults, "DURATION", BRIEF)
 
 
 def flown(fault: str, mode: str = "testbed-demo", span: float | None = 3.0) -> dict[str, Any]:
@@ -92,7 +91,7 @@ def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any
     sound = fault_judgement.judge(run, kind, entry)
     assert (sound["reaction_right"], sound["blind_current_a"]) == (True, 0.0)
     doctored = WritablePackets(
-        {name: run[name].copy() for name in ("control", "imu", "truth", "event", "housekeeping")}
+        {name: run[name].copy() for name in ("control", "imu", "truth", "event", "housekeeping", "run")}
     )
     doctored.logs = run.logs
     during = (run["control"]["time_ns"] > 6.0e9) & (run["control"]["time_ns"] < 7.0e9)

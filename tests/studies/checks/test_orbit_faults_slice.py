@@ -34,7 +34,6 @@ AT, SPAN = 12.0, 10.0
 
 @pytest.fixture(autouse=True)
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(judgement, "DURATION", BRIEF)
     monkeypatch.setattr(judgement, "LAST", LAST)
 
 
@@ -103,8 +102,7 @@ def refly(
 ) -> dict[str, Any]:
     """Repeat a flight of the campaign with the fault of a given name."""
     monkeypatch.undo()
-    for module in (orbit_faults, orbit_fault_flights, judgement):
-        monkeypatch.setattr(module, "DURATION", seconds)
+    monkeypatch.setattr(orbit_fault_flights, "DURATION", seconds)
     name = f"{number} {fault} {mode}"
     return orbit_faults.run(Case(name, (seed, number), {"fault": fault, "mode": mode}))
 
