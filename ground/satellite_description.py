@@ -22,7 +22,7 @@ from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER,
 from knightcube.astro.earth.mean_elements import FittedElements
 from knightcube.astro.inertia import box_inertia
 from knightcube.errors import UsageError
-from sim_hal.settings import OrbitSection
+from sim_hal.settings import YEARS, OrbitSection
 from sim_hal.worlds.orbit import elements, julian_date, log_density, sun_position
 
 Vector = tuple[float, float, float]
@@ -498,10 +498,13 @@ def _number_or(word: str, low: float, high: float) -> Callable[[str], float | No
 
 def _read_utc(text: str) -> str:
     whole = text if text.endswith("Z") else f"{text}Z"
+    first, last = YEARS
     try:
         julian_date(whole)
     except ConfigError:
         raise ValueError("give a time such as 2026-03-20T12:00:00") from None
+    if not first <= int(whole[:4]) <= last:
+        raise ValueError(f"give a year from {first} to {last}")
     return whole
 
 
@@ -553,7 +556,7 @@ QUESTIONS = (
     Question(
         "local-time",
         "H",
-        "mean local time of the ascending node at the start, h",
+        "local time of the ascending node by the true Sun at the start, h",
         number(0.0, 24.0, "h"),
         "10.5",
     ),
@@ -596,7 +599,8 @@ def check_values(name: str, values: Values) -> None:
         problem = _density_problem(values["mass"], values["size"])
     if name in {"altitude", "eccentricity"} and {"altitude", "eccentricity"} <= set(values):
         problem = _perigee_problem(values["altitude"], values["eccentricity"])
-    if name == "inclination" and values[name] is None:
+    orbit = {"altitude", "eccentricity", "inclination"}
+    if not problem and name in orbit and orbit <= set(values) and values["inclination"] is None:
         altitude = values["altitude"]
         if sun_synchronous_inclination(1e3 * altitude, values["eccentricity"]) is None:
             problem = f"no orbit at {altitude:g} km is Sun-synchronous: give an inclination"

@@ -285,7 +285,8 @@ def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Objec
     """Return the pointing results of each target, or None for a run without pointing.
 
     A target's error is evaluated from `SETTLED_AFTER_S` s after the target's first pointing cycle, or from
-    the end of its first slew if that is later. The pointing axis in body axes is `axis` (3,).
+    the end of its first slew if that is later. The pointing axis in body axes is `axis` (3,). A target whose
+    event is not in the log is named "-".
     """
     found = pointing_errors(run)
     if not len(found.times):
@@ -293,8 +294,10 @@ def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Objec
     happened, unit = run["event"], np.asarray(axis, dtype=float)
     slew_ends = seconds(happened[happened["code"] == events.SLEW_ENDED.code])
     announced = happened[happened["code"] == events.TARGET.code]
-    starts = [*map(float, seconds(announced))] or [-math.inf]
-    names = [text_of(row["text"]) for row in announced] or ["-"]
+    starts = [*map(float, seconds(announced))]
+    names = [text_of(row["text"]) for row in announced]
+    if not starts or found.times[0] < starts[0]:  # the event of the first target is not in the log
+        starts, names = [-math.inf, *starts], ["-", *names]
     rows = []
     for name, start, stop in zip(names, starts, [*starts[1:], math.inf], strict=True):
         inside = (found.times >= start) & (found.times < stop)

@@ -144,13 +144,16 @@ def _identity(run: Run, attitude: signals.ThreadMotion, notes: list[str]) -> Obj
 
 
 def _power(run: Run, power: signals.PowerHistory | None, notes: list[str]) -> Object:
-    written, actual = np.abs(run["control"]["current_written"]), np.abs(run["truth"]["current"])
+    # The truth packets have only the first three coils.
+    six = run["true_coil_currents"]
+    actual = np.abs((six if len(six) else run["truth"])["current"])
+    written = np.abs(run["control"]["current_written"])
     measured = signals.bus_power(run)[1]
     sums = ("supply_average_w", "supply_peak_w", "supply_j", "heat_average_w", "heat_j")
     found: Object = {
         "bus_average_w": float(measured.mean()) if len(measured) else math.nan,
         "peak_current_a": float(written.max()) if written.size else math.nan,
-        "peak_current_actual_a": float(actual.max()) if actual.size else math.nan,
+        "peak_current_actual_a": float(np.fmax.reduce(actual, axis=None, initial=math.nan)),
         "source": None,
         **dict.fromkeys(sums, math.nan),
     }

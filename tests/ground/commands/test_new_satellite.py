@@ -144,6 +144,13 @@ def _coil(dipole: float, current: float, resistance: float) -> str:
     return f"axis=xyz,dipole={dipole},current={current},resistance={resistance}"
 
 
+def test_a_sun_synchronous_inclination_is_accepted_without_the_other_values_of_the_orbit(
+    tmp_path: Path,
+) -> None:
+    written(tmp_path, *GIVEN, "--inclination", "sso")
+    assert "inclination_deg: 97." in (tmp_path / "mine.yaml").read_text(encoding="utf-8")
+
+
 def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
     # The inclination of a near-circular Sun-synchronous orbit at 800 km is 98.6 deg in Vallado, Fundamentals
     # of Astrodynamics, example 11-2.
@@ -178,6 +185,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         (("--altitude", "150x200"), "--altitude 150x200: give a number from 200 to 2000 km, or the"),
         (("--inclination", "polar"), "--inclination polar: give a number from 0 to 180 deg, or sso"),
         (("--utc", "noon"), "--utc noon: give a time such as 2026-03-20T12:00:00"),
+        (("--utc", "2050-01-01T00:00:00"), "--utc 2050-01-01T00:00:00: give a year from 2001 to 2043"),
         (("--coil", "strong"), "--coil strong: 'strong' is unknown: give coils such as axis=xyz,dipole="),
         (("--coil", "axis=x,dipole=1,current=1"), "`resistance` is missing: give coils such as"),
         (("--coil", _coil(0.2, 5.0, 40.0)), "current=5.0: give a number from 0.001 to 1 A"),

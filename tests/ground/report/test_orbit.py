@@ -19,13 +19,14 @@ from flight.schema import reader
 from flight.schema.bodies import OrbitConfig, as_orbit
 from ground.identification.orbit import learned_lens
 from ground.report import draw, summarise
-from ground.report.orbit import JUDGED, dipole_errors, star_camera
+from ground.report.orbit import JUDGED, dipole_errors, pointing, star_camera
 from ground.report.text import _lens
 from ground.telemetry import Run, read_run
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from tests.manual_clock import ManualClock
 from tests.support.flights import CONFIG
+from tests.support.packed_run import packed_run
 
 if TYPE_CHECKING:
     from ground.report.panels import RunSignals
@@ -325,3 +326,13 @@ def test_the_learned_lens_is_that_of_the_last_packet() -> None:
     assert "distance of a corner from the centre +- 0.0400 %" in text
     assert "line time 0.00 +- 0.10 us" in text
     assert learned_lens(cast(Run, {"lens": rows[:0]})) is None
+
+
+def test_pointing_before_the_first_recorded_target_is_reported_without_a_name() -> None:
+    point = {"mode": int(Mode.POINT), "quaternion": (0, 0, 0, 1), "target": (0, 0, 0, 1)}
+    nadir = {"code": events.TARGET.code, "name": "target", "text": "nadir"}
+    run = packed_run(attitude=[(float(at), point) for at in range(0, 2000, 10)], event=[(1000.0, nadir)])
+    found = pointing(run, (0.0, 0.0, 1.0), None)
+    assert found is not None
+    spans = [(row["target"], row["begin_s"], row["duration_s"]) for row in found["targets"]]
+    assert spans == [("-", 0.0, 990.0), ("nadir", 1000.0, 990.0)]

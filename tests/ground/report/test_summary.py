@@ -221,6 +221,17 @@ def test_without_a_monitor_the_power_at_the_bus_is_unknown(tmp_path: Path) -> No
     assert (bus["worst"], bus["verdict"]) == (None, "unknown")
 
 
+def test_the_largest_true_current_is_that_of_any_of_six_coils() -> None:
+    truth = [(0.0, {"current": [0.01, -0.02, 0.0]})]
+    coils = [(0.0, {"current": [0.01, -0.02, 0.0, 0.03, -0.05, math.nan]})]
+    started = [(0.0, {"name": "started", "code": 1})]
+    power = summarise(packed_run(event=started, truth=truth, true_coil_currents=coils))["power"]
+    assert power["peak_current_actual_a"] == pytest.approx(0.05)
+    power = summarise(packed_run(event=started, truth=truth))["power"]
+    assert power["peak_current_actual_a"] == pytest.approx(0.02)
+    assert summarise(packed_run(event=started))["power"]["peak_current_actual_a"] is None
+
+
 def test_the_supply_power_is_judged_by_the_thesis_whatever_r_i_squared_is(tmp_path: Path) -> None:
     """The requirement of 0.10 W applies to the supply power, not to R I^2.
 
