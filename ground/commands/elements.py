@@ -103,7 +103,7 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
     node = orbit.add_mutually_exclusive_group()
     node.add_argument("--node", type=finite, metavar="DEG", help="right ascension of the ascending node (0)")
     node.add_argument(
-        "--local-time", type=finite, metavar="H", help="mean local time of the ascending node instead"
+        "--local-time", type=finite, metavar="H", help="local time of the ascending node instead"
     )
     orbit.add_argument("--perigee", type=finite, metavar="DEG", help="argument of perigee (0)")
     orbit.add_argument("--anomaly", type=finite, metavar="DEG", help="true anomaly at the epoch (0)")
