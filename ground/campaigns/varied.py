@@ -269,7 +269,7 @@ def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[fl
                 row["quantity"], (row["limit"], row["unit"], [math.nan] * len(results))
             )
             worst = math.nan if row["worst"] is None else float(row["worst"])
-            values[number] = worst if math.isnan(values[number]) else max(worst, values[number])
+            values[number] = float(np.fmax(worst, values[number]))  # the other value if one is NaN
     return found
 
 

@@ -355,12 +355,13 @@ def test_the_worst_value_of_each_quantity_counts_and_missing_values_are_unknown(
         {"judged": [ROW | {"quantity": "a", "worst": 1.0}, ROW | {"quantity": "a", "worst": 3.0}]},
         {"judged": [ROW | {"quantity": "a", "worst": None}, ROW | {"quantity": "b", "worst": 5.0}]},
         {"judged": [ROW | {"quantity": "a", "worst": None}, ROW | {"quantity": "a", "worst": 2.0}]},
+        {"judged": [ROW | {"quantity": "a", "worst": 4.0}, ROW | {"quantity": "a", "worst": None}]},
     ]
     found = figures_of(rows)
     assert list(found) == ["a", "b"]
     assert found["a"][:2] == (2.0, "deg")
-    assert found["a"][2] == pytest.approx([3.0, math.nan, 2.0], nan_ok=True)
-    assert found["b"][2] == pytest.approx([math.nan, 5.0, math.nan], nan_ok=True)
+    assert found["a"][2] == pytest.approx([3.0, math.nan, 2.0, 4.0], nan_ok=True)
+    assert found["b"][2] == pytest.approx([math.nan, 5.0, math.nan, math.nan], nan_ok=True)
     drawn = [{"drawn": {"x": 1, "on": True, "name": "n"}}, {"drawn": {"x": 2.5, "on": False, "name": "m"}}]
     assert numbers_drawn(drawn) == {"x": [1.0, 2.5]}
     mixed = [{"drawn": {"x": 1, "y": value}} for value in (0.1, None)]  # such as --vary y=0.1|null
