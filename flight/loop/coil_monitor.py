@@ -342,8 +342,9 @@ class CoilMonitor:
         self._weak = ""  # text about a coil without the expected torque
         self._weak_ns = -_AGAIN_NS  # time (ns) of the last search for an axis without torque
         self._prime: int | None = None  # axis to probe first
-        # Suspected fault that the motion contradicts, while another coil is probed for comparison.
+        # Suspected fault that is not confirmed, while another coil is probed for comparison.
         self._compared: tuple[int, CoilFault] | None = None
+        self._begun_at_rest = False  # whether probes began before any reading of a driven coil
         self._verdicts: dict[int, CoilVerdict] = {}
         self.correction = CoilCorrection(coils)
         self._news: list[str] = []  # texts about corrected signs and gains
@@ -694,6 +695,7 @@ class CoilMonitor:
             # Coils that have been at zero current since the suspicion are probed, unless no probe is applied.
             if not evidence.is_driven and not (self._probe.has_begun and waited):
                 if not self._probe.has_begun:
+                    self._begun_at_rest = True
                     self._look_further({axis for axis, _ in left}, now_ns)
                 return
             if (gain := evidence.monitor_gain(self._known)) is not None:
@@ -720,10 +722,14 @@ class CoilMonitor:
             return
         works = self._evidence.shows_working_monitor(self._known)
         gain = self._evidence.monitor_gain(self._known)
-        if gain is not None or (not works and self._is_contradicted(axis, fault)):
+        # A single probe cannot show whether the coil or the current monitor is faulty.
+        contradicted = not works and (self._begun_at_rest or self._is_contradicted(axis, fault))
+        if gain is not None or contradicted:
             if self._begin_comparison(axis, fault, now_ns):
                 return
             why = f"but the measured motion shows no fault of coil {COIL_NAMES[axis]}"
+            if self._begun_at_rest:
+                why = "no probe of a coil shows a correct reading"
             self._doubt_monitor(why, gain, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)
@@ -792,4 +798,5 @@ class CoilMonitor:
         self._evidence.clear()
         self._probe.stop()
         self._prime = self._compared = None
+        self._begun_at_rest = False
         self._strangeness = ""

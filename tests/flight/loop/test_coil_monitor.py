@@ -103,6 +103,23 @@ def test_healthy_coils_in_short_pulses_are_neither_suspected_nor_probed() -> Non
     assert seen.suspicious == 0
 
 
+@pytest.mark.parametrize("gain", [0.5, 2.0])
+def test_a_wrong_gain_of_the_monitor_in_short_pulses_does_not_isolate_a_coil(gain: float) -> None:
+    """A probe that begins at rest is compared with a probe of another coil before a coil is isolated."""
+    watch, drawn = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL))), [0.0]
+    for cycle in range(40 * 20):
+        time, now_ns = 0.025 * cycle, 25_000_000 * cycle
+        if cycle % 8 == 0:
+            mean, newest = gain * float(np.mean(drawn[-40:])), gain * drawn[-1]
+            watch.measured(PowerReading(now_ns, 5.0, mean, 5.0 * mean, newest, now_ns - 200_000_000))
+        wanted = np.array([0.0, -0.06 if time % 3.0 < 0.8 else 0.0, 0.0])
+        wanted = wanted if watch.probe is None else watch.probe
+        watch.commanded(now_ns, wanted)
+        drawn.append(float(np.abs(wanted).sum()))
+    assert watch.verdicts == ()
+    assert f"the monitor measures {gain:.2f} of the current" in watch.monitor_doubted
+
+
 def test_a_suspicion_of_coils_at_zero_ends_if_no_probe_is_applied() -> None:
     """A suspicion of coils at zero current ends after the probe, also if another mode commands zero."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
