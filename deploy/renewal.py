@@ -10,9 +10,7 @@ new version is installed, and the next run continues.
 The link is not trusted. The requests of the link must be regular files of limited size, and symbolic links
 are not followed. The program `open_bundle.py` checks signatures and content of an artefact before anything is
 installed. Time is counted only while the board has power, by a clock that no command and no time server can
-set.
-
-Any Python interpreter can run this program, which needs only the standard library.
+set. Any Python interpreter can run this program, which needs only the standard library.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ DOWN_S = 180.0
 FIRST_CONTACT_S = 60.0
 """Time (s) that a flight must last before its note about a renewal is deleted."""
 MOST_TRIES = 3
-"""Maximum number of attempts to build a release. A killed process or a power loss ends an attempt early."""
+"""Maximum number of attempts at a request or a build. A killed process or a power loss ends an attempt."""
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 LONGEST_TEXT = 120
@@ -122,6 +120,7 @@ class State:
         number: number of this record; the copy with the higher number is used.
         handled: names of the newest executed requests.
         versions: highest confirmed version of each kind of artefact.
+        begun: name of the unfinished request, once for each attempt.
         previous: name of the configuration that flew before the present one.
         bad: names of the releases that failed a trial.
         trial: open trial.
@@ -139,6 +138,7 @@ class State:
 
     number: int = 0
     handled: list[str] = dataclasses.field(default_factory=list)
+    begun: list[str] = dataclasses.field(default_factory=list)
     versions: dict[str, int] = dataclasses.field(default_factory=dict)
     previous: str = ""
     bad: list[str] = dataclasses.field(default_factory=list)
@@ -474,29 +474,33 @@ class Renewal:
             self._obey(name)
         if judged is not None and self._state.trial is judged and judged.stage == "fly":
             self._judge()
+        if self._state.trial is None or self._state.trial.stage != "install":
+            shutil.rmtree(self._board.own / "staging", ignore_errors=True)
         self._count_silence()
         self._age_note()
         self._save()
 
     def _next_request(self) -> str:
-        """Return the name of the first request that was not executed yet, or an empty text.
+        """Delete the executed requests, and return the name of the first other request, or an empty text.
 
         The requests are executed in ascending order of the key and of the frame counter in their names.
-        Executed requests before the returned request are deleted.
         """
-        folder, names = self._board.link / "renewal", list[str]()
+        folder, names, handled = self._board.link / "renewal", list[str](), self._state.handled
         with suppress(OSError):
-            names = list(filter(_REQUEST.fullmatch, os.listdir(folder)))
-        for name in sorted(names, key=lambda name: [int(number) for number in name.split("-")]):
-            if name not in self._state.handled:
-                return name
-            with suppress(OSError):
-                (folder / name).unlink()
-        return ""
+            names = [one for one in os.listdir(folder) if _REQUEST.fullmatch(one) and one not in handled]
+            for name in handled:
+                (folder / name).unlink(missing_ok=True)
+            sync_folder(folder)
+            # The counter of a new key begins at 0, so a later request can have the name of a deleted one.
+            self._state.handled = []
+        return min(names, key=lambda name: [int(number) for number in name.split("-")], default="")
 
     def _obey(self, name: str) -> None:
-        """Execute a request, and report the reason if it is refused."""
-        self._state.handled = [*self._state.handled, name][-KEPT_REQUESTS:]
+        """Execute a request, in at most `MOST_TRIES` attempts, and report the reason if it is refused."""
+        state = self._state
+        state.begun = [name, *(one for one in state.begun if one == name)]
+        self._save()  # so that a request during which the board loses power is not repeated forever
+        state.handled = [*state.handled, name][-KEPT_REQUESTS:]
         request: dict[str, Any] = {}
         with (
             suppress(OSError, *_DAMAGED),
@@ -505,6 +509,8 @@ class Renewal:
             request = dict(decoded(file.read()))
         word, kind = str(request.get("do", "")), str(request.get("kind", ""))
         try:
+            if len(state.begun) > MOST_TRIES:
+                raise Refused(f"the board or the renewal program stopped {MOST_TRIES} times during it")
             if word == "restart":
                 self._restart(name, str(request["part"]))
             elif kind not in KINDS:
@@ -519,6 +525,7 @@ class Renewal:
                 raise Refused("the request is damaged")
         except (Refused, OSError, *_DAMAGED) as error:
             self._report(name, "failed", word or "request", str(error) or type(error).__name__)
+        state.begun = []
 
     def _restart(self, name: str, part: str) -> None:
         """Store the request as executed, so that it is never repeated, and restart flight, link or board."""
@@ -535,7 +542,7 @@ class Renewal:
             raise Refused("the return to an earlier version is not finished: activate again later")
         if state.trial is not None:
             raise Refused(
-                f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw this trial first"
+                f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw it first"
             )
         hours = float(request["hours"])
         if not 0.0 < hours <= MOST_HOURS:
@@ -554,8 +561,8 @@ class Renewal:
                 f"{kind} {version} is not newer than {state.versions[kind]}: "
                 "sign a newer version, or sign this one with --back"
             )
-        left_s, despite = 3600.0 * hours, bool(request["despite_faults"])
-        before, session = board.release("previous"), str(self._contact.get("session", ""))
+        left_s, despite, before = 3600.0 * hours, bool(request["despite_faults"]), board.release("previous")
+        session = str(self._contact.get("session", ""))
         if kind == "release":
             old, new, what = board.release("current"), "", "release"
             os.sync()  # the sources are on disk before the trial is stored
@@ -604,8 +611,7 @@ class Renewal:
             if done.returncode == 0:
                 return dict(json.loads(done.stdout))
             problems += done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
-        missing = "no release is installed, or root.json is missing: run deploy/install.sh"
-        raise Refused(problems[0] if problems else missing)
+        raise Refused([*problems, "no release or no root.json is installed: run deploy/install.sh"][0])
 
     def _confirm(self, name: str, kind: str) -> None:
         """End the trial and keep the new version. Raises Refused if it cannot be confirmed."""
@@ -865,9 +871,7 @@ def main(words: Sequence[str]) -> int:
     )
     parser.add_argument("--root", type=Path, default=Path("/"), help="folder of the board's files")
     parser.add_argument("--now", type=float, help="time since boot (s) to assume, for tests")
-    parser.add_argument(
-        "--accepted", action="store_true", help="keep the configuration that install.sh accepted"
-    )
+    parser.add_argument("--accepted", action="store_true", help="store the accepted configuration")
     parser.add_argument("--restart", action="store_true", help="restart the services as requested by a run")
     options = parser.parse_args(words)
     board = Board(options.root)

@@ -387,6 +387,41 @@ def test_a_trial_begins_when_the_release_is_built_even_after_a_kill(board: Renew
     assert [result for result, _ in board.reports(request)] == ["started"]
 
 
+def test_a_request_during_which_the_program_is_killed_is_executed_three_times(board: RenewedBoard) -> None:
+    """A bundle whose check resets the board would otherwise reset the board again after each boot."""
+    request = board.activate(board.bundle("configuration", board.changed("second"), 1))
+    with patch.object(renewal.Renewal, "_copy_bundle", side_effect=KeyboardInterrupt) as checked:
+        for _ in range(renewal.MOST_TRIES):
+            with pytest.raises(KeyboardInterrupt):
+                board.step()
+        board.step()
+    assert checked.call_count == renewal.MOST_TRIES
+    assert board.reports(request) == [
+        ("failed", "the board or the renewal program stopped 3 times during it")
+    ]
+    activated(board, version=2)
+
+
+def test_a_request_after_a_new_key_may_have_the_name_of_an_earlier_request(board: RenewedBoard) -> None:
+    """The frame counters of a new key begin at 0."""
+    for step in range(3):
+        board.count = 0
+        board.request("restart", part="flight")
+        board.step()
+        board.step()
+        assert len(board.reports("1-1-0-0")) == step + 1
+
+
+def test_a_refused_bundle_leaves_no_files(board: RenewedBoard) -> None:
+    """A bundle that fills the disk would otherwise prevent that its refusal is stored."""
+    bundle = board.bundle("configuration", board.changed("second"), 1)
+    bundle.write_bytes(bundle.read_bytes()[:-100])
+    request = board.activate(bundle)
+    board.step()
+    assert board.reports(request)[-1][0] == "failed"
+    assert not (board.own / "staging").exists()
+
+
 def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> None:
     (library,) = (board.files.prefix / "current").glob("venv/lib/python3*/site-packages/numpy/numpy.py")
     library.write_text(library.read_text(encoding="ascii").upper(), encoding="ascii")
