@@ -212,11 +212,16 @@ class Fixes:
 
 
 def read_fixes(path: Path) -> Fixes:
-    """Return the fixes of a CSV file, or of the flight log in the folder of a run. Raises UsageError."""
+    """Return the fixes of a CSV file, or those of the flight log in a run's folder in order of their UTC.
+
+    Raises UsageError.
+    """
     if path.is_dir():
         rows = read_run(path)["fix"]
         if not len(rows):
             raise UsageError(f"{path}: the flight log has no GPS fixes: give a CSV file with {_WANTED}")
+        # A faulty receiver may repeat a fix or report an earlier time.
+        rows = rows[np.unique(rows["utc_ns"], return_index=True)[1]]
         dates = UNIX_EPOCH + rows["utc_ns"] / (1e9 * DAY)
         return _celestial(dates, np.hstack([rows["position"], rows["velocity"]]))
     found = []

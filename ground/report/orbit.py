@@ -335,6 +335,7 @@ def objects(run: Run) -> list[Object]:
         detected = packets["seen"] > 0
         speed = np.linalg.norm(packets["rate"].astype(float), axis=1)
         sigma = float(np.median(packets["measured_sigma"][detected])) if detected.any() else None
+        magnitude = packets["magnitude"][np.isfinite(packets["magnitude"])]
         rows.append(
             {
                 "number": int(packets["number"][0]),
@@ -344,7 +345,7 @@ def objects(run: Run) -> list[Object]:
                 "seen": int(detected.sum()),
                 "rate_least_rad_s": float(speed.min()),
                 "rate_most_rad_s": float(speed.max()),
-                "magnitude": float(np.median(packets["magnitude"])),
+                "magnitude": float(np.median(magnitude)) if len(magnitude) else math.nan,
                 "sighting_sigma_rad": sigma,
             }
         )

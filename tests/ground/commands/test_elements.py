@@ -15,12 +15,16 @@ from PIL import Image
 from flight.app.cli import main
 from flight.link.process import directives
 from flight.link.process.directives import Scheduled
+from flight.link.telemetry.definitions import FIX
+from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.packets import Packer
 from ground.commands import elements, satellite
 from ground.telemetry import read_run
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
 from sim_hal.worlds.orbit import julian_date
 from tests.ground.commands.in_process import command
+from tests.manual_clock import ManualClock
 from tests.support.orbit_elements import POLAR_ORBIT
 
 ORBIT = tuple(
@@ -85,6 +89,18 @@ def test_elements_are_fitted_to_noisy_fixes(velocity: bool, tmp_path: Path) -> N
     for hours in (0.0, 12.0, 24.0):
         date = julian_date("2026-03-20T12:00:00Z") + hours / 24.0
         assert np.linalg.norm(found.at(date).position - known.at(date).position) < 200.0
+
+
+def test_repeated_and_late_fixes_of_a_flight_log_are_put_in_order(tmp_path: Path) -> None:
+    packer, log = Packer(), FlightLog(tmp_path, "flight", clock=ManualClock(0), sync_period_ns=None)
+    blank = {field.name: [0.0] * field.count if field.count > 1 else 0 for field in FIX.fields}
+    for at, seconds in enumerate((10, 20, 20, 0, 30)):
+        utc_ns = (1_774_000_000 + seconds) * 1_000_000_000
+        fields = {**blank, "utc_ns": utc_ns, "position": [7e6, float(seconds), 0.0]}
+        log.write(packer.pack(FIX, at * 10_000_000_000, **fields))
+    log.close()
+    found = elements.read_fixes(tmp_path)
+    assert 86_400.0 * (found.dates - found.dates[0]) == pytest.approx([0.0, 10.0, 20.0, 30.0], abs=1e-3)
 
 
 @pytest.mark.slow

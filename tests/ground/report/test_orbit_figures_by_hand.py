@@ -222,11 +222,13 @@ def test_an_object_has_the_figures_of_its_own_packets() -> None:
             seen(1.0, 2, seen=1, rate=[3e-3, 0.0, 4e-3], magnitude=4.0, measured_sigma=1e-5),
             seen(2.0, 2, seen=1, rate=[0.0, 0.0, 6e-3], magnitude=5.0, measured_sigma=3e-5),
             seen(3.0, 2, rate=[0.0, 7e-3, 0.0], magnitude=9.0, measured_sigma=math.nan),
-            seen(2.0, 1, rate=[1e-3, 0.0, 0.0]),
+            seen(2.0, 1, rate=[1e-3, 0.0, 0.0], magnitude=math.nan),
+            seen(3.0, 1, rate=[1e-3, 0.0, 0.0], magnitude=6.0),
         ]
     )
     first, second = orbit.objects(run)
     assert (first["number"], first["seen"], first["sighting_sigma_rad"]) == (1, 0, None)
+    assert first["magnitude"] == 6.0, "unknown magnitudes do not count"
     assert second == {
         "number": 2, "first_s": 1.0, "last_s": 3.0, "frames": 3, "seen": 2,
         "rate_least_rad_s": pytest.approx(5e-3), "rate_most_rad_s": pytest.approx(7e-3),
