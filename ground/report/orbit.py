@@ -14,7 +14,7 @@ from flight.link.events import POINTING, Mode
 from flight.link.telemetry.packets import PacketArray
 from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import FAST, Camera
-from ground.report.signals import PowerHistory, seconds, true_quaternions
+from ground.report.signals import PowerHistory, seconds, true_quaternions, within_truth
 from ground.report.steps import judge
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
@@ -82,8 +82,9 @@ def detumbling(run: Run) -> Object | None:
         names = ("first_rate_rad_s", "largest_rate_rad_s", "last_rate_rad_s")
         period = {"begin_s": begin, "duration_s": stop - begin, "slowed": slowed}
         periods.append(period | dict(zip(names, map(float, rates), strict=True)))
-    spin, truth, rms = magnetometer_rates(run), run["truth"], math.nan
-    if len(truth) and len(spin):
+    truth, rms = run["truth"], math.nan
+    spin = within_truth(truth, magnetometer_rates(run))
+    if len(spin):
         at, times, rate = seconds(spin), seconds(truth), truth["rate"].astype(float)
         true = np.column_stack([np.interp(at, times, column) for column in rate.T])
         rms = float(np.sqrt(np.mean((spin["rate"].astype(float) - true) ** 2)))
@@ -251,8 +252,8 @@ def _judged_dipoles(run: Run) -> dict[str, FloatArray]:
     The rows are those of the last ten minutes in sunlight, or in shadow, one row per second.
     """
     packets, truth = run["navigation"], run["orbit_truth"]
-    packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
-    if not len(packets) or not len(truth):
+    packets = within_truth(truth, packets[np.isfinite(packets["residual_dipole"][:, 0])])
+    if not len(packets):
         return {"sunlight": np.empty((0, 2, 3)), "shadow": np.empty((0, 2, 3))}
     at = np.clip(np.searchsorted(seconds(truth), seconds(packets)), 0, len(truth) - 1)
     true, lit = truth["residual_dipole"][at].astype(float), truth["sunlit"][at]

@@ -29,6 +29,7 @@ from ground.report.signals import (
     seconds,
     true_attitude,
     with_rate,
+    within_truth,
 )
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
@@ -263,6 +264,7 @@ def rate_error(ax: Axes, signals: RunSignals) -> None:
     if truth is None:
         return
     control = control[np.isfinite(control["rate"]) & np.isfinite(control["rate_sigma"])]
+    control = within_truth(signals.run["truth"], control)
     time, bound = seconds(control), 3e3 * control["rate_sigma"].astype(float)
     error = 1e3 * (control["rate"] - np.interp(time, truth.time, truth.rate))
     band = r"$\pm 3\sigma$ of the estimate"

@@ -105,6 +105,15 @@ def last_time(run: Run) -> float:
     return max([0.0, *(float(seconds(run[name])[-1]) for name in names if len(run[name]))])
 
 
+def within_truth(truth: PacketArray, packets: PacketArray) -> PacketArray:
+    """Return the packets within the time span of the truth log, whose oldest segments may be deleted."""
+    if not len(truth):
+        return packets[:0]
+    first, last = truth["time_ns"][[0, -1]]
+    inside: PacketArray = packets[(packets["time_ns"] >= first) & (packets["time_ns"] <= last)]
+    return inside
+
+
 def true_quaternions(truth: PacketArray, packets: PacketArray) -> FloatArray:
     """Return the true quaternion (n, 4) at the time of each packet, NaN where the truth is not known.
 
@@ -287,7 +296,7 @@ def estimate_errors(run: Run) -> Object | None:
     normalised value is 1 if the standard deviations are correct.
     """
     control, truth = run["control"], run["truth"]
-    control = control[np.isfinite(control["angle"]) & np.isfinite(control["rate"])]
+    control = within_truth(truth, control[np.isfinite(control["angle"]) & np.isfinite(control["rate"])])
     if not len(control) or len(truth) < 2:
         return None
     quaternion, time = truth["quaternion"], seconds(truth)

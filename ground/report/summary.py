@@ -293,8 +293,10 @@ def _battery(run: Run) -> Object:
     names = ("charge_error_rms", "true_charge_lowest", "true_charge_last", "solar_j", "loads_j", "coils_j")
     found |= dict.fromkeys(names, math.nan)
     if len(true):
-        at = np.interp(times, signals.seconds(true), true["charge"].astype(float))
-        errors = (charge - at)[np.isfinite(charge)]
+        judged = signals.within_truth(true, packets)
+        at = np.interp(signals.seconds(judged), signals.seconds(true), true["charge"].astype(float))
+        errors = judged["charge"] - at
+        errors = errors[np.isfinite(errors)]
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
         # The true powers (W) are recorded once a second, so their sum is the energy (J).
         sums = [float(true[f"{name}_power"].sum()) for name in ("solar", "load", "coil")]

@@ -67,6 +67,9 @@ def test_detumbling_has_the_rates_of_its_period_and_the_error_of_the_magnetomete
     assert found is not None
     assert (found["rate_source"], found["restarts"], found["rate_known_share"]) == ("truth", 3, 0.5)
     assert found["rate_error_rms_rad_s"] == pytest.approx(math.sqrt((0.03**2 + 0.04**2) / 3))
+    late = orbit.detumbling(packed_run(truth=truth[3:], spin=spin))
+    assert late is not None
+    assert late["rate_error_rms_rad_s"] == pytest.approx(found["rate_error_rms_rad_s"]), "of one row"
     (period,) = found["periods"]
     assert (period["begin_s"], period["duration_s"], period["slowed"]) == (1.0, 3.0, True)
     assert period["first_rate_rad_s"] == pytest.approx(math.hypot(0.25, 0.4))
@@ -304,3 +307,11 @@ def test_every_requirement_is_judged_by_its_figure() -> None:
     assert orbit.requirements(config, spinning, None, None, None, 109.0)[0]["verdict"] == "unknown"
     never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None, None, 139.0)
     assert never[1]["verdict"] == "unknown"
+
+
+def test_a_residual_dipole_before_the_truth_log_has_no_error() -> None:
+    learned = [(float(t), {"residual_dipole": [3e-3 if t < 5 else 1e-3, 0.0, 0.0]}) for t in range(10)]
+    truth = [(float(t), {"residual_dipole": [1e-3, 0.0, 0.0], "sunlit": 1.0}) for t in range(5, 10)]
+    found = orbit.dipole_errors(packed_run(navigation=learned, orbit_truth=truth))
+    assert found["sunlight"] == pytest.approx(0.0)
+    assert math.isnan(found["shadow"])

@@ -205,6 +205,7 @@ def test_the_errors_of_the_estimate_are_about_the_thread() -> None:
         (0.0, {"angle": 3.13, "rate": 0.24, "angle_sigma": 0.03, "rate_sigma": 0.02}),
         (1.0, {"angle": 3.34 - 2 * math.pi, "rate": 0.17, "angle_sigma": 0.02, "rate_sigma": 0.0}),
         (0.5, {"angle": math.nan}),
+        (2.0, {"angle": 9.0, "rate": 9.0, "angle_sigma": 0.1, "rate_sigma": 0.1}),  # after the truth log
     ]
     found = signals.estimate_errors(packed_run(truth=truth, control=control))
     assert found is not None
