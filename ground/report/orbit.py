@@ -35,6 +35,8 @@ MIN_DIPOLE = 1e-9
 """Smallest residual dipole (A m^2) by which the dipole error is divided."""
 SETTLED_AFTER_S = 600.0
 """Time (s) from the start of pointing at a target until its pointing error is evaluated."""
+_SAME_CYCLE_S = 0.5
+"""Longest time (s) from a description packet to the attitude error that is used with it."""
 _LATEST_START_S = 2.0
 """Latest time (s) of the first packets of a complete log; these packets are sent every second."""
 
@@ -184,8 +186,8 @@ def camera_errors(run: Run) -> AttitudeErrors:
     if not len(packets) or not len(true) or not len(errors.times):
         return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
     # The estimated misalignment changes slowly, so the attitude error of the same control cycle is used.
-    at = np.searchsorted(errors.times, seconds(packets))
-    inside = at < len(errors.times)
+    at = np.minimum(np.searchsorted(errors.times, seconds(packets)), len(errors.times) - 1)
+    inside = np.abs(errors.times[at] - seconds(packets)) < _SAME_CYCLE_S
     packets, at = packets[inside], at[inside]
     misaligned = true["camera"][0].astype(float) - packets["camera"].astype(float)
     error = errors.error[at] + misaligned

@@ -257,7 +257,7 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
         description=[
             (t, {**matrices, **sigmas, "inertia": doubled, "inertia_ratio_sigma": [0.01] * 6,
                  "camera": [0.0] * 3, "camera_sigma": [2e-3] * 3, "camera_attitude_sigma": [1e-4] * 3})
-            for t in (0.5, 10.5, 40.5)
+            for t in (0.5, 10.5, 20.5, 40.5)  # at 20.5 s, the attitude is unknown
         ],
         true_description=[(0.0, {**matrices, "inertia": inertia, "camera": (-tilt).tolist()})],
     )  # fmt: skip
@@ -267,6 +267,7 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
     error = math.sqrt(2.1e-3**2 + 2e-3**2)
     assert found["with_stars_error_rms_rad"] == pytest.approx(math.sqrt(1.1e-3**2 + 1e-3**2), rel=1e-4)
     assert found["star_camera"]["with_stars_error_rms_rad"] == pytest.approx(error, rel=1e-3)
+    assert orbit.camera_errors(run).times.tolist() == [0.5, 10.5, 40.5]
     rows = {row["name"]: row for row in found["description"]}
     assert rows["inertia"]["error"] == pytest.approx(0.0, abs=1e-12), "only the ratio to the trace counts"
     without = orbit.knowledge(packed_run(**packets | {"stars": []}))
