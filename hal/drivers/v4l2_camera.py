@@ -485,6 +485,9 @@ def meaning(name: str, error: OSError, doing: str) -> DeviceError:
         return NotResponding(name, f"the camera disappeared while {doing}: check its cable")
     if error.errno == errno.EBUSY:
         return Refused(name, f"busy while {doing}: another program uses the camera")
+    if error.errno == errno.ENOSPC:
+        cure = "connect it to another USB controller, or choose a smaller image or a compressed pixel format"
+        return Refused(name, f"the bandwidth of its USB bus is exhausted (found {doing}): {cure}")
     if error.errno == errno.ENOTTY:
         return Refused(name, f"is not a V4L2 device (found {doing})")
     return NotResponding(name, f"failed while {doing}: {os.strerror(error.errno or errno.EIO)}")
@@ -659,8 +662,9 @@ class V4l2Camera:
         device.set_interval(settings.exposure_ns)
         device.start(settings.buffers)
         # The controls are set after the start, because some cameras reset their controls at the start.
-        set_gain(device, settings)
+        # Automatic exposure is switched off before the gain is set, because it may also control the gain.
         self._exposures = manual_exposures(self.name, device, card)
+        set_gain(device, settings)
         self.check(settings.exposure_ns)
         self._asked_steps = 0
         self._set_exposure(device, settings.exposure_ns)

@@ -55,6 +55,8 @@ class IoctlCamera:
         absurd: wrong time stamps of single frames, by frame number.
         raw: content of each frame instead of a pattern, and its number of used bytes.
         held_ns: delay of the frames, ns.
+        automatic_gain: gain after automatic exposure has been switched off.
+        bandwidth: whether the USB bus has enough bandwidth left for the frames.
         draws: whether each frame has its own pattern; otherwise the buffer keeps its old content.
     """
 
@@ -79,6 +81,8 @@ class IoctlCamera:
         self.raw: bytes | None = None
         self.held_ns = 0
         self.first_sequence = 0
+        self.automatic_gain = 10
+        self.bandwidth = True
         self.knobs = {
             v4l2.EXPOSURE_AUTO: Knob(0, 3, 3),
             v4l2.EXPOSURE_ABSOLUTE: Knob(1, 5000, 157),
@@ -200,6 +204,7 @@ class IoctlCamera:
 
     def _streamon(self, _: ctypes.c_int) -> None:
         _require(self._count > 0, errno.EINVAL)
+        _require(self.bandwidth, errno.ENOSPC)
         self._streaming = True
         self._sequence = self.first_sequence
         self._next_ns = self._now_ns() + 3 * MILLISECOND_NS
@@ -227,6 +232,9 @@ class IoctlCamera:
             # Like UVC cameras, the camera refuses a set exposure while its exposure is automatic.
             _require(self.knobs[v4l2.EXPOSURE_AUTO].value == v4l2.EXPOSURE_MANUAL, errno.EACCES)
             self._pending.append((self.lag, argument.value))
+        if argument.id == v4l2.EXPOSURE_AUTO and v4l2.GAIN in self.knobs and argument.value != knob.value:
+            # Like many UVC cameras, the camera keeps the gain of its automatic exposure.
+            self.knobs[v4l2.GAIN].value = self.automatic_gain
         knob.value = argument.value
 
     def _run(self) -> None:

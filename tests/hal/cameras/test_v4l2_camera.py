@@ -396,6 +396,14 @@ def test_a_camera_that_another_program_has_is_refused(kernel: IoctlCamera, clock
         video_rig(kernel, clock)
 
 
+def test_a_camera_on_an_exhausted_usb_bus_is_refused_with_the_cure(
+    kernel: IoctlCamera, clock: ManualClock
+) -> None:
+    kernel.bandwidth = False
+    with pytest.raises(Refused, match=r"bandwidth of its USB bus is exhausted.*another USB controller"):
+        video_rig(kernel, clock)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
