@@ -272,16 +272,22 @@ def probe(config: Config) -> list[Probed]:
     sections = fitted_devices(config)
     sections += [("camera", "camera", config.camera)] if config.camera is not None else []
     sections += [(f"wide_cameras[{k}]", "camera", camera) for k, camera in enumerate(config.wide_cameras)]
-    return [_probed(config, *named) for named in sections] + list(_files(config))
+    with ExitStack() as cameras:
+        return [_probed(config, cameras, *named) for named in sections] + list(_files(config))
 
 
-def _probed(config: Config, name: str, kind: str, section: Any) -> Probed:
-    """Check whether one device responds, over connections that are opened for this check."""
+def _probed(config: Config, cameras: ExitStack, name: str, kind: str, section: Any) -> Probed:
+    """Check whether one device responds, over connections that are opened for this check.
+
+    All cameras stay open until `cameras` closes them, because cameras that can be opened separately may
+    together exceed the bandwidth of a USB bus.
+    """
     camera = isinstance(section, Camera | WideCamera)
     driver = driver_of(kind, section.device if camera else section)
     place = ", ".join(driver.files(section) or driver_of("coils", config.coils).files(config.coils))
     place = getattr(section.device, "name", "") or place if camera else place
-    with ExitStack() as stack:
+    with ExitStack() as own:
+        stack = cameras if camera else own
         rig = real_rig(config, stack)
         try:
             if camera:

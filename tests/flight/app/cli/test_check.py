@@ -8,16 +8,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from flight.app.cli import run as checking
 from flight.app.cli.run import flight_problems
 from flight.app.run import RunResult
 from flight.loop.flight_loop import FlightEnding
+from flight.schema import reader
+from flight.schema.devices import V4l2Device, WideCamera
+from hal.interfaces.errors import Refused
 from tests.ground.commands.in_process import command
+from tests.support.orbit_devices import orbit_config
 from tests.support.places import DEMO, ROOT
 
 TESTBED = ROOT / "config" / "testbed.yaml"
@@ -170,6 +177,25 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
     text = command("check", path).stdout
     assert "MISSING  coils" in text
     assert "found    inertial_unit" in text
+
+
+def test_all_cameras_are_open_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras that can be opened separately may together exceed the bandwidth of their USB bus."""
+    running: list[str] = []
+
+    def opened(section: Any, rig: Any, stack: ExitStack) -> None:
+        if len(running) == 2:
+            raise Refused(section.device.path, "the bandwidth of its USB bus is exhausted")
+        running.append(section.device.path)
+        stack.callback(running.remove, section.device.path)
+
+    monkeypatch.setattr(checking, "open_camera", opened)
+    monkeypatch.setattr(checking, "fitted_devices", lambda _: [])
+    cameras = tuple(WideCamera(device=V4l2Device(path=f"/dev/camera{number}")) for number in range(3))
+    found = checking.probe(reader.replace(orbit_config(), camera=None, wide_cameras=cameras))
+    assert [item.found for item in found if item.name.startswith("wide")] == [True, True, False]
+    assert found[2].text == "the bandwidth of its USB bus is exhausted"
+    assert running == [], "the check closes the cameras"
 
 
 def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) -> None:
