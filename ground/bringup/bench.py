@@ -23,13 +23,14 @@ from hal.drivers.current_monitors import config_for
 from hal.drivers.vn100 import BAUD_RATES
 from hal.drivers.vn100_protocol import StreamParser
 from hal.interfaces.devices import Frame, FrameSource, ImuReading, InertialUnit, TorqueCoils
-from hal.interfaces.errors import DeviceError, NotResponding
+from hal.interfaces.errors import DeviceError, NotResponding, Refused
 from hal.interfaces.guardian import CoilGuardian
 from hal.interfaces.wires import SECOND_NS, I2cBus, Rig
 from knightcube.astro.arrays import FloatArray, Image
 
 _POLL_NS = 25_000_000
 _FRAME_PATIENCE_NS = 12 * SECOND_NS
+_REOPENING_NS = 3 * SECOND_NS
 _ATTEMPTS = 3
 """Number of attempts to open a device, so that the measurement can begin despite a loose contact."""
 _LOST_FRAMES = 2  # number of additional triggers if a trigger yields no frame
@@ -216,9 +217,20 @@ class Session:
         return taken
 
     def _frame(self, source: FrameSource, exposure: float) -> Frame:
-        """Return the frame of one trigger. Raises NotResponding."""
+        """Return the frame of one trigger. Raises DeviceError.
+
+        A camera that the previous trigger has lost is reopened by its service within `_REOPENING_NS`.
+        """
         clock = self.rig.clock
-        source.trigger(round(exposure * SECOND_NS))
+        until_ns = clock.now_ns() + _REOPENING_NS
+        while True:
+            try:
+                source.trigger(round(exposure * SECOND_NS))
+                break
+            except (NotResponding, Refused):
+                if clock.now_ns() > until_ns:
+                    raise
+                clock.sleep_until_ns(clock.now_ns() + _POLL_NS)
         until_ns = clock.now_ns() + _FRAME_PATIENCE_NS
         while (frame := source.poll()) is None:
             if clock.now_ns() > until_ns:
@@ -285,11 +297,11 @@ def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int, flo
             while rig.clock.now_ns() < until_ns:
                 rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
                 for arrival_ns, chunk in port.receive():
-                    parser.feed(arrival_ns, chunk)
-                    arrivals.append(arrival_ns)
+                    if parser.feed(arrival_ns, chunk):  # a serial port delivers a packet in several chunks
+                        arrivals.append(arrival_ns)
                     data += chunk
         except DeviceError:
-            return "", 0, 0.0
+            continue
         if b"$VN" in data or parser.packets + parser.foreign > 2:
             pauses = np.diff(arrivals) * 1e-9
             irregular = len(pauses) > _REGULAR and pauses.max() > _PAUSE * np.median(pauses)

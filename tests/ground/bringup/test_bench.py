@@ -17,6 +17,7 @@ from ground.bringup.bench import Outcome, Session, StepSkipped, chip_at, talker
 from ground.bringup.diagnosis import Finding
 from ground.bringup.session import step_find
 from hal.drivers.vn100 import BAUD_RATES
+from hal.drivers.vn100_protocol import build
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
@@ -73,6 +74,31 @@ def test_lost_frames_are_triggered_again_and_reported(
     assert len(device.triggers) <= count + 2
     assert [(one.part, one.kind) for one in findings] == ([("camera", "intermittent")] if said else [])
     assert all(said is not None and said in one.text for one in findings)
+
+
+def test_a_camera_that_a_trigger_has_lost_is_triggered_again_when_it_is_open_again() -> None:
+    """A real camera is reopened a second after a lost frame, and refuses triggers until then."""
+
+    class Reopened(ScriptedCamera):
+        open_ns = 0
+
+        def trigger(self, exposure_ns: int) -> None:
+            if self.session().rig.clock.now_ns() < self.open_ns:
+                raise NotResponding("camera", "it is being opened")
+            super().trigger(exposure_ns)
+
+        def poll(self) -> Any:
+            try:
+                return super().poll()
+            except NotResponding:
+                self.open_ns = self.session().rig.clock.now_ns() + round(1.1 * SECOND_NS)
+                raise
+
+    device = Reopened(lambda: session, PIXELS, None, PIXELS)
+    session = bench_session({"camera": device})
+    findings: list[Finding] = []
+    assert [frame.sequence for frame in session.frames(3, findings)] == [1, 3, 4]
+    assert [one.text for one in findings] == ["1 of 4 triggers give no frame (no frame for trigger 2)"]
 
 
 def test_a_camera_without_frames_is_given_up_after_two_triggers() -> None:
@@ -274,6 +300,9 @@ def test_a_chip_is_recognised_by_its_registers(registers: dict[int, int], word: 
     assert chip_at(bus, 0x41) is None
 
 
+REFUSED_RATE = 123
+
+
 class Line:
     """Serial line that sends chunks at given times (s) at one baud rate, and noise at other rates."""
 
@@ -286,6 +315,8 @@ class Line:
         self.now = rate
         self.rates.append(rate)
         self.begun = self.last = self.clock.now_ns()
+        if rate == REFUSED_RATE:
+            raise NotResponding("line", "does not support this baud rate")
 
     def receive(self) -> list[tuple[int, bytes]]:
         now, last = self.clock.now_ns(), self.last
@@ -327,12 +358,28 @@ def test_the_kind_of_a_serial_device_is_recognised_at_its_baud_rate() -> None:
 
 
 def test_a_pause_of_five_usual_pauses_is_a_loose_contact() -> None:
-    """Chunks arrive every 0.05 s; the line is read every 0.02 s."""
-    loose, _ = heard(9600, *every(0.05, b"$VN", (0.4, 0.75)))
+    """Lines arrive every 0.05 s; the port is read every 0.02 s."""
+    line = build("YMR", 1)
+    loose, _ = heard(9600, *every(0.05, line, (0.4, 0.75)))
     assert loose == ("vn100", 9600, pytest.approx(0.4, abs=0.02))
-    assert heard(9600, *every(0.05, b"$VN", (0.4, 0.57)))[0] == ("vn100", 9600, 0.0)
-    few = [*every(0.16, b"$VN")[:2], (1.15, b"$VN")]
+    assert heard(9600, *every(0.05, line, (0.4, 0.57)))[0] == ("vn100", 9600, 0.0)
+    few = [*every(0.16, line)[:2], (1.15, line)]
     assert heard(9600, *few)[0] == ("vn100", 9600, 0.0), "too few pauses"
+
+
+def test_the_chunks_in_which_a_port_delivers_a_line_are_not_loose_contacts() -> None:
+    """The buffer of a UART delivers a line in several chunks, between which the pauses are short."""
+    line = build("YMR", 1)
+    chunks = [(at + 0.001 * k, line[k : k + 1]) for at, _ in every(0.05, line) for k in range(len(line))]
+    assert heard(9600, *chunks)[0] == ("vn100", 9600, 0.0)
+    loose, _ = heard(9600, *(one for one in chunks if not 0.4 < one[0] < 0.75))
+    assert loose == ("vn100", 9600, pytest.approx(0.4, abs=0.02))
+
+
+def test_a_baud_rate_that_the_port_refuses_does_not_end_the_search() -> None:
+    found, rates = heard(57600, *every(0.05, b"$VNYMR,"), rates=(REFUSED_RATE,))
+    assert found == ("vn100", 57600, 0.0)
+    assert rates[0] == REFUSED_RATE
 
 
 def test_a_lost_serial_port_has_no_device() -> None:
