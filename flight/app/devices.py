@@ -497,13 +497,17 @@ def open_ublox(rig: Rig, gps: Gps) -> GpsReceiver:
 
 
 def probe_ublox(rig: Rig, gps: Gps) -> str:
-    """Wait for bytes of the GPS receiver, which sends without a request at least once a second."""
-    port, deadline_ns = rig.wires.serial(gps.device, gps.baud_rate), rig.clock.now_ns() + _LISTENED_NS
+    """Wait for bytes of the GPS receiver, which sends without a request.
+
+    A receiver sends at least once a second after its power-on, and once per `period` after a flight.
+    """
+    listened_ns = max(_LISTENED_NS, round((gps.period + 0.5) * SECOND_NS))
+    port, deadline_ns = rig.wires.serial(gps.device, gps.baud_rate), rig.clock.now_ns() + listened_ns
     while rig.clock.now_ns() < deadline_ns:
         if port.receive():
             return "sends"
         rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
-    silence = f"the port opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
+    silence = f"the port opens, but no byte arrived in {listened_ns * 1e-9:g} s"
     raise NotResponding(gps.device, f"{silence}: check power, the cable and the baud rate")
 
 

@@ -281,18 +281,23 @@ def chip_at(bus: I2cBus, address: int) -> str | None:
     return "ina219" if high << 8 | low in _INA219 else ""
 
 
-def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int, float]:
+def talker(
+    rig: Rig, device: str, rates: tuple[int, ...], period_ns: int = _LISTEN_NS
+) -> tuple[str, int, float]:
     """Return which kind of device sends on a serial line, its baud rate, and its longest sending pause, s.
 
     The kind is `vn100` or `gps`, or "" if none is recognised. The pause is 0 for a device that sends
-    regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100.
+    regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100. At the first rate,
+    the device may send only once per `period_ns`, for which the last flight has configured it.
     """
+    listened_ns = max(_LISTEN_NS, period_ns)
     for rate in dict.fromkeys((*rates, *BAUD_RATES)):
         try:
             port = rig.wires.serial(device, rate)
             port.set_baud_rate(rate)
             port.receive()
-            until_ns, parser, data = rig.clock.now_ns() + _LISTEN_NS, StreamParser(), b""
+            until_ns, parser, data = rig.clock.now_ns() + listened_ns, StreamParser(), b""
+            listened_ns = _LISTEN_NS
             arrivals: list[int] = []
             while rig.clock.now_ns() < until_ns:
                 rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
@@ -392,7 +397,8 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     if wanted == "vn100" and section.driver != "vn100":
         return None
     rates = tuple(dict.fromkeys([section.baud_rate, *(one.baud_rate for one in serial.values())]))
-    what, rate, pause = talker(rig, section.device, rates)
+    period_ns = round((section.period + 0.2) * SECOND_NS) if wanted == "gps" else _LISTEN_NS
+    what, rate, pause = talker(rig, section.device, rates, period_ns)
     found = None
     if what == wanted and rate != section.baud_rate:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"

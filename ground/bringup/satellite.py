@@ -111,7 +111,7 @@ def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -
 _FIX_PATIENCE_S = 120.0  # longest time (s) that a receiver under an open sky needs for its first fix
 _SILENCE_S = 6.0
 _FIXES = 12
-_PERIOD_S = 1.0  # interval (s) of the fixes that the drivers request
+_NMEA_PERIOD_S = 1.0  # interval (s) of the fixes of an NMEA receiver, which the driver does not configure
 _LATE_S = 0.7
 """Largest age (s) of a fix at its arrival: receivers need up to 0.2 s, and slow serial lines add to this."""
 _CLOCK_S = 5.0  # difference (s) between GPS time and computer time that is not explained by a late fix
@@ -120,6 +120,10 @@ _CLOCK_S = 5.0  # difference (s) between GPS time and computer time that is not 
 def step_gps(session: Session) -> Outcome:
     """Receive fixes, and check number of satellites, rate, time, position and velocity."""
     receiver: GpsReceiver = session.device("gps")
+    section = session.config.gps
+    assert section is not None, "the device is open"
+    period = _NMEA_PERIOD_S if section.driver == "nmea" else section.period
+    silence = max(_SILENCE_S, 2.0 * period)
     session.ask("Place the GPS antenna under an open sky, and leave it there.")
     clock, before, readings = session.rig.clock, receiver.link(), list[GpsReading]()
     begun_ns = clock.now_ns()
@@ -131,7 +135,7 @@ def step_gps(session: Session) -> Outcome:
     while sum(one.valid for one in readings) < _FIXES and seconds() < _FIX_PATIENCE_S:
         session.wait(1.0)
         readings += receiver.poll()
-        if not readings and seconds() > _SILENCE_S and receiver.link().frames == before.frames:
+        if not readings and seconds() > silence and receiver.link().frames == before.frames:
             break
     link, span = receiver.link(), seconds()
     bad, good = link.bad_checksum - before.bad_checksum, link.frames + link.sentences
@@ -142,7 +146,8 @@ def step_gps(session: Session) -> Outcome:
         "satellites": max((one.satellites for one in readings), default=0),
         "offset_s": float(np.median(offsets)) if offsets else None,
     }
-    findings = _gps_stream(readings, bad / max(good - before.frames - before.sentences + bad, 1))
+    corrupted = bad / max(good - before.frames - before.sentences + bad, 1)
+    findings = _gps_stream(readings, corrupted, period)
     if not fixes:
         if not readings:
             text = f"no navigation solution arrives in {span:.0f} s: {link.condition or 'check its output'}"
@@ -160,8 +165,11 @@ def _offset(reading: GpsReading, now_ns: int, utc_ns: int) -> float:
     return (utc_ns - (now_ns - reading.arrival_ns) - reading.utc_ns) * 1e-9
 
 
-def _gps_stream(readings: Sequence[GpsReading], bad: float) -> list[Finding]:
-    """Return the faults in the stream of readings, given the fraction `bad` of wrong checksums."""
+def _gps_stream(readings: Sequence[GpsReading], bad: float, period: float) -> list[Finding]:
+    """Return the faults in the stream of readings, which should have the interval `period`, s.
+
+    The fraction of messages with wrong checksums is `bad`.
+    """
     findings = []
     if bad > 0.02:
         text = f"{100.0 * bad:.0f} % of the messages have a wrong checksum"
@@ -175,8 +183,8 @@ def _gps_stream(readings: Sequence[GpsReading], bad: float) -> list[Finding]:
         text = f"the messages stop for up to {gaps.max():.1f} s"
         cure = "check plugs and solder joints for loose contact, and its supply"
         findings.append(Finding("gps", "intermittent", text, cure))
-    elif not 0.6 * _PERIOD_S < typical < 1.5 * _PERIOD_S and bad <= 0.02:
-        text = f"a message every {typical:.2f} s instead of every {_PERIOD_S:g} s"
+    elif not 0.6 * period < typical < 1.5 * period and bad <= 0.02:
+        text = f"a message every {typical:.2f} s instead of every {period:g} s"
         findings.append(Finding("gps", "wrong rate", text, "check its rate and the baud rate"))
     return findings
 

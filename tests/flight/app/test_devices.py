@@ -9,9 +9,11 @@ from unittest.mock import Mock
 import pytest
 
 from flight.app import devices
-from flight.schema.devices import Sensor, SensorsSection
+from flight.schema.devices import Gps, Sensor, SensorsSection
 from flight.schema.document import ConfigError
 from hal.interfaces.errors import NotResponding, OutOfRange
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.clock import SimClock
 
 
 @pytest.mark.parametrize("answers", [True, False])
@@ -29,6 +31,18 @@ def test_sensors_that_were_opened_to_be_checked_are_closed(
         with pytest.raises(NotResponding):
             devices.probe_sensors(Mock(), section)
     unit.close.assert_called_once_with()
+
+
+@pytest.mark.parametrize(("period", "arrival"), [(1.0, 2.4), (5.0, 5.4)])
+def test_a_receiver_that_sends_once_per_period_is_found(period: float, arrival: float) -> None:
+    """A receiver keeps the period that the last flight has set until it loses its supply."""
+    clock = SimClock()
+    heard = Mock(receive=lambda: [(0, b"x")] if clock.now_ns() >= arrival * SECOND_NS else [])
+    rig: Any = SimpleNamespace(clock=clock, wires=Mock(serial=lambda *_: heard))
+    assert devices.probe_ublox(rig, Gps(period=period)) == "sends"
+    silent: Any = SimpleNamespace(clock=clock, wires=Mock(serial=lambda *_: Mock(receive=list)))
+    with pytest.raises(NotResponding, match=f"no byte arrived in {max(2.5, period + 0.5):g} s"):
+        devices.probe_ublox(silent, Gps(period=period))
 
 
 @pytest.mark.parametrize(

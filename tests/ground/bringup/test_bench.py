@@ -357,6 +357,17 @@ def test_the_kind_of_a_serial_device_is_recognised_at_its_baud_rate() -> None:
     assert rates == [4800, *BAUD_RATES]
 
 
+def test_a_receiver_that_a_flight_has_configured_may_send_rarely() -> None:
+    """A receiver keeps the period of its last flight, and is silent for longer than 1.2 s."""
+    clock = SimClock()
+    line = Line(clock, 9600, iter([(4.5, UBX)]))
+    rig: Any = Mock(clock=clock)
+    rig.wires.serial = lambda device, rate: line
+    assert talker(rig, "/dev/line", (9600,), 5 * SECOND_NS) == ("gps", 9600, 0.0)
+    assert talker(rig, "/dev/line", (38400, 9600), 5 * SECOND_NS) == ("", 0, 0.0)
+    assert line.rates[:1] == [9600]
+
+
 def test_a_pause_of_five_usual_pauses_is_a_loose_contact() -> None:
     """Lines arrive every 0.05 s; the port is read every 0.02 s."""
     line = build("YMR", 1)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.schema.devices import Battery, Power, PowerMonitorSection, SolarString, SolarStringsSection
+from flight.schema.devices import Battery, Gps, Power, PowerMonitorSection, SolarString, SolarStringsSection
 from ground.bringup.bench import Session, StepSkipped
 from ground.bringup.satellite import step_gps, step_power, step_strings
 from hal.interfaces.devices import GpsLink, GpsReading, PowerReading, StringReading
@@ -202,9 +202,9 @@ def fixes(count: int = 12, *, period: float = 1.0, late: float = 0.15, **changes
     return found
 
 
-def gps(readings: list[GpsReading], link: GpsLink | None = None) -> Any:
+def gps(readings: list[GpsReading], link: GpsLink | None = None, **section: Any) -> Any:
     receiver = ScriptedReceiver(readings, link)
-    session = bench_session({"gps": receiver})
+    session = bench_session({"gps": receiver}, gps=Gps(**section))
     receiver.session = session
     return step_gps(session)
 
@@ -213,6 +213,14 @@ def test_twelve_fixes_state_number_satellites_and_delay() -> None:
     found = gps(fixes(20))
     assert found.findings == []
     assert found.values == {"fixes": 12, "satellites": 9, "offset_s": pytest.approx(0.15)}
+
+
+def test_the_interval_of_the_fixes_is_that_of_the_configuration() -> None:
+    assert gps(fixes(period=5.0), period=5.0).findings == []
+    assert named(gps(fixes(period=1.0), period=5.0).findings) == ["gps wrong rate"]
+    assert gps(fixes(period=1.0), period=5.0, driver="nmea").findings == []
+    late = [replace(one, arrival_ns=one.arrival_ns + 10 * SECOND_NS) for one in fixes(3, period=10.0)]
+    assert named(gps(late, GpsLink(), period=10.0).findings) == ["gps wrong time"], "not given up after 6 s"
 
 
 def moved(by_m: float, sigma: float) -> list[GpsReading]:
