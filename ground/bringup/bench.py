@@ -110,9 +110,13 @@ class Session:
             kind, section = self.section(key)
             if section is None:
                 raise StepSkipped(f"the configuration has no {key}")
+            opened: Any = None
             for attempt in range(_ATTEMPTS):
                 try:
-                    self._open[key] = self._opened(key, kind, section)
+                    if opened is None:
+                        opened = self._opened(key, kind, section)
+                    self._start(kind, opened)
+                    self._open[key] = opened
                     break
                 except DeviceError as error:
                     if attempt + 1 == _ATTEMPTS:
@@ -137,13 +141,16 @@ class Session:
             return open_camera(section, self.rig, self.stack)
         device = driver_of(kind, section, f"{key}.driver").open(self.rig, section)
         self.stack.callback(device.close)
+        return device
+
+    def _start(self, kind: str, device: Any) -> None:
+        """Configure an open device. Raises DeviceError, after which the same device can be started again."""
         if kind == "coils":
             cast(TorqueCoils, device).start()
         if kind == "inertial_unit":
             cast(InertialUnit, device).configure()
             self.wait(STILL_S)
             device.poll()
-        return device
 
     def wait(self, seconds: float, each: Callable[[], None] | None = None) -> None:
         """Wait for `seconds` s, and call `each` every 25 ms."""

@@ -164,6 +164,9 @@ class AravisCamera:
         settings = self._settings
         if not camera.is_software_trigger_supported():
             raise Refused(self.name, f"{camera.get_model_name()} does not support software triggers")
+        with contextlib.suppress(_glib_error()):
+            # A camera whose program was killed continues to acquire, and its format is then locked.
+            camera.stop_acquisition()
         offered = camera.dup_available_pixel_formats_as_strings()
         if settings.pixel_format not in offered:
             raise Refused(

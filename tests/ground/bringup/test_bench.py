@@ -204,6 +204,16 @@ def test_a_device_is_opened_at_most_three_times_and_then_kept(monkeypatch: pytes
     assert (ended.value.finding.kind, ended.value.finding.text) == ("refused", "broken")
 
 
+def test_a_device_that_does_not_start_is_not_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A unit of separate sensors reads them in its own thread from its opening to the end of the session."""
+    refused = NotResponding("lis3mdl", "no acknowledge")
+    unit = Mock(configure=Mock(side_effect=[refused, refused, None]))
+    driver = Mock(open=Mock(side_effect=[unit]))
+    monkeypatch.setattr(bench, "driver_of", lambda *_: driver)
+    assert bench_session({}).device("inertial_unit") is unit
+    driver.open.assert_called_once()
+
+
 def _refuse(tries: list[str]) -> None:
     tries.append("coils")
     raise NotResponding("coils", "broken")

@@ -66,6 +66,7 @@ class FakeCamera:
             "auto": True,
             "stream": FakeStream(),
             "failing": "",
+            "acquiring": False,
             **changes,
         }
         self.set: dict[str, Any] = {}
@@ -88,6 +89,8 @@ class FakeCamera:
 
     def set_pixel_format_from_string(self, name: str) -> None:
         self._may_fail("format")
+        if self.known["acquiring"]:
+            raise GlibError("PixelFormat is locked")
         self.set["format"] = name
 
     def get_sensor_size(self) -> tuple[int, int]:
@@ -155,11 +158,12 @@ class FakeCamera:
         self.lost = handler
 
     def start_acquisition(self) -> None:
-        self.set["started"] = True
+        self.set["started"] = self.known["acquiring"] = True
 
     def stop_acquisition(self) -> None:
         self.stopped += 1
         self._may_fail("stop")
+        self.known["acquiring"] = False
 
     def software_trigger(self) -> None:
         self._may_fail("trigger")
@@ -335,6 +339,13 @@ def test_frame_numbers_continue_after_their_largest_value(rig: Rig) -> None:
     assert rig.driver.counts.missed == 0
 
 
+def test_a_camera_that_a_killed_program_left_acquiring_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(monkeypatch, {}, acquiring=True)
+    rig.driver.open()
+    assert rig.camera.set["format"] == "Mono12"
+    assert rig.camera.set["started"]
+
+
 def test_a_lost_camera_does_not_respond(rig: Rig) -> None:
     rig.camera.lost(None)
     with pytest.raises(NotResponding, match="gone"):
@@ -345,7 +356,7 @@ def test_a_lost_camera_does_not_respond(rig: Rig) -> None:
     rig.camera.known["failing"] = "stop"
     rig.driver.close()
     rig.driver.close()
-    assert rig.camera.stopped == 1
+    assert rig.camera.stopped == 2, "once when opened, and once when closed"
     rig.camera.known["failing"] = ""
     rig.driver.open()
     assert rig.driver.collect() is None, "open again"
