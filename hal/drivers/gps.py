@@ -446,13 +446,9 @@ class UbloxReceiver:
         The configuration is repeated as long as no NAV-PVT arrives.
         """
         now_ns = self._clock.now_ns()
-        requested_ns = self._requested_ns
-        silent = now_ns - self._fix_arrival_ns >= self._silence_ns
-        if requested_ns is None:
-            due = silent or self._parser.frames == 0
-        else:
-            due = self._is_due or (silent and now_ns - requested_ns >= self._silence_ns)
-        if not due:
+        silent = now_ns - max(self._fix_arrival_ns, self._requested_ns or 0) >= self._silence_ns
+        # A receiver that sends at the start may still have the settings of an earlier flight.
+        if not (silent or self._is_due or self._requested_ns is None):
             return
         self._requested_ns, self._is_due = now_ns, False
         request = b"" if self._protocol else frame(MON_VER)

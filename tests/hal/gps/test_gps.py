@@ -151,6 +151,17 @@ def test_a_broken_line_gives_no_false_fix(faults: LineFaults) -> None:
         np.testing.assert_array_equal(reading.position, expected[reading.utc_ns])
 
 
+def test_a_receiver_that_already_sends_fixes_is_set_to_the_configured_period() -> None:
+    """A receiver keeps the period of an earlier flight, and its fixes arrive before the driver begins."""
+    gps = bench()
+    gps.fly(3.0)
+    gps.clock.sleep_until_ns(gps.clock.now_ns() + 2 * SECOND_NS)
+    gps.driver = UbloxReceiver(gps.line.host, gps.clock, 5 * SECOND_NS)
+    assert gps.fly(0.1), "fixes lie in the port"
+    epochs = [reading.utc_ns for reading in gps.fly(21.0)][1:]
+    assert set(np.diff(epochs)) == {5 * SECOND_NS}
+
+
 def test_a_fix_is_read_although_the_request_for_the_next_fixes_cannot_be_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
