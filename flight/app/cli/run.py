@@ -336,9 +336,9 @@ def configure_check(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command `check` to the parser."""
     parser.description = (
         "Check a configuration before a flight. Its values are validated. If it names real devices, each "
-        "device must answer; no device is configured and no coil is driven. A missing device is reported "
-        "with the remedy. If it has a simulation section, ten seconds of flight are simulated in lock-step. "
-        "Exit status 0: ready; 1: not ready; 2: the configuration is refused."
+        "device must answer. Cameras and separate sensors are started, but no coil is driven. A missing "
+        "device is reported with the remedy. If it has a simulation section, ten seconds of flight are "
+        "simulated in lock-step. Exit status 0: ready; 1: not ready; 2: the configuration is refused."
     )
     carried = ", ".join(names())
     parser.add_argument("config", type=config_path, metavar="CONFIG", help=f"YAML file, or one of {carried}")
