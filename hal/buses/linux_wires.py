@@ -45,8 +45,8 @@ _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
 class PySerialPort:
     """Serial port in raw 8N1 mode without flow control, opened exclusively.
 
-    The class implements `hal.interfaces.wires.SerialPort`. The modem lines are neither read nor set, so that
-    a pseudo-terminal works as well.
+    The class implements `hal.interfaces.wires.SerialPort`. Opening a port sets the modem lines DTR and RTS,
+    which are not used otherwise. A pseudo-terminal has no modem lines, and works as well.
 
     Attributes:
         baud_rate: baud rate of the port, bits per second.
