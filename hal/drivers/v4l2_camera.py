@@ -199,6 +199,10 @@ QUERYCTRL = _request(3, 36, QueryControl)
 _MICROSECOND_NS = 1_000
 _SECOND_NS = 1_000_000_000
 _MOST_FORMATS = 64
+# Frame intervals that are requested in turn, as multiples of half the wanted interval.
+_INTERVAL_FACTORS = (2, 3, 4, 8)
+# Tolerance of the frame interval, relative to the exposure time.
+_INTERVAL_SLACK = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,13 +263,20 @@ class VideoDevice:
         return PixelLayout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
 
     def set_interval(self, interval_ns: int) -> None:
-        """Request a frame interval (ns), if the device supports frame intervals."""
+        """Request a frame interval (ns) or a longer one, if the device supports frame intervals.
+
+        The kernel chooses the nearest interval that the device has. If this interval is too short, longer
+        intervals are requested.
+        """
         answer = StreamParameters(type=VIDEO_CAPTURE)
         try:
             self._ask(G_PARM, answer)
-            if answer.capability & CAP_TIME_PER_FRAME:
-                answer.timeperframe = Fraction(-(-interval_ns // _MICROSECOND_NS), 1_000_000)
+            for factor in _INTERVAL_FACTORS if answer.capability & CAP_TIME_PER_FRAME else ():
+                answer.timeperframe = Fraction(-(-factor * interval_ns // (2 * _MICROSECOND_NS)), 1_000_000)
                 self._ask(S_PARM, answer)
+                given = answer.timeperframe
+                if given.numerator * _SECOND_NS >= (1.0 - _INTERVAL_SLACK) * interval_ns * given.denominator:
+                    return
         except OSError as error:
             if error.errno not in {errno.ENOTTY, errno.EINVAL}:
                 raise
@@ -370,7 +381,7 @@ class V4l2Settings:
         path: path of the device, such as /dev/knightcube-camera.
         columns, rows: size of the image, pixels.
         pixel_format: name of a pixel format in PIXEL_FORMATS.
-        exposure_ns: usual exposure time, ns; the frame interval is set to the same value.
+        exposure_ns: usual exposure time, ns; the frame interval is set to this value or longer.
         gain: gain in the camera's own units, or None to leave the gain unchanged.
         stamp: meaning of the time stamps.
         stamp_delay_ns: delay of the time stamp after the start or end of exposure, ns.
@@ -399,8 +410,6 @@ UVC_STAMPS = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
 
 # A time stamp can be slightly in the future, because the kernel estimates the offset of the camera's clock.
 _STAMP_AHEAD_NS = 10_000_000
-# Tolerance of the frame interval, relative to the exposure time.
-_INTERVAL_SLACK = 0.05
 _CONTRADICTIONS = 3
 # Number of consecutive impossible time stamps after which the camera is reopened.
 _ABSURD = 8

@@ -56,6 +56,7 @@ class IoctlCamera:
         raw: content of each frame instead of a pattern, and its number of used bytes.
         held_ns: delay of the frames, ns.
         automatic_gain: gain after automatic exposure has been switched off.
+        intervals_ns: intervals of frames of which the nearest is chosen, or none for any interval.
         bandwidth: whether the USB bus has enough bandwidth left for the frames.
         draws: whether each frame has its own pattern; otherwise the buffer keeps its old content.
     """
@@ -83,6 +84,7 @@ class IoctlCamera:
         self.first_sequence = 0
         self.automatic_gain = 10
         self.bandwidth = True
+        self.intervals_ns: tuple[int, ...] = ()
         self.knobs = {
             v4l2.EXPOSURE_AUTO: Knob(0, 3, 3),
             v4l2.EXPOSURE_ABSOLUTE: Knob(1, 5000, 157),
@@ -182,6 +184,10 @@ class IoctlCamera:
         _require(not self._streaming, errno.EBUSY)
         time = answer.timeperframe
         self.interval_asked_ns = time.numerator * 10**9 // time.denominator
+        if self.intervals_ns:
+            nearest_ns = min(self.intervals_ns, key=lambda one: abs(one - self.interval_asked_ns))
+            answer.timeperframe = v4l2.Fraction(nearest_ns // 1000, 1_000_000)
+            self.interval_asked_ns = nearest_ns
 
     def _reqbufs(self, answer: v4l2.RequestBuffers) -> None:
         _require(not self._streaming, errno.EBUSY)

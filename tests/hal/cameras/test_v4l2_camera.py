@@ -370,6 +370,20 @@ def test_the_camera_is_set_to_manual_with_its_gain_and_time_between_frames(
     assert kernel.interval_asked_ns == EXPOSURE_NS
 
 
+@pytest.mark.parametrize(
+    ("intervals_ms", "chosen_ms"),
+    [((33, 66), 66), ((39, 80), 39), ((10, 20, 200), 200), ((10, 20), 20), ((40,), 40)],
+)
+def test_the_time_between_frames_is_not_shorter_than_the_exposure(
+    kernel: IoctlCamera, clock: ManualClock, intervals_ms: tuple[int, ...], chosen_ms: int
+) -> None:
+    """The kernel chooses the nearest interval of the camera, which may be shorter than the exposure."""
+    assert EXPOSURE_NS == 40_000_000
+    kernel.intervals_ns = tuple(1_000_000 * one for one in intervals_ms)
+    video_rig(kernel, clock).camera.close()
+    assert kernel.interval_asked_ns == 1_000_000 * chosen_ms
+
+
 def test_no_such_camera_names_the_cure(tmp_path: Path, kernel: IoctlCamera, clock: ManualClock) -> None:
     with pytest.raises(NotResponding, match=r"nothing: no such camera.*v4l2-ctl --list-devices"):
         video_rig(kernel, clock, path=str(tmp_path / "nothing"))
