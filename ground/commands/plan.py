@@ -183,7 +183,7 @@ def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--orbit", type=config_path, metavar="CONFIG", help=text)
     group.add_argument("--at", type=utc, metavar="UTC", help="start of the slew, such as 2026-03-01T12:00:00")
     group.add_argument("--within", type=positive, metavar="S", help="duration of the slew, s")
-    text = f"longest stretched slew, s (default {STRETCH:g} times --within)"
+    text = f"longest stretched slew, s (default {STRETCH:g} times --within, up to {SLEW_HORIZON_RANGE[1]:g})"
     group.add_argument("--longest", type=positive, metavar="S", help=text)
     text = "start at the best time within this time after --at, s (default 0)"
     group.add_argument("--window", type=finite, metavar="S", help=text)
@@ -231,9 +231,9 @@ def _planned(
     """Return the planned slew that the options describe. Raises UsageError."""
     if options.least_time and options.time_price is not None:
         raise UsageError("--least-time and --time-price: give one of them")
-    longest = STRETCH * options.within if options.longest is None else options.longest
     _check_range("--nodes", options.nodes, *SLEW_NODES_RANGE)
     low, high = SLEW_HORIZON_RANGE
+    longest = min(STRETCH * options.within, high) if options.longest is None else options.longest
     if not low <= options.within <= longest <= high:
         raise UsageError(f"--within {options.within:g}, longest {longest:g}: must be {low:g} to {high:g}")
     cones: dict[Literal["sun", "earth", "moon"], float] = {

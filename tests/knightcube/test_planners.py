@@ -159,6 +159,10 @@ def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
     assert naive.plan.energy == fixed.plan.energy
 
 
+def test_a_slew_that_is_longer_than_a_third_of_the_longest_needs_no_limit() -> None:
+    assert plan_slew(**SLEW | {"duration": 7000.0, "nodes": 8}).plan.horizon == pytest.approx(7000.0)
+
+
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [

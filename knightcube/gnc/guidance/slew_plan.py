@@ -620,7 +620,7 @@ def plan_slew(
         goal: pointing target at the end; if its roll is free, only the direction is an end condition.
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
-            default is three times `duration`.
+            default is three times `duration`, but at most 20,000 s.
         window: length of the time interval in which the slew begins at the time of minimum energy, s.
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
             energy plus `time_cost` times the duration. If the time cost is infinite, the shortest slew is
@@ -645,7 +645,7 @@ def plan_slew(
         start,
         goal,
         duration,
-        STRETCH * duration if longest is None else longest,
+        min(STRETCH * duration, HORIZON_RANGE[1]) if longest is None else longest,
         window,
         time_cost,
         _cone_angles(cones),

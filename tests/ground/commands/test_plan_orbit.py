@@ -43,6 +43,12 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
     )
 
 
+def test_a_long_slew_needs_no_longest_duration() -> None:
+    done = command(*PLAN, "--from", "nadir", "--to", "sun", "--within", "7000", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["horizon_s"] == pytest.approx(7000.0)
+
+
 def test_a_number_of_nodes_of_0_is_refused() -> None:
     done = command(*TO_THE_SUN, "--within", "120", "--nodes", "0")
     assert (done.returncode, "--nodes 0: must be 8 to 96" in done.stderr) == (2, True)
