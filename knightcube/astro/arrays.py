@@ -74,6 +74,13 @@ def real_number(value: npt.ArrayLike) -> float:
     )
 
 
+def check_numbers(**given: npt.ArrayLike | None) -> None:
+    """Raise ArgumentError, with the name, for an argument that is neither None nor a number."""
+    for name, value in given.items():
+        if value is not None and not (np.ndim(value) == 0 and np.asarray(value).dtype.kind in "uif"):
+            raise ArgumentError(name, f"{value!r}: give a number")
+
+
 def check_type(name: str, value: object, kind: type[object]) -> None:
     """Raise ArgumentError unless the argument `name` of a public function is an object of a class.
 

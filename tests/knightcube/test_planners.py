@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from knightcube import (
+    ArgumentError,
     GeomagneticError,
     Goal,
     OrbitError,
@@ -22,6 +23,7 @@ from knightcube import (
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import PlanningError, UsageError
+from knightcube.gnc.guidance import slew_plan
 from knightcube.gnc.guidance.plant import FARTHEST
 
 PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, stiffness=1e-5, damping=2e-6)
@@ -99,6 +101,10 @@ FREE = SingleAxisPlant(2.5e-3, 5e-4, 30.0, 0.1)
         ),
         ({"plant": replace(PLANT, current_limit=1e-3)}, "0.0195 A would hold the end angle, which exceeds"),
         (
+            {"plant": FREE, "start_rate": 0.05, "horizon": 86_400.0, "max_stretch": 1.0},
+            "use another horizon or a larger current limit",
+        ),
+        (
             {"plant": replace(PLANT, current_limit=0.04), "max_stretch": 1.0},
             "a longer horizon or a larger current",
         ),
@@ -121,6 +127,13 @@ def test_the_current_that_a_refusal_asks_for_is_needed_and_nearly_sufficient(end
     with pytest.raises(PlanningError):
         plan_step(replace(FREE, current_limit=0.98 * least), **step, end_rate=end_rate)
     assert plan_step(replace(FREE, current_limit=1.02 * least), **step, end_rate=end_rate).horizon == 12.0
+
+
+@pytest.mark.parametrize("name", ["start_angle", "end_angle", "horizon", "start_rate", "max_stretch"])
+@pytest.mark.parametrize("value", ["1.0", [1.0], 1j])
+def test_an_argument_of_a_step_with_another_type_is_named(name: str, value: object) -> None:
+    with pytest.raises(ArgumentError, match=f"^{name}: .*: give a number"):
+        plan_step(**STEP | {name: value})
 
 
 def test_steps_between_the_ends_of_the_range_are_planned() -> None:
@@ -159,6 +172,20 @@ def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
     assert naive.plan.energy == fixed.plan.energy
 
 
+def test_a_slew_far_beyond_the_limit_is_not_tried_at_each_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[object] = []
+    plan_task = slew_plan.plan_task
+
+    def counted(task: Any) -> Any:
+        tried.append(task)
+        return plan_task(task)
+
+    monkeypatch.setattr(slew_plan, "plan_task", counted)
+    with pytest.raises(PlanningError, match="check that inertia is in kg"):
+        plan_slew(**SLEW | {"inertia": [11.0, 10.5, 9.9]}, window=1200.0)
+    assert len(tried) == 1
+
+
 def test_a_slew_that_is_longer_than_a_third_of_the_longest_needs_no_limit() -> None:
     assert plan_slew(**SLEW | {"duration": 7000.0, "nodes": 8}).plan.horizon == pytest.approx(7000.0)
 
@@ -174,6 +201,11 @@ def test_a_slew_that_is_longer_than_a_third_of_the_longest_needs_no_limit() -> N
         ({"cones": {"moon": NAN}}, r"cones\['moon'\]: nan rad"),
         ({"window": -1.0}, "window"),
         ({"window": NAN}, "window is nan s: must be 0 to 20000 s"),
+        ({"window": "300"}, "window: '300': give a number"),
+        ({"duration": np.array([600.0])}, r"duration: array\(\[600.\]\): give a number"),
+        ({"longest": "900"}, "longest: '900': give a number"),
+        ({"time_cost": True}, "time_cost: True: give a number"),
+        ({"cones": {"sun": "0.3"}}, r"cones\['sun'\]: 0.3 rad: must be"),
         ({"duration": NAN}, "duration is nan s, .* must satisfy 1 <= duration <= longest <= 20000 s"),
         ({"duration": 1e12}, "duration is 1000000000000.0 s"),
         ({"longest": 300.0}, "duration is 600.0 s, longest 300.0 s: must satisfy"),

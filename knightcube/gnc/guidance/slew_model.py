@@ -514,6 +514,7 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
     """Return the exclusion cones of a body `axis` (3,), one for each of `angles`, rad.
 
     The angles `sun` and `moon` are measured from the centre of the disc, and `earth` from the Earth's limb.
+    The position of the Moon relative to the Earth is that at the start; it changes by 0.6 deg per hour.
     """
     date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
     moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)

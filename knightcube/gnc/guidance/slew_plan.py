@@ -28,7 +28,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray, check_type, finite_array, unit_vector
+from knightcube.astro.arrays import (
+    FloatArray,
+    check_numbers,
+    check_type,
+    finite_array,
+    real_number,
+    unit_vector,
+)
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.geomagnetism import check_year
 from knightcube.astro.earth.orbit_knowledge import elements_of
@@ -146,6 +153,15 @@ _ENDS = 9
 """Number of durations for which the error message checks whether the slew would end inside a cone."""
 
 
+_HOPELESS = 10.0
+"""Ratio of the required dipole to the dipole limit above which no other start time is tried. Along an orbit,
+the energy varies by a factor of up to ten, and the dipole by a factor of about three."""
+
+
+class _HopelessError(PlanningError):
+    """Raised if a slew needs so much more than the dipole limit that no start time would be feasible."""
+
+
 class SlewStatus(StrEnum):
     """Whether the requested duration was kept (OPTIMAL) or extended (STRETCHED)."""
 
@@ -201,7 +217,8 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
         if plan is not None:
             return plan
         tried, least = tried + search.tried, min(least, search.least)
-    raise PlanningError(refusal(task, tried, least))
+    is_hopeless = _HOPELESS < _excess(task, least) < math.inf
+    raise (_HopelessError if is_hopeless else PlanningError)(refusal(task, tried, least))
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
@@ -275,13 +292,21 @@ def refusal(task: SlewTask, tried: int, least: float = math.inf) -> str:
         text += f"; {share} of these, from {first:.0f} s on, end in the exclusion cone of the {cone.name}"
         if share == "all":
             return f"{text}: choose another goal or time, or a smaller cone"
-    # The dipole of a slew is about inversely proportional to the squared duration.
-    if 1.0 < least * (task.horizon / task.longest) ** 2 < math.inf:
+    if 1.0 < _excess(task, least) < math.inf:
         return (
             f"{text}: without the limit, a slew of {task.horizon:g} s needs {least:.3g} times the dipole "
             "limit: check that inertia is in kg m^2 and the dipole limit in A m^2, or allow a longer time"
         )
     return f"{text}: allow a longer time or another start"
+
+
+def _excess(task: SlewTask, least: float) -> float:
+    """Return the ratio of the peak dipole to the dipole limit for the longest duration.
+
+    The argument `least` is this ratio for the requested duration. The dipole of a slew is about inversely
+    proportional to the squared duration.
+    """
+    return least * (task.horizon / task.longest) ** 2
 
 
 def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
@@ -418,7 +443,8 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
 
     The window opens `first` s after the start of the ephemeris. The ephemeris must begin at least `LEAD` s
     before `first`, and end at least `LEAD` s after the end of the longest slew. Raises PlanningError with the
-    last reason if no slew is found, and UsageError for a window out of range.
+    last reason if no slew is found, and UsageError for a window out of range. If a slew needs many times the
+    dipole limit, no other start is tried.
     """
     _check_window(order.window)
     begins = first + order.window * np.linspace(0.0, 1.0, _BEGINS + 1 if order.window else 1)
@@ -428,6 +454,8 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
     for begin in begins if order.window else ():
         try:
             plan = plan_task(task_at(coarse, ephemeris, float(begin)))
+        except _HopelessError:
+            raise
         except PlanningError as error:
             failed = error
         else:
@@ -541,7 +569,7 @@ def _check_order(order: SlewOrder) -> None:
     for name, angle in order.angles.items():
         if name not in ("sun", "earth", "moon"):
             raise ArgumentError("cones", f"unknown exclusion cone {name!r}: give sun, earth or moon")
-        if not 0.0 <= angle < math.pi:
+        if not 0.0 <= real_number(angle) < math.pi:
             raise ArgumentError(
                 f"cones[{name!r}]", f"{angle} rad: must be 0 to below pi; math.radians converts degrees"
             )
@@ -637,6 +665,7 @@ def plan_slew(
         OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
         GeomagneticError: if the slew is outside the years 2025 to 2030 of the magnetic field model.
     """
+    check_numbers(duration=duration, longest=longest, window=window, time_cost=time_cost)
     axes = _axes(pointing_axis, across_axis)
     order = SlewOrder(
         _craft(inertia, dipole_limit, heat),

@@ -25,7 +25,7 @@ from typing import Literal
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, check_type
+from knightcube.astro.arrays import FloatArray, check_numbers, check_type
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.plant import (
     FARTHEST,
@@ -415,7 +415,8 @@ def _remedy(plant: SingleAxisPlant, ends: BoundaryStates, horizon: float, longes
             f"{limit}: every path of these durations needs at least about {current:.3g} A: use a larger "
             "current limit, a longer horizon or a smaller step"
         )
-    return f"{limit}: use a longer horizon or a larger current limit"
+    # A body that moves at an end may also need a shorter horizon, because it would leave the range of angles.
+    return f"{limit}: use {'another' if any(rates) else 'a longer'} horizon or a larger current limit"
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
@@ -486,8 +487,9 @@ def _check(
     q2_limit: float,
     max_stretch: float,
 ) -> None:
-    """Raise PlanningError for arguments outside their ranges, and ArgumentError for another plant."""
+    """Raise PlanningError for arguments outside their ranges, and ArgumentError for another type."""
     check_type("plant", plant, SingleAxisPlant)
+    check_numbers(**states, horizon=horizon, max_stretch=max_stretch)
     for name, value in states.items():
         if not math.isfinite(value):
             raise PlanningError(f"{name} is {value}: a path needs finite states")
@@ -562,6 +564,7 @@ def run(job: PlanJob) -> StepPlan:
 
 def _q2_at(name: str, angle: float) -> float:
     """Return q2 at an angle (rad), the argument `name`. Raises PlanningError for an angle out of range."""
+    check_numbers(**{name: angle})
     if not abs(angle) <= FARTHEST:
         in_degrees = abs(angle) > 2.0 * math.pi and abs(math.radians(angle)) <= FARTHEST
         raise PlanningError(
