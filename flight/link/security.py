@@ -225,6 +225,12 @@ class Vault:
             return newest
         return None if newest.spi == COMMAND_SPIS[0] else self._witness.known[newest.spi]
 
+    def has_used(self, spi: int, key: bytes) -> bool:
+        """Return whether an SPI has this key, or has or had it according to the reference folder."""
+        present = self.read(spi)
+        recorded = self._witness is not None and self._witness.has_recorded(spi, key)
+        return recorded or (present is not None and present.key == key)
+
     def copies(self, name: int | str) -> int:
         """Return the number of valid copies that equal the newest copy."""
         found = self._copies(name)
@@ -304,6 +310,11 @@ class _Witness:
         if known.key == stored.key:
             return stored.unused < known.unused
         return _id_of(stored.key) in self._replaced[stored.spi]
+
+    def has_recorded(self, spi: int, key: bytes) -> bool:
+        """Return whether a key is the newest key of an SPI or was replaced."""
+        known = self.known.get(spi)
+        return _id_of(key) in self._replaced[spi] or (known is not None and known.key == key)
 
     def write(self, association: Association) -> None:
         """Record a new association, and the digest of the key that it replaces."""

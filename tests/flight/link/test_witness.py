@@ -74,9 +74,14 @@ def test_a_replaced_key_stays_refused_and_a_new_one_is_accepted(keys: Path, grou
     shutil.copytree(keys, keys.parent / "backup")
     at = opened(keys)
     for spi in (1, 2, 3):
+        before = at.read(spi)
         assert at.write(Association(spi, 2, 0, bytes([spi + 10]) * 32)) == 2
+        assert before is not None
+        assert at.has_used(spi, before.key), "a replaced key must not be set again"
     restore(keys)
     at = opened(keys)
+    assert at.has_used(1, bytes([11]) * 32)
+    assert not at.has_used(1, new_key())
     assert (at.restored, at.read(1)) == (True, None)
     for spi in (2, 3):
         found = at.read(spi)

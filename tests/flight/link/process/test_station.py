@@ -374,6 +374,16 @@ def test_a_new_key_makes_the_old_one_worthless(link: BothEnds) -> None:
     assert link.status()["generation"].tolist() == [2, 1, 1, 1]
 
 
+def test_a_key_is_not_set_again(link: BothEnds) -> None:
+    """With the counter at 0, recorded commands with this key would be executed again."""
+    present = link.sky.read(1)
+    assert present is not None
+    counter = link.terminal.send(directives.pack(NewKey(1, 2, present.key), 1))
+    link.turn()
+    assert link.stages(counter) == ["accepted", "failed"]
+    assert link.status()["generation"].tolist() == [1, 1, 1, 1]
+
+
 def test_a_stolen_primary_key_cannot_change_the_keys_of_the_reserves(link: BothEnds) -> None:
     key = bytes(range(32))
     for changed in (2, 4):
