@@ -69,6 +69,8 @@ _BEYOND = 1.01
 """Largest ratio of the current limit of a coil to the current that its supply voltage drives."""
 _PREFIX = 24
 """Default prefix length of the network whose hosts may send frames to the link."""
+_MOST_SEGMENTS = 10_000
+"""Maximum number of segment files of a log, whose folder the link lists in 0.1 s."""
 _DATA_SYMBOLS = 223
 """Number of data symbols in a codeword of the link's Reed-Solomon code."""
 
@@ -99,6 +101,13 @@ def check_consistency(config: Config, document: Document) -> None:
             "telemetry.budget_bytes",
             f"is {telemetry.budget_bytes}: must be at least twice `telemetry.segment_bytes`",
         )
+    if telemetry.budget_bytes > _MOST_SEGMENTS * telemetry.segment_bytes:
+        problem = f"is {telemetry.budget_bytes}: a log has at most {_MOST_SEGMENTS} segments"
+        refuse("telemetry.budget_bytes", f"{problem}: give a larger `telemetry.segment_bytes`")
+    logs = 2 if config.simulation is None else 3
+    if telemetry.archive_bytes < logs * telemetry.budget_bytes:
+        problem = f"is {telemetry.archive_bytes}: must be at least {logs} times `telemetry.budget_bytes`"
+        refuse("telemetry.archive_bytes", f"{problem}, for the logs of one run")
     if config.camera is not None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)

@@ -171,6 +171,16 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
             "telemetry: {segment_bytes: 9000, budget_bytes: 17999}\nduration:",
             "at least twice `telemetry.segment_bytes`",
         ),
+        (
+            "duration:",
+            "telemetry: {segment_bytes: 4096, budget_bytes: 40964096}\nduration:",
+            "a log has at most 10000 segments: give a larger `telemetry.segment_bytes`",
+        ),
+        (
+            "duration:",
+            "telemetry: {segment_bytes: 9000, budget_bytes: 20000, archive_bytes: 59999}\nduration:",
+            "`telemetry.archive_bytes` is 59999: must be at least 3 times `telemetry.budget_bytes`",
+        ),
     ],
 )
 def test_values_that_contradict_each_other_are_refused(right: str, wrong: str, complaint: str) -> None:
@@ -198,6 +208,7 @@ def test_the_inertia_is_a_tensor_or_its_diagonal() -> None:
     "right",
     [
         "telemetry: {segment_bytes: 9000, budget_bytes: 18000}",
+        "telemetry: {segment_bytes: 4096, budget_bytes: 40960000, archive_bytes: 122880000}",
         "commands: {udp: 'localhost:5000'}",
         "commands: {udp: '127.1.2.3:5000'}",
     ],
