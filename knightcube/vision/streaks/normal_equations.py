@@ -456,6 +456,8 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
     return EliminatedEquations(kept, own, gain, inner) if size < _SINGULAR else None
 
 
+# Information (1/counts^2) on the flux of a star without fitted pixels, so that its block is invertible.
+_UNFITTED = 1e-30
 # Largest element of the inverse of a regular information matrix that is scaled to a unit diagonal.
 _SINGULAR = 1e10
 
@@ -472,8 +474,7 @@ def _eliminated_numpy(
     alone = information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # For a star without fitted pixels, the element of the flux is set to 1, so that the block is invertible.
-    diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
+    diagonal += np.where(diagonal > 0.0, 0.0, _UNFITTED)
     root = np.sqrt(np.einsum("nii->ni", alone))
     outer = root[:, :, None] * root[:, None, :]
     unit = alone / outer
@@ -500,7 +501,7 @@ def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, Fl
     for star in range(n):
         for i in range(ALONE):
             diagonal = information[star, SHARED + i, SHARED + i] + PRIOR[i]
-            root[i] = math.sqrt(diagonal if diagonal > 0.0 else 1.0 + diagonal)
+            root[i] = math.sqrt(diagonal if diagonal > 0.0 else _UNFITTED + diagonal)
         for i in range(ALONE):
             for j in range(ALONE):
                 unit[i, j] = information[star, SHARED + i, SHARED + j] / (root[i] * root[j])

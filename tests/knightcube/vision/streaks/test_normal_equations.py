@@ -122,7 +122,7 @@ def test_the_equations_of_a_star_are_those_without_its_own_parameters() -> None:
 def test_singular_equations_have_no_solution() -> None:
     """Parameters without information, or with information only on their sum, are not determined.
 
-    A star without pixels leaves the equations of the other stars as they are.
+    A star without pixels leaves the equations of the other stars as they are, and its flux is unknown.
     """
     evaluation = _random_evaluation()
     dark = replace(evaluation, information=evaluation.information.copy())
@@ -140,6 +140,9 @@ def test_singular_equations_have_no_solution() -> None:
     assert expected is not None
     assert found.inner == pytest.approx(expected.inner)
     assert not found.gain[2].any()
+    # No flux that a camera can measure is significant.
+    assert found.own[2, 2, 2] > 1e20
+    assert found.own[2, 3, 3] == pytest.approx(1.0 / PRIOR[3])
     each = empty.information, np.flatnonzero(_FREE)
     assert_forms_agree(normal_equations._eliminated, *each, compiled=False)
 
