@@ -279,7 +279,9 @@ SHADOW = 0.5
 TRACK_INTERVAL_S = 10.0
 """Time (s) between drawn points of the ground track."""
 TRACK_MARK_S = 600.0
-"""Time (s) between marked points of the ground track."""
+"""Shortest time (s) between marked points of the ground track."""
+_MAX_MARKS = 60
+"""Maximum number of marked points of the ground track."""
 _CONES = {"Sun": panels.ORANGE, "Earth": panels.GREEN, "Moon": panels.GREY}
 _OBJECT_COLOURS = (panels.BLUE, panels.ORANGE, panels.GREEN, panels.PURPLE)
 
@@ -479,7 +481,8 @@ def track_figure(signals: RunSignals) -> Figure | None:
     dark = packets["sunlit"] < SHADOW
     for inside, colour, label in ((~dark, panels.ORANGE, "sunlit"), (dark, panels.BLUE, "in shadow")):
         ax.plot(east[inside], north[inside], ".", color=colour, markersize=4, label=label)
-    marked = np.searchsorted(times, np.arange(times[0], times[-1], TRACK_MARK_S))
+    interval = TRACK_MARK_S * max(1.0, np.ceil((times[-1] - times[0]) / (TRACK_MARK_S * _MAX_MARKS)))
+    marked = np.searchsorted(times, np.arange(times[0], times[-1], interval))
     ax.plot(east[marked], north[marked], "o", color=panels.BLACK, markersize=4)
     for k in marked:
         label, place = f"{times[k] / 60.0:.0f} min", (east[k], north[k])

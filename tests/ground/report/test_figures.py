@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from ground.report import panels
-from ground.report.figures import path_figure, spin_figure
+from ground.report.figures import path_figure, spin_figure, track_figure
 from ground.report.panels import RunSignals, planned_path
 
 EVERY = ["attitude", "current", "power", "paths", "cycle_times", "rate", "overview"]
@@ -197,3 +197,15 @@ def test_a_path_is_drawn_from_its_start_to_its_target_within_the_limit(tmp_path:
     assert imread(file).std() > 0.01
     with pytest.raises(UsageError, match="the picture cannot be written"):
         draw_path(made, plant, tmp_path)
+
+
+def test_the_track_of_a_month_has_as_many_marks_as_can_be_read() -> None:
+    def marks(step: float) -> list[str]:
+        times = (step * number for number in range(100))
+        rows = [(at, {"utc": 2461120.0 + at / 86400.0, "position": [7e6, at, 0.0]}) for at in times]
+        figure = track_figure(RunSignals(packed_run(orbit_truth=rows)))
+        assert figure is not None
+        return [text.get_text() for text in figure.axes[0].texts]
+
+    assert marks(60.0) == [f"{minutes} min" for minutes in range(0, 99, 10)]
+    assert 50 <= len(marks(25_920.0)) <= 60
