@@ -181,7 +181,7 @@ def _source_files(path: Path) -> Iterator[Path]:
 
 
 def _damaged_package(release: Path) -> str:
-    """Return how a file of a release's packages differs from the manifest, or an empty text."""
+    """Return how the package files of a release differ from its manifest, or an empty text if they agree."""
     first, _, rest = (release / MANIFEST).read_text(encoding="utf-8").partition("\n")
     if hashlib.sha256(rest.encode()).hexdigest() != first:
         return f"the manifest of {release.name} is damaged"

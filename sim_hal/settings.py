@@ -283,9 +283,10 @@ class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
 
 
 class SolarPanel(Section, frozen=True, kw_only=True):
-    """A solar panel on a face with the outward `normal` (3,), body axes, of any length.
+    """A solar panel on a face of the body.
 
-    `peak` (W) is the electrical power in sunlight at normal incidence and one astronomical unit.
+    The outward `normal` (3,), in body axes, need not be a unit vector. `peak` (W) is the electrical power in
+    sunlight at normal incidence and one astronomical unit.
     """
 
     normal: Annotated[Vector, Meta(description="outward normal in body axes, three numbers")]

@@ -257,7 +257,7 @@ class Vault:
             return 0
 
     def remove(self, name: int | str) -> None:
-        """Delete both copies of an association."""
+        """Delete both copies of a security association."""
         for copy in COPIES:
             self._path(name, copy).unlink(missing_ok=True)
 

@@ -772,8 +772,8 @@ class CoilMonitor:
     def _look_further(self, axes: set[int], now_ns: int) -> None:
         """Probe the next suspected axis; after the last axis, collect new evidence.
 
-        After the last axis, no coil fault explained the evidence, as with an intermittent fault or a faulty
-        monitor.
+        If all axes were probed, no coil fault explains the evidence; the fault may be intermittent, or the
+        current monitor may be faulty.
         """
         ends_ns = self._probe.begin(axes, now_ns, self._prime)
         gain = self._evidence.monitor_gain(self._known) if ends_ns is None else None

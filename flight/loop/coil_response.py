@@ -552,7 +552,8 @@ def _bin_equations_numpy(
         per_field: accelerations per ampere (3, 3 n) by the coils in a unit field along each body axis.
         gyroscopic: coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of k error modes.
         free: indices (f,) of the axes about which the body can rotate.
-        sums: integrals (2, 3 n + 6) until the end of the first bin, and their means in the first bin.
+        sums: the integrals at the end of the first bin, and the mean of each integral over the first bin,
+            (2, 3 n + 6).
         motion: rotation vector (rad) until the first bin, and mean rate in the first bin, (2, 3).
         span: time (s) between the bins, or 0.0 without a first bin.
 

@@ -552,7 +552,7 @@ _YAML_CURES = {
 
 
 def _unit_hint(dotted: str, value: Any, message: str) -> str:
-    """Return a hint about a number with a unit, and about an angle in rad that a key expects in deg."""
+    """Return a hint if a value was written with a unit, or in rad although the key expects deg."""
     if isinstance(value, str) and "a number" in message and re.match(r"\s*[-+]?[0-9]", value):
         quoted = re.fullmatch(r"\s*[-+]?[0-9.]+([eE][-+]?[0-9]+)?\s*", value)
         return f": write the number without {'quotes' if quoted else 'a unit'}"

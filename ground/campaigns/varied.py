@@ -106,7 +106,7 @@ def _between(low: float, high: float, logarithmic: bool) -> tuple[Draw, bool]:
 
 
 def varied_campaign(path: Path, variations: Sequence[Variation], duration: float | None) -> Campaign:
-    """Return the campaign that flies a simulated configuration with random parameters.
+    """Return the Monte Carlo campaign of a simulated configuration with random parameters.
 
     The result of a flight contains its random parameters and those performance measures that have a limit.
     The limits are those of the section `requirements` for a satellite, and those of the thesis for a testbed.

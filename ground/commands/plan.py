@@ -146,7 +146,7 @@ def _text(made: StepPlan, plant: SingleAxisPlant, solved_s: float) -> str:
 
 
 def _q2(option: str, text: str) -> float:
-    """Read a value of the quaternion component q2 from a text. Raises UsageError for a value out of range."""
+    """Return the quaternion component q2 that a text states. Raises UsageError for a value out of range."""
     try:
         value = finite(text)
     except argparse.ArgumentTypeError as error:

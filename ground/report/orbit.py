@@ -38,7 +38,8 @@ SETTLED_AFTER_S = 600.0
 _SAME_CYCLE_S = 0.5
 """Longest time (s) from a description packet to the attitude error that is used with it."""
 _LATEST_START_S = 2.0
-"""Latest time (s) of the first packets of a complete log; these packets are sent every second."""
+"""Latest time (s) of the first packets of a complete log. The packets are sent every second, so a log that
+begins later has lost its oldest segments."""
 
 
 def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
@@ -437,7 +438,7 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
 
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return start and end times (n,), s, of the camera's intervals, and whether the body rotates slowly.
+    """Return start and end times (n,), s, of the frame periods, and whether the body then rotates slowly.
 
     The body rotates slowly if its rate is below `camera.max_rate`. As in flight, an instant at which the body
     rotates too fast for a frame does not delay the next instant. If the oldest segments of the log were

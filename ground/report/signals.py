@@ -55,8 +55,8 @@ class PowerHistory:
         time: start times (n,) of the intervals, s.
         end: end of the last interval, s.
         supply: mean of V |I| (n,), W, which the coils draw from their supply.
-        heat: mean of R I^2 (n,), W, the ohmic heat of constant currents. The planner minimises the ohmic
-            heat.
+        heat: mean of R I^2 (n,), W, the ohmic heat if the current were not pulsed. The planner minimises
+            this heat.
         source: "truth" if computed from the simulated coils, "written" if computed from the commanded
             currents.
     """

@@ -34,7 +34,7 @@ from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import SECOND_NS, Clock
 
 _READ_TIMEOUT_S = 0.1  # longest time (s) until the thread notices that the port is to be closed
-_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; the kernel's buffer is rarely full
+_WRITE_TIMEOUT_S = 0.005  # longest time (s) to wait while the kernel's buffer is full, a fifth of a cycle
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 

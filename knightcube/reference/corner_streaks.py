@@ -60,7 +60,7 @@ _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
     "harris": {},
     # The minimum eigenvalue is proportional to brightness^2, and Harris's response to brightness^4.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},
-    # With four neighbours, all pixels of a diagonal streak are detected as corners.
+    # With 4-connectivity, all pixels of a diagonal streak are detected as corners.
     # Smoothing and a high threshold suppress false corners, but also half of the streak ends.
     "trajkovic-4": {
         "smoothing_sigma": 1.0,

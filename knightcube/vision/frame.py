@@ -506,8 +506,8 @@ def gain_in_counts(gain: float, unit: float) -> float:
 def raw_counts(image: Image) -> tuple[Image, float, float]:
     """Return an image (rows, columns) as unsigned integers, the unit of a count, and the value of 0 counts.
 
-    A pixel value is the value of 0 counts plus its counts times the unit. The unit of whole numbers is 1, and
-    their value of 0 counts is 0 unless a pixel is negative or exceeds the precision of a float32. Other
+    A pixel value is the value of 0 counts plus its counts times the unit. For whole numbers, the unit is 1,
+    and the value of 0 counts is 0 unless a pixel is negative or too large to be exact as a float32. Other
     numbers are rounded to a sixteenth of their noise. Raises ArgumentError if the range of the pixels is
     infinite.
     """

@@ -482,9 +482,9 @@ def calibrate_one_lens(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationImage:
-    """One image of a lens calibration: its solution, and the reason for excluding it if it was solved.
+    """One image of a lens calibration, with its solution.
 
-    For an image that is used, `excluded` is empty.
+    The attribute `excluded` states why a solved image is not used, and is empty for all other images.
     """
 
     solution: FrameSolution

@@ -181,7 +181,7 @@ class SunSolution:
 _MOST_PATCHES = 4
 """Maximum number of bright patches that are examined, starting with the largest."""
 _LEAST_PATCH = 3
-"""Minimum number of bright pixels of a patch on the rows that are read, which excludes hot pixels."""
+"""Minimum number of bright pixels of a patch on the sampled rows, so that no hot pixel counts as a patch."""
 _SPOKES = 48
 """Number of spokes along which the rim of a bright patch is traced."""
 _STEP = 0.5

@@ -566,8 +566,9 @@ def _expansion(
 
 
 def _legendre(cosine: FloatArray, sine: FloatArray) -> tuple[list[list[FloatArray]], list[list[FloatArray]]]:
-    """Return Schmidt functions P[n][m] and derivatives with respect to colatitude, each an array (points,).
+    """Return associated Legendre functions P[n][m] and their derivatives with respect to colatitude.
 
+    The functions are Schmidt quasi-normalised, and each element is an array (points,).
     The recursions are from Langel, "The main field", in Geomagnetism (Jacobs, 1987), eq. 27 and table 2.
     """
     p = [[np.ones_like(cosine)]]

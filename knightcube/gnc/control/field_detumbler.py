@@ -271,7 +271,7 @@ SHORTEST = 9
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 CHANGED = 30.0
-"""Time span (s) of the predicted field change whose direction is aligned with the measured field change."""
+"""Time (s) over which the predicted change of the field shows the direction in which the field rotates."""
 STRENGTH = 0.2
 """Difference between predicted and measured field strength above which the orbit counts as wrong, as a
 fraction of the measured strength."""

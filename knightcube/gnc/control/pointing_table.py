@@ -6,11 +6,11 @@ algorithm 18.3). In contrast to the sweeps of `pointing_path`, the intermediate 
 need not obey the equations of motion. The defect of a time step is the difference between the propagated
 state at the end of the step and the state at the next instant. The defects of all steps converge to zero
 during the iterations (Bock & Plitt 1984, IFAC 9th World Congress). Multiple shooting prevents errors from
-growing along a revolution of the orbit. If one motion were propagated over a revolution, errors could grow,
-because coils cause no torque about the field and the body may rotate by a large angle about the pointing
-axis. An iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the midpoint
-rule, and the derivatives are the exact derivatives of the midpoint rule. With derivatives of the continuous
-motion, the iteration would stall for bodies that rotate by degrees per time step.
+growing along a revolution of the orbit. If a single motion were propagated over the revolution, errors could
+grow, because coils cause no torque about the field and the body may rotate by a large angle about the
+pointing axis. An iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the
+midpoint rule, and the derivatives are the exact derivatives of the midpoint rule. With derivatives of the
+continuous motion, the iteration would stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of the path is computed by a backward

@@ -252,7 +252,8 @@ class PriorCheck:
 def gate_bounds(sigma: float) -> dict[int, float]:
     """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 
-    A larger square is less probable than a one-dimensional deviation by `sigma` standard deviations.
+    A larger normalised square is less probable than a deviation of a normal variable by `sigma` standard
+    deviations.
     """
     chance = math.erfc(sigma / math.sqrt(2.0))
     return {components: chi_square.bound(chance, components) for components in (1, 2, 3)}

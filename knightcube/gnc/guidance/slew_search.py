@@ -568,8 +568,8 @@ in Newton steps times intervals, exceeds the budget, no further guess is tried. 
 (in this unit) takes about 0.1 s. Searches with exclusion cones begin with 12 intervals, because on ten
 intervals a path around a cone differs too much from the path on the fine grid."""
 _WALKS = 1.8
-"""Work, as a multiple of the budget of a search, after which the continuation ends with the best path so
-far."""
+"""Computational effort, as a multiple of the budget of a search, after which the continuation ends with the
+best path so far."""
 _MAXIMUM_TRIED = 16
 """Largest number of initial guesses that are tried for one duration."""
 _LOOK = 8

@@ -154,10 +154,9 @@ The number of other edges determines the density of chance edges.
 
 @dataclass(frozen=True, slots=True)
 class LimbInView:
-    """Length of the part of a limb in an image that should show edges, px, and crossings with scan lines.
+    """Length (px) of the part of a limb in an image that should show edges, and crossings with scan lines.
 
-    The number of crossings is `crossings` for the part that should show edges, and `all_crossings` for the
-    whole limb in the image.
+    The scan lines cross that part `crossings` times, and the whole limb in the image `all_crossings` times.
     """
 
     length: float

@@ -642,8 +642,9 @@ _BELLS = np.array([_BELL * math.exp(-0.5 * edge * edge) for edge in _EDGES])
 def _profile(offset: float, sigma: float, out: FloatArray) -> None:
     """Write the three arrays that `profile` returns, for one star, to `out` (3, k + 1), last column unused.
 
-    The normal distribution and its density are Taylor series about the nearest tabulated edge, because `erfc`
-    and `exp` would take a third of the time of a fit. The error of the series is below 1e-12.
+    The normal distribution function and its density are computed from Taylor series about the nearest node of
+    a table, because `erfc` and `exp` would take a third of the time of a fit. The error of the series is
+    below 1e-12.
     """
     size = out.shape[1] - 1
     for k in range(size + 1):

@@ -181,8 +181,9 @@ _BlockLines = tuple[IntArray, IntArray, FloatArray, BoolArray, BoolArray]
 
 
 def _block_lines_numpy(place: FloatArray, sampled: FloatArray, field: tuple[int, int]) -> _BlockLines:
-    """Return the lines of pixels that cross n parts of paths, given positions (n, s, 2) at s instants (n, s).
+    """Return the rows or columns of pixels that n path segments cross.
 
+    Each segment is given by its positions `place` (n, s, 2) at the s instants `sampled` (n, s).
     The pair `field` contains the numbers of columns and rows of the frame.
     """
     span = np.abs(place[:, -1] - place[:, 0])

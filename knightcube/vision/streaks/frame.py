@@ -244,7 +244,7 @@ def _mark_bright(
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
 _BROAD = 25.0
-# Smallest length (px) of a region that is assumed when its mean width is computed from its area.
+# Lower bound (px) of the length of a region by which its area is divided for its mean width.
 _LEAST_LENGTH = 40.0
 # Side length (px) of a square that fits into the image of a limb or a reflection, but not of a star.
 _SOLID = 31

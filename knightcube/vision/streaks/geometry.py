@@ -119,7 +119,7 @@ _Terms = tuple[FloatArray, FloatArray, FloatArray]
 def _ideal_arguments(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray
 ) -> tuple[_View, _Terms, FloatArray, FloatArray]:
-    """Return view, terms of the motion, undistorted `stars` (m, 2) and `time` (m,), as contiguous arrays."""
+    """Return camera model, motion, undistorted `stars` (m, 2) and `time` (m,), all as contiguous arrays."""
     if isinstance(pinhole, DistortedPinhole):
         stars = pinhole.undistorted(stars)
     each = motion.rate, motion.acceleration, motion.higher_terms, stars, time
@@ -582,7 +582,7 @@ class StreakScene:
         return replace(self, motion=self.motion.smooth, stars=self.stars + shift)
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return the scene with m additional stars at `stars` (m, 2), px, which do not affect the motion."""
+        """Return the scene with m more stars at `stars` (m, 2), px, which the motion is not fitted to."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),

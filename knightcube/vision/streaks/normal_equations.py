@@ -526,7 +526,10 @@ def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, Fl
 
 @loop_helper
 def _inverted(matrix: FloatArray) -> float:
-    """Replace an information matrix (k, k) by its inverse, and return the measure of `_eliminated_numpy`."""
+    """Replace an information matrix (k, k) by its inverse, and return how singular the matrix is.
+
+    The returned measure of singularity is that of `_eliminated_numpy`.
+    """
     count, size = len(matrix), 0.0
     scale, pair = np.empty(count), np.zeros((count, 2 * count))
     for i in range(count):

@@ -599,7 +599,7 @@ def coefficients(
     The eight derivatives are with respect to rate (3), acceleration (3), and the star's position x and y. The
     derivatives with respect to the acceleration are zero unless the rate changes (`growing`). Within a block,
     displacements are linear along the path. If `quadratic` is True, displacements are quadratic along the
-    path, and the result contains the coefficients of QUADRATIC_IMAGES further images.
+    path, and the result also contains the coefficients of QUADRATIC_IMAGES additional images.
     """
     centre = 0.5 * (strips.time[:, LINES // 2 - 1] + strips.time[:, LINES // 2])
     of_block = stars[strips.star]

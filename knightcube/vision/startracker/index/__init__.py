@@ -223,7 +223,7 @@ SIZES = 1 << 16
 OCTAVE = SIZES // 8
 """Number of steps of a triangle's longest side per factor of two; `SIZES` steps end at the chord 1."""
 RUN_BITS = 10
-"""Binary logarithm of the number of steps of the longest side per interval of `TriangleIndex.below`."""
+"""Binary logarithm of the number of steps (see `SIZES`) in one interval of `TriangleIndex.below`."""
 # Number of boxes along each axis into which the cube around the unit sphere is divided for star searches.
 _BOXES = 20
 TIE = 1e-9
