@@ -192,7 +192,7 @@ class CameraMotion:
             return out
         powers = np.arange(3.0, 3.0 + len(self.higher_terms))
         factors = (np.ones(len(powers)), powers, powers * (powers - 1.0))[derivative]
-        # Horner's scheme is faster than powers
+        # Horner's scheme is faster than the computation of each power.
         for coefficient in (factors[:, None] * self.higher_terms)[::-1]:
             out = coefficient[:, None] + time * out
         return out * (time * time * time, time * time, time)[derivative]

@@ -133,7 +133,7 @@ _CONTRADICTION = 0.6
 _SHAKEN = 2.5
 # Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
 _CALM = 2.0
-# Fraction of streak ends that a fit with a wrong rotation angle can match, at one end of each streak.
+# Fraction of streak ends that a fit with a wrong rotation angle can match by matching one end per streak.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -311,7 +311,7 @@ def _judged(done: StreakFit, guess: MotionGuess, ends: float) -> tuple[float, bo
 def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
     """Return a preliminary fit that includes a vibration, or None if the residuals show no vibration.
 
-    The fit is as precise as the last one, because residuals of bright stars would look like faint stars.
+    The tolerance is that of the final fit, because residuals of bright stars would look like faint stars.
     """
     limits = replace(FIRST, tolerance=LAST.tolerance)
     return fit_vibration(
@@ -362,9 +362,9 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     """Return the result of the streak check: whether the streaks of a motion have confirmed ends and no gaps.
 
     In a frame with many stars, a streak may be a blend of several stars. A motion is doubtful if some streaks
-    have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no streak has
-    both ends in the frame, or if most streaks with both ends in the frame contradict the motion. A motion is
-    rejected if too many streak ends are wrong, or if most short streaks continue as faint trails.
+    have gaps or wrong ends, unless enough other streaks have two confirmed ends. A motion is also doubtful if
+    no streak has both ends in the frame, or if most flux of complete streaks contradicts the motion. A motion
+    is rejected if too many streaks have gaps, wrong ends or faint trails, or are parts of longer streaks.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -434,11 +434,11 @@ _MOST_DIFFERENCE = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A motion from the joint fit, with its rotation vector over the exposure (3,), rad, and its streaks.
+    """A motion from the joint fit, with the result of the streak check.
 
-    For a rolling shutter, `middles` (n, 2), px, are the centres of the n bright streaks, and `excess` (n,) is
-    the chi-square of each streak minus the number of its pixels. For a global shutter, `middles` and `excess`
-    are empty.
+    The rotation vector over the exposure is `rotation` (3,), rad. For a rolling shutter, `middles` (n, 2),
+    px, are the centres of the n bright streaks, and `excess` (n,) is the chi-square of each streak minus the
+    number of its pixels. For a global shutter, `middles` and `excess` are empty.
     """
 
     result: MotionResult
@@ -505,7 +505,7 @@ _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # Last step of a joint fit (standard deviations) above which the fit has not converged.
 _UNSETTLED = 2.0
-# Distance (point-spread widths) from the border of the frame at which the end of a streak is visible.
+# Minimum distance (point-spread widths) from the frame's border at which the end of a streak is visible.
 _END_WIDTHS = 2.0
 # Minimum decrease of chi-square for which a rotation that reverses during the exposure is assumed.
 _REVERSED = 30.0
@@ -520,7 +520,7 @@ _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return a copy of the result `seen` with fitted stars, streak ends and covariances."""
+    """Return a copy of the result `seen` with stars, streak ends and covariances of the fit `last`."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
@@ -783,7 +783,7 @@ def _in_direction(
 def _motion_of_course(
     camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None, course: Course | None
 ) -> _Candidate | None:
-    """Return the best motion that follows the navigation filter's motion, unless the pixels contradict it."""
+    """Return the best motion with the time course `course`, or without it if the pixels contradict it."""
     if course is not None and camera.course is not None:
         found = _best_motion(camera, seen, regions, near)
         if found is not None and found.result.status is not StreakStatus.FAILED:
@@ -868,8 +868,8 @@ def _candidate(
 ) -> tuple[StreakFit | None, _Candidate]:
     """Return the joint fit that starts from the fit `first`, or None if it fails, and its motion.
 
-    With a learned profile of the PSF, each evaluation of the model is several times as much work, so that the
-    work of the fit is limited separately.
+    A learned profile of the PSF multiplies the work of each evaluation of the model. The work of a fit with
+    such a profile is therefore limited separately.
     """
     if first.scene.profile != GAUSSIAN:
         camera = replace(camera, work=WorkBudget())

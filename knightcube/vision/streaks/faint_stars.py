@@ -64,7 +64,7 @@ _PROFILE /= _PROFILE[0]
 
 
 def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
-    """Return the overlap of two streaks at the columns `one` and `other` (...), as a fraction of length.
+    """Return the overlap of streaks centred at columns `one` and `other` (...), as a fraction of `length`.
 
     The argument `span` (..., 2) is the range of columns of a circle that lie on the detector. `length` is in
     samples.
@@ -273,7 +273,7 @@ def _refined(values: Float32Array, row: IntArray, column: IntArray) -> tuple[Flo
         r, c = row[k], column[k]
         own = values[r, c]
         below = r + _vertex(values[max(r - 1, 0), c], own, values[min(r + 1, rows - 1), c])
-        # A rounded row of a peak on the last circle would lie beyond the grid.
+        # Without the limit, the rounded row of a peak on the last circle could lie outside the grid.
         fine[0, k] = min(below, rows - 1.0)
         fine[1, k] = c + _vertex(values[r, max(c - 1, 0)], own, values[r, min(c + 1, columns - 1)])
     return fine[0], fine[1]
@@ -546,7 +546,7 @@ def _subtract_triangle(
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Return peak heights (k,) of stars such that the sum of their responses is the measured response."""
+    """Return peak heights (k,) for which the sum of responses is the measured response at each star."""
     order, height = np.argsort(row, kind="stable"), np.empty(len(row))
     row, column = row[order], column[order]
     middle = np.rint(row).astype(int)

@@ -117,9 +117,12 @@ for the best position of each box. A box is an interval of samples on a circle.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Boxes:
-    """Cumulative sums (n, c + 1), along n circles of c samples, of the values and of the mask of the frame.
+    """Cumulative sums (n, c + 1) along n circles of c samples.
 
-    The azimuth of the first sample is `begin` (rad), and the spacing of the samples is `step` (rad).
+    The sums are those of the sample values (`total`) and of the numbers of samples in the frame (`exist`).
+    The noise variance of a sample is `variance` (n,), and the index of the sample at the centroid of each
+    region is `middle` (n,). The azimuth of the first sample is `begin` (rad), and the spacing of the samples
+    is `step` (rad).
     """
 
     total: FloatArray
@@ -233,7 +236,7 @@ def _refined_angle(
 
 # Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Sine of the angle between the equation vectors of two regions below which they give no rotation axis.
+# Sine of the angle between the equation vectors of two regions below which no rotation axis is proposed.
 _PARALLEL = 1e-9
 # Standard error of a region's orientation multiplied by the region's length (rad px).
 _SIDE_ERROR = 1.2
@@ -304,10 +307,11 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
 def _likeliest_axis_numpy(
     leaders: FloatArray, equation: FloatArray, flow: FloatArray, tolerance: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Return the best rotation axis (3,) that two of the equation vectors `leaders` (k, 3) propose, or zeros.
+    """Return the best rotation axis (3,) that a pair of `leaders` proposes, or zeros if no pair proposes any.
 
-    The equation vectors `equation` (n, 3), image-flow matrices `flow` (n, 2, 3), standard errors `tolerance`
-    (n,), rad, and the `weight` (n,) belong to the regions that vote for the axes.
+    The `leaders` (k, 3) are equation vectors. The equation vectors `equation` (n, 3), image-flow matrices
+    `flow` (n, 2, 3), standard errors `tolerance` (n,), rad, and the `weight` (n,) belong to the regions that
+    vote for the axes.
     """
     i, j = np.triu_indices(len(leaders), k=1)
     proposal, length = np.cross(leaders[i], leaders[j]), np.linalg.norm(leaders, axis=-1)
@@ -448,8 +452,8 @@ def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
     """Return the relative change of the rate over the exposure from the asymmetry of the regions.
 
     If the rate increases linearly from zero, the distance between the centroid and the midpoint of a streak
-    is a sixth of its length. The relative change is positive if the rate increases in magnitude during the
-    exposure. If the change of the rate is too small to be significant, the result is 0.
+    is a sixth of the streak's length. The relative change is positive if the rate increases in magnitude
+    during the exposure. If the change of the rate is too small to be significant, the result is 0.
     """
     whole = guess.agree & ~regions.cut & (guess.width * guess.speed > _LEAST_LENGTH)
     if np.count_nonzero(whole) < _LEAST_GROWING:
@@ -596,13 +600,13 @@ def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
 def _stars_of_angle(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, angle: float, most: int, growth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return centres (n, 2) px and fluxes (n,) of the brightest streaks that fit the rotation angle."""
+    """Return centres (n, 2), px, and fluxes (n,) of the brightest streaks that fit the rotation angle."""
     spread = _LENGTH_ERROR / guess.speed + _LENGTH_SHARE * angle
     whole = guess.agree & ~regions.cut & (np.abs(guess.width - angle) < 4.0 * spread)
     reach = np.abs(guess.last - guess.first)
     one = guess.cut_first ^ guess.cut_last
     cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # The centre of a truncated streak is computed from its end in the frame; regions extend 2 px beyond it.
+    # The centre of a truncated streak is computed from its end in the frame. Regions are 2 px longer.
     past = 2.0 / guess.speed
     middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)
     middle = np.where(whole, guess.middle - growth / 12.0 * angle, middle)

@@ -40,7 +40,7 @@ STEEPEST = 0.68
 
 SLOWEST = 1e-3
 """Lower limit (px per exposure) of a star's speed, which avoids divisions by zero."""
-# Largest camera rotation (rad) in one part of a path, whose column or row must change monotonically.
+# Largest camera rotation (rad) in one part of a path, along which column or row must change monotonically.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is sampled to find where it crosses lines of pixels.
 _CROSSING_SAMPLES = 17
@@ -80,7 +80,7 @@ class Strips:
     inside: BoolArray
 
     def select(self, blocks: IntArray | slice) -> Strips:
-        """Return the strips with only some of the `blocks`."""
+        """Return the strips with only the selected `blocks`."""
         at_lines = self.time[blocks], self.corner[blocks], self.step[blocks]
         return Strips(self.star[blocks], *at_lines, self.index[blocks], self.inside[blocks])
 
@@ -260,7 +260,7 @@ _StripArrays = tuple[IntArray, FloatArray, IntArray, IntArray, IntArray, BoolArr
 def _strip_pixels_numpy(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field) -> _StripArrays:
     """Return the attributes of the strips formed by `lines`, which cross the paths at the `points`.
 
-    The strips contain only blocks with usable pixels, without margins that are unusable on all lines.
+    Blocks without selected pixels are omitted. Margins without selected pixels on any line are removed.
     """
     (position, velocity, _), along, (columns, _, width) = points, lines.along_rows[:, None], field
     tangent = np.where(along, *velocity) / np.maximum(np.hypot(*velocity), SLOWEST)
@@ -395,7 +395,8 @@ def _select_near(
     """Compute whether each pixel of a line is `near` the path, within `limits` along and across the path.
 
     The distances across and along the tangent of the path are `first` (px) for the first pixel, and change by
-    `slope` from pixel to pixel. The limits (px) are those of the part of the path, and the largest distance.
+    `slope` from pixel to pixel. The `limits` (px) are the start and the stop along the path, and the largest
+    distance across the path.
     """
     across, ahead = np.float32(first[0]), np.float32(first[1])
     by_across, by_ahead = np.float32(slope[0]), np.float32(slope[1])
@@ -484,7 +485,7 @@ class BlockPixels:
         ceiling: counts above the background at which each pixel saturates.
         gain: gain of the camera, electrons per count.
         crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
-        common: index of each fitted pixel in the list of the pixels that several stars share.
+        common: index (e,) of each of these e pixels in the list of the pixels that several stars share.
     """
 
     slot: IntArray
@@ -599,13 +600,13 @@ def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray,
 
 @compiled_form_of(_at_pixels_numpy)
 def at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Return the blocks (c,) that contain e pixels, the first pixel of each, and i images on the pixels.
+    """Return the blocks (c,) that contain e given pixels, and the values of images at these pixels.
 
-    The first pixels (c,) are indices among the e pixels. The third array (i, e) contains the values of the
-    images.
-    The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last of
-    the i + 1 images contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices
-    of the given pixels in an array (b, p), in ascending order.
+    The second returned array (c,) contains the index, among the e given pixels, of the first pixel of each
+    block. The third array (i, e) contains the values of i images. The array `images` (b, i + 1, p) contains
+    i + 1 images on the p pixels of each of b blocks. The last of the i + 1 images contains the residuals and
+    is omitted. The array `crowded` (e,) contains the flat indices of the given pixels in an array (b, p), in
+    ascending order.
     """
     blocks, count, size = images.shape
     block, begin, found = np.empty(blocks, np.int64), np.empty(blocks, np.int64), 0

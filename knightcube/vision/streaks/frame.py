@@ -31,7 +31,7 @@ from knightcube.vision.frame import (
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 
-# Distance (px) between the pixels whose median is the usual noise.
+# Distance (px) between the pixels whose median noise variance determines the usual noise.
 _SPARSE = 97
 
 
@@ -100,7 +100,7 @@ class BrightRegions:
         centre: centroid of each region (n, 2), px.
         normal: unit vector in the image perpendicular to each region's long axis (n, 2).
         length: length of the uniform line that has the same second moments as each region (n,), px.
-        flux: (n,) counts.
+        flux: flux of each region (n,), counts.
         cut: whether each region touches the border of the frame (n,).
         owner, column, row, light: region, position and counts above the background of each pixel (m,).
         lit: fraction of the frame's pixels that exceed the threshold for bright regions.
@@ -141,7 +141,7 @@ def _fluxes_numpy(pixel: IntArray, number: IntArray, count: int, signal: Float32
     """Return the counts (count,) of each region, zero for a region that is smaller than `_LEAST_AREA`.
 
     The other arguments are the flat index and the region of each bright pixel (p,), and the counts of all
-    pixels. Negative counts do not count.
+    pixels. Pixels with negative counts contribute zero.
     """
     area = np.bincount(number, minlength=count)
     flux = np.bincount(number, np.maximum(signal[pixel], np.float32(0.0)), count)
@@ -168,10 +168,10 @@ _RegionPixels = tuple[IntArray, IntArray, IntArray, FloatArray, BoolArray]
 def _region_pixels_numpy(
     pixel: IntArray, number: IntArray, rank: IntArray, signal: Float32Array, shape: tuple[int, int]
 ) -> _RegionPixels:
-    """Return the pixels of the chosen regions; the border of the frame truncates the regions of the mask.
+    """Return the pixels of the chosen regions, and a mask of the regions truncated by the frame border.
 
-    The arguments are the flat index and the region of each bright pixel (p,), the place of each of n regions
-    among the chosen regions, or -1, and the counts and the shape of the frame.
+    The arguments are the flat index and the region of each bright pixel (p,), the index of each of n regions
+    among the chosen regions (-1 for the other regions), and the counts and the shape of the frame.
     """
     rows, columns = shape
     kept = np.flatnonzero(rank[number] >= 0)
@@ -244,7 +244,7 @@ def _mark_bright(
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
 _BROAD = 25.0
-# Lower bound (px) of the length of a region by which its area is divided for its mean width.
+# Lower bound (px) of a region's length in its mean width, which is the region's area divided by its length.
 _LEAST_LENGTH = 40.0
 # Side length (px) of a square that fits into the image of a limb or a reflection, but not of a star.
 _SOLID = 31
@@ -253,7 +253,7 @@ _ABOUT = 12
 
 
 def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` without the pixels of limbs and reflections, or None if it has none.
+    """Return `frame` without the pixels of limbs and reflections, or None if there are none.
 
     A limb or a reflection is a region that contains a square larger than any star. A region of crossing
     streaks is not excluded, because it contains no square larger than a star. A margin around limbs and
@@ -296,7 +296,7 @@ MEDIAN_ERROR = 1.25
 
 
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with the filter responses of a colour mosaic equalised, or None if they are equal.
+    """Return `frame` with equalised filter responses of a colour mosaic, or None if no mosaic is found.
 
     The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. In each bright region,
     about the same flux of starlight reaches the pixels behind each of the four filters. The ratios of the

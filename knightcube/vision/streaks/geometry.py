@@ -582,7 +582,7 @@ class StreakScene:
         return replace(self, motion=self.motion.smooth, stars=self.stars + shift)
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return the scene with m more stars at `stars` (m, 2), px, which the motion is not fitted to."""
+        """Return the scene with m more stars at `stars` (m, 2), px, that do not affect the motion fit."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),

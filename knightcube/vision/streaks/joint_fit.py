@@ -92,7 +92,7 @@ _DRIFT = 2.0
 _FAINT_DRIFT = 3.2
 # Change of the angular acceleration, as a fraction of the rotation, above which pixels are selected again.
 _GROWN = 0.1
-# Step of the shared parameters (standard deviations) below which the fit, after this step, has converged.
+# Largest step of the shared parameters (standard deviations) after which the fit counts as converged.
 SETTLED = 0.4
 # Largest ratio of the lengths of a step and the preceding step that counts as progress of the fit.
 _LEAST_PROGRESS = 0.7
@@ -184,10 +184,10 @@ class FitProblem:
 class StreakFit:
     """A fitted scene with the solution and the normal equations of the last step.
 
-    The normal equations are those of the scene `before` the last step.
-    The last step of the shared parameters, in standard deviations, is 0 if the fit is converged. The mask
-    `free` (SHARED,) selects the fitted parameters among the shared parameters. The stars `hidden` on the
-    fitted pixels were subtracted instead of fitted; None without any.
+    The normal equations are those of the scene `before` the last step. The last step of the shared
+    parameters, in standard deviations, is 0 if the fit is converged. The mask `free` (SHARED,) selects the
+    fitted parameters among the shared parameters. The stars `hidden` were subtracted from the frame instead
+    of fitted; None if the fit did not subtract stars.
     """
 
     scene: StreakScene
@@ -377,7 +377,7 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
         return out
     scene, length = scene.select(long), length[long]
     instants = np.linspace(-0.5, 0.5, _INSTANTS)
-    # A small linear term makes the rotation angle strictly increasing while the camera is at rest.
+    # A small linear term makes the rotation angle strictly increasing even while the camera is at rest.
     progress = np.maximum.accumulate(scene.motion.progress(instants)) + 1e-9 * np.arange(_INSTANTS)
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
@@ -431,7 +431,7 @@ def _end_motions(
 
 
 def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return 1 for each tested star whose streak has no gaps, and 0 for each other tested star, (k,).
+    """Return an array (k,) with 1 for each tested star whose streak has no gaps, otherwise 0.
 
     Only the part of a star's path that is on the detector is tested for gaps. Stars with very short or very
     faint streaks are not tested.
@@ -551,7 +551,7 @@ _MOST_STRETCHED_CHANGE = 0.5
 
 
 def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray, FloatArray]:
-    """Return distances (n, 2) px from modelled to measured streak ends, and path lengths (n,) px.
+    """Return the distances (n, 2), px, of measured from modelled streak ends, and path lengths (n,), px.
 
     A distance is positive outwards, and NaN if the streak end cannot be measured.
     """
@@ -789,7 +789,10 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return the stars in the motion fit that agree with the majority, or all stars if too few agree."""
+    """Return a mask (n,) of the stars in the motion fit that agree with the majority.
+
+    If too few stars agree, the mask contains all stars in the motion fit.
+    """
     equations = star_equations(rough.evaluation, rough.solution.eliminated)
     change, deviation = estimates_of(equations, rough.scene)
     before = rough.scene.trusted

@@ -81,7 +81,7 @@ class Evaluation:
     kept: list[BoolArray]
 
     def without(self, rejected: BoolArray) -> Evaluation:
-        """Return the normal equations if the stars `rejected` (n,) do not affect the shared parameters."""
+        """Return the equations without the effect of the stars `rejected` (n,) on the shared parameters."""
         information, gradient = self.information.copy(), self.gradient.copy()
         information[rejected, :SHARED] = information[rejected, :, :SHARED] = gradient[rejected, :SHARED] = 0.0
         crowds = []
@@ -121,8 +121,8 @@ def evaluate(
     """Return the normal equations of `scene` on the pixels of its fit windows.
 
     The residual limit `clip` for outlier pixels is in standard deviations. The flag `growing` states whether
-    the angular acceleration is fitted, and `tested` whether a score test needs its derivatives. The test is
-    valid for the approximate derivatives that are linear within a block of pixels, the fit is not.
+    the angular acceleration is fitted, and `tested` whether a score test needs its derivatives. For the
+    score test, derivatives that are linear within a block of pixels suffice; for the fit, they do not.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows, growing)
@@ -337,9 +337,9 @@ def _scalar_product(a: Any, b: Any) -> Any:
 def _multiply_images(
     gram: FloatArray, images: Float32Array, weights: Float32Array, weighted: Float32Array
 ) -> None:
-    """Compute the products `gram` (i, i), with the `weights` (p,), of i images (i, p).
+    """Compute the weighted scalar products `gram` (i, i) of all pairs of i images (i, p).
 
-    The array `weighted` (p,) is overwritten.
+    The `weights` (p,) are those of the p pixels. The array `weighted` (p,) is overwritten.
     """
     count, size = images.shape
     for i in range(count):
@@ -456,7 +456,7 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
     return EliminatedEquations(kept, own, gain, inner) if size < _SINGULAR else None
 
 
-# Information (1/counts^2) on the flux of a star without fitted pixels, so that its block is invertible.
+# Information (1/counts^2) assumed on the flux of a star without fitted pixels, to avoid a singular block.
 _UNFITTED = 1e-30
 # Largest element of the inverse of a regular information matrix that is scaled to a unit diagonal.
 _SINGULAR = 1e10
@@ -760,7 +760,8 @@ def _multiply(
 ) -> None:
     """Compiled form of `_product`, which writes the product to `product`.
 
-    The scratch arrays (common,), (e,) for e shared pixels of all stars, and (2, n, s + a) are overwritten.
+    The three scratch arrays, with the shapes (common,), (e,) and (2, n, s + a), are overwritten. The number e
+    is the sum, over all stars, of the numbers of their shared pixels.
     """
     change, light, vectors = scratch
     vector, out, shared, alone, begin = vectors[0], vectors[1], len(free), ALONE, 0
@@ -833,13 +834,13 @@ def _add_scaled(total: Any, factor: Any, values: Any) -> None:
         total[k] += factor * values[k]
 
 
-# Ratio of a star's Fisher information to the largest information of any star below which it is ignored.
+# Ratio of a star's Fisher information to the largest of any star, below which the star is ignored.
 _NOTHING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEquations:
-    """Normal equations of each star for k fitted shared parameters, after elimination of its own parameters.
+    """Each star's normal equations for k fitted shared parameters, after elimination of its own parameters.
 
     The attribute `kept` (k,) contains the indices of the fitted parameters. The equations consist of the
     information matrix (n, k, k) and the gradient (n, k) of the log-likelihood of each star (`score`).

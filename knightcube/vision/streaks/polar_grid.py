@@ -57,7 +57,7 @@ class PolarGrid:
 
     @property
     def full(self) -> bool:
-        """Whether the circles of the polar grid are complete, with azimuths from 0 to 2 pi."""
+        """Whether the circles of the polar grid are complete, so that the azimuths span 2 pi."""
         return abs(float(self.azimuth[-1] - self.azimuth[0])) > 2.0 * np.pi - 0.05
 
     @property

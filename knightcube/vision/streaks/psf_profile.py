@@ -48,8 +48,8 @@ def fit_profile(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
     """Return a fit of the motion and the stars of `fit` with a PSF profile learned from their pixels.
 
     The work of this fit is not added to that of the `camera`, because few frames need it. Returns None if the
-    PSF is not wider than configured, unlike that of a defocused camera, if the pixels do not determine the
-    profile, or if the fit does not succeed.
+    PSF is not wider than configured (the camera is in focus), if the pixels do not determine the profile, or
+    if the fit does not succeed.
     """
     if fit.scene.sigma < _LEAST_WIDER * camera.settings.psf_sigma:
         return None
@@ -78,9 +78,10 @@ def _without_doubles(scene: StreakScene) -> StreakScene:
 
 
 def _shares(camera: FitProblem, scene: StreakScene, windows: FitWindows) -> FloatArray | None:
-    """Return the shares (k,) of the k Gaussians that fit the pixels of all stars best, or None.
+    """Return the shares (k,) of the k Gaussians that fit the pixels of all stars best.
 
-    The sum of the shares differs from 1 if the flux of the stars does.
+    The sum of the shares is the ratio of the flux of the stars to their flux in `scene`. Returns None if the
+    pixels do not determine the shares, or if this ratio is implausible.
     """
     lights = gaussian_lights(camera.pinhole, camera.shutter, scene, windows)
     frame, pixels, brightest = camera.frame, windows.pixels, lights.max(axis=0)

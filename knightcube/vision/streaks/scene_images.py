@@ -1,7 +1,7 @@
 """Model images of all stars of a scene, for any profile of the point spread function (PSF).
 
 The images of long streaks and of spots are computed for Gaussian PSFs, see `streak_model`. Images and
-derivatives are linear in the PSF, so that those of another profile are sums over its Gaussians.
+derivatives are linear in the PSF. For any other profile, they are sums over the Gaussians of the profile.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from knightcube.vision.streaks.geometry import GAUSSIAN, Shutter, StreakScene
 ModelImages = tuple[Float32Array, FloatArray, FloatArray]
 """Images that are combined to model long streaks, images of spots, and the derivatives of these images."""
 
-# Index of the image of the sky level, which alone does not depend on the PSF, and of the derivative with
-# respect to the width.
+# Index of the image of the sky level, which is the only image that does not depend on the PSF, and index of
+# the derivative with respect to the width.
 _SKY, _BY_WIDTH = 6, 5
 # Index of the derivative with respect to the width among the derivatives of a spot.
 _SPOT_BY_WIDTH = 8
@@ -34,7 +34,7 @@ def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: Fi
 def gaussian_lights(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> Float32Array:
-    """Return the counts (k, m) of all stars on the m fitted pixels if the PSF were one of its k Gaussians."""
+    """Return the counts (k, m) of all stars on the m fitted pixels, for each of the k Gaussians as PSF."""
     parts = _gaussian_scenes(scene)
     return np.stack([_light(part, windows, light_images(pinhole, shutter, part, windows)) for part in parts])
 

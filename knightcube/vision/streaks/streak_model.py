@@ -174,7 +174,7 @@ QUADRATIC_IMAGES = 2
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths) along a path from a pixel to where the path crosses its line.
+# Largest distance (point-spread widths) along a path from a pixel to the path's crossing of the pixel's line.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in units of the exposure time.
 _STEP = 1e-4
@@ -411,8 +411,8 @@ def _draw(
 # of the crossing from the centre of the block.
 _ACROSS, _AHEAD, _BEND, _THINNING, _SHIFT = range(5)
 _Five = tuple[float, float, float, float, float]
-# Coefficients of the profile's factor, distance (px) along the path, exponent of the profile, its factor, and
-# distance (point-spread widths) from a streak end.
+# Constant and quadratic coefficients of the profile's factor, distance (px) along the path, exponent and
+# factor of the profile, and distance (point-spread widths) from a streak end.
 _CONSTANT, _QUADRATIC, _ALONG, _EXPONENT, _FACTOR, _DISTANCE = range(5, 11)
 _VALUES = 11
 
@@ -441,8 +441,8 @@ def _set_line(
 def _endless_block(pixels: Float32Array, narrow: float) -> None:
     """Compute exponent and factor of an infinite streak's profile from the values of `_set_line`.
 
-    The distances become distances across and along the curved path, the latter from the centre of the block,
-    and the factor replaces the constant coefficient. The argument `narrow` is the inverse squared width.
+    The distance across the path is corrected for the path's curvature. The distance along the curved path
+    from the centre of the block is also computed. The argument `narrow` is the inverse squared width.
     """
     half, one, cubic = np.float32(0.5), np.float32(1.0), np.float32(0.375)
     six, inverse = np.float32(6.0), np.float32(narrow)
@@ -487,7 +487,7 @@ def _exponential(exponents: Float32Array, power: npt.NDArray[np.int32], out: Flo
 
 @loop_helper
 def _fill(out: Float32Array, pixels: Float32Array, exponential: Float32Array) -> None:
-    """Set `out[0]` to the counts of an infinitely long streak, and initialise the images `out[3:7]`."""
+    """Set `out[0]` to the counts of an infinitely long streak, and initialise `out[3:7]` and `out[8:]`."""
     for k in range(out.shape[1]):
         out[0, k] = exponential[k] * pixels[_FACTOR, k]
     out[3:6] = out[IMAGES + 1 :] = 0.0

@@ -229,7 +229,7 @@ class MotionResult(FrameMotion):
         significance: flux of each star divided by its standard deviation (n,).
         faint_endpoints: both ends of m streaks that were detected but not fitted (m, 2, 2), px, accurate to
             about 1 px.
-        faint_flux: (m,) counts.
+        faint_flux: flux of each of the m faint stars over the exposure (m,), counts.
         faint_significance: flux of each of the m faint stars divided by its standard deviation (m,).
         psf_sigma: fitted standard deviation of the PSF, px.
         psf_profile: fitted profile of the PSF.
@@ -238,7 +238,7 @@ class MotionResult(FrameMotion):
         acceleration: fitted angular acceleration (3,), rad/s^2, or None if it was not fitted.
         reason: one-line reason why no rate was found. If a rate was found, `reason` is empty.
         course: rotation estimated by the navigation filter, from which the fit took the higher-order terms;
-            None if it used none.
+            None if the fit took no such terms.
         line_time_sigma: standard deviation of the delay between the exposures of successive rows, s.
     """
 

@@ -65,8 +65,8 @@ class Displacement:
 def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
     """Return the displacement of streak ends that explains the residuals, or None if no end is visible.
 
-    The errors of a learned profile of the PSF are as large elsewhere on the streaks as at their ends. Only
-    larger residuals at the ends then show a displacement.
+    The errors of a learned profile of the PSF are as large elsewhere on the streaks as at their ends. For a
+    learned profile, only residuals that are larger at the ends than elsewhere show a displacement.
     """
     light = scene.light[left.star, None, None].astype(np.float32)
     change = light * (left.images[:, 3] + left.images[:, 4])
@@ -146,7 +146,7 @@ def correct(
     described: int,
     counted: FloatArray | None = None,
 ) -> CalibrationCorrection | None:
-    """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
+    """Return the joint solution for shared parameters and calibration errors; None for singular equations.
 
     The information (n, k, k) and the score (n, k) are described in `StarEquations`. The argument `spread` is
     the ratio of the variance of the stars' scatter to the variance of their noise. Each of m calibration
@@ -375,13 +375,14 @@ _CONJUGATE = 12
 # time. It is the rms error of a parabola that is fitted to the rotation angle of a body at which a torque
 # begins at a random time of the exposure, divided by the rms fitted acceleration.
 _TORQUE_STEP = 0.031
-# Largest such error (px). Streaks with larger errors, of changes by 3 px or more, mostly fail other checks.
+# Upper limit (px) of this error. If the acceleration is so large (3 px or more) that the error exceeds the
+# limit, other checks mostly reject the frame.
 _MOST_OF_STEP = 0.1
 # Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
 _UNCHECKED = (2, 4.0)
-# Relative difference between fitted and configured PSF variance that is neglected if the fitted PSF is
-# narrower, and if it is wider. A fast vibration makes streaks wider; therefore the latter is small, but one
-# standard deviation of the difference between fitted and configured variance is neglected in addition.
+# Relative differences between fitted and configured PSF variance that are neglected if the fitted PSF is
+# narrower or wider than configured. The second limit is small, because a fast vibration makes streaks wider.
+# For a wider PSF, one standard deviation of the difference is neglected in addition.
 _NARROWER, _WIDER = 0.02, 0.004
 # Ratio of a streak end's error to the square root of the difference of fitted and configured PSF variance.
 _END_SHARE = 1.0
@@ -401,7 +402,7 @@ _END_COMMON = 25.0
 _MOST_LENSES = 3
 # Remaining calibration error (standard deviations) below which the lens correction counts as converged.
 _SMALL_ERROR = 0.2
-# Uncertainty of the rotation due to lens errors, as a fraction, above which the lens is always corrected.
+# Relative uncertainty of the rotation due to lens errors above which the lens is always corrected.
 _WORTHWHILE = 0.002
 # Ratio of covariance to noise covariance above which model errors are the cause (three sigma).
 _BEYOND_NOISE = 9.0
@@ -467,7 +468,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     covariance = covariance + lens.added + longer * np.eye(3)
     covariance = covariance + spread * vibration
     if last.free[3]:
-        # The torque may have changed at once, for instance that of a coil, instead of being constant.
+        # The torque, for instance of a coil, may have changed abruptly instead of being constant.
         error, most = _TORQUE_STEP * scene.motion.acceleration, _MOST_OF_STEP / camera.pinhole.focal_length
         error *= most / max(float(np.linalg.norm(error)), most)
         covariance = covariance + np.outer(error, error)
@@ -566,9 +567,9 @@ def _lens_effect(
 def _misfit_of_motion(last: StreakFit) -> float:
     """Return the chi-square per degree of freedom of the stars, weighted by their information on the rate.
 
-    A single bright star can determine a component of the rate. Its residuals then show the error of this
-    component, which the median over all stars and the scatter of the stars do not. The largest of the values
-    for the three components of the rate is returned.
+    A single bright star can determine a component of the rate. In that case, only the residuals of this star
+    show the error of the component; the median over all stars and the scatter of the stars do not show it.
+    The largest of the values for the three components of the rate is returned.
     """
     trusted = np.flatnonzero(last.scene.trusted)
     equations = star_equations(last.evaluation, last.solution.eliminated)
@@ -581,7 +582,7 @@ def _misfit_of_motion(last: StreakFit) -> float:
 
 # Smallest used eigenvalue of a star's information matrix, as a fraction of the largest eigenvalue.
 _KNOWN = 1e-4
-# Minimum effective number of stars (smaller for unequal weights) for an estimate of their scatter.
+# Lower limit of the effective number of stars, which is smaller than their number for unequal weights.
 _LEAST_EFFECTIVE = 2.0
 
 
@@ -628,10 +629,10 @@ def _end_uncertainty(
 ) -> float:
     """Return the uncertainty (px) of streak ends due to a PSF that may differ from the model.
 
-    If the residuals at the streak ends are not significant, the PSF has the modelled profile, with the same
-    width along and across the streaks. Significant residuals at the streak ends indicate a different profile
-    of the PSF or an unresolved fast vibration, which shifts the apparent ends. If a profile or a vibration
-    was fitted, the width of the streaks does not limit the errors of their ends.
+    If the residuals at the streak ends are not significant, the PSF is assumed to have the modelled profile
+    and the same width along and across the streaks. Significant residuals at the streak ends indicate a
+    different profile of the PSF or an unresolved fast vibration, which shifts the apparent ends. If a profile
+    or a vibration was fitted, the width of the streaks does not limit the errors of their ends.
     """
     scene, described = whole.scene, settings.psf_sigma**2 + PIXEL_VARIANCE
     learned = 2.0 * settings.psf_sigma * settings.knowledge.psf_sigma

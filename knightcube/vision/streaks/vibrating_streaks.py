@@ -72,8 +72,8 @@ def images(
 ) -> Float32Array:
     """Return images (b, IMAGES + 3, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The first IMAGES images have the meaning that they have in `streak_model`. The next two are the derivative
-    of the counts with respect to a displacement along the path, and the same derivative with the displacement
+    The first IMAGES images have the same meaning as in `streak_model`. The next two are the derivative of the
+    counts with respect to a displacement along the path, and the same derivative with the displacement
     multiplied by the distance along the path from the centre of the block. The last image of each block is
     not initialised.
     """

@@ -72,7 +72,7 @@ class StreakResiduals:
         return self.sums_of_lines(2)
 
     def sums_of_lines(self, rows: int) -> LineSums:
-        """Return the sums over each line of pixels for the first `rows` of the four rotations and rates."""
+        """Return the sums over each line of pixels for the first `rows` of the four `_ROTATION_IMAGES`."""
         return LineSums(*_line_sums(self.images, self.weight, self.residual, rows))
 
 
@@ -236,7 +236,7 @@ class CommonMotion:
 
 
 def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
-    """Return the vibration common to the streaks that determine the motion, or 0 if none is long.
+    """Return the vibration common to the long streaks that determine the motion; 0 without long streaks.
 
     At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
     changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
@@ -396,7 +396,7 @@ def vibration_covariance(
     vibration = scene.motion.vibration
     if not len(left.star):
         return np.zeros((3, 3)), 0.0
-    # The amplitude of an unresolved vibration requires no rotations at start and end of the exposure.
+    # The rotations at start and end of the exposure do not affect the amplitude of an unresolved vibration.
     sums = _rotation_sums(camera, scene, left, 4 if vibration.exists else 2)
     length = _median_length(camera, scene)
     amplitude = _unresolved_amplitude(sums, vibration, length / scene.width)
@@ -594,7 +594,7 @@ def _strongest_frequency(sums: _RotationSums, known: Vibration, highest: float) 
 
 
 def _solved(matrix: FloatArray, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the solution of a linear system, or that of smallest norm if the `matrix` is singular."""
+    """Return the solution of a linear system; if it is singular, the least-squares solution of least norm."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
@@ -620,7 +620,7 @@ def _improved(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> 
     sine, cosine = amplitudes + step[smooth : smooth + 6 * k].reshape(2, k, 3)
     detuned = np.clip(step[smooth + 6 * k :], -_MOST_DETUNED, _MOST_DETUNED)
     frequency = np.maximum(vibration.frequency + detuned, _LOWEST)
-    # The derivative of the rotation over the exposure with respect to each parameter except the width.
+    # The derivatives of the rotation over the exposure with respect to all parameters; zero for the width.
     begin, end = _rotations(vibration)(_ENDS).transpose(2, 1, 0)
     rotation = np.insert(end - begin, smooth - 1, 0.0, axis=1)
     total = rotation @ _solved(matrix, rotation.T)
