@@ -202,9 +202,10 @@ def fits(
 def is_healthy_current(
     current: float, commands: Commands, bounds: Bounds, sampling: Sampling, clipped: bool = False
 ) -> bool:
-    """Return whether a reading agrees with healthy coils, as `fits` does for its prediction, but faster.
+    """Return whether a reading agrees with healthy coils.
 
-    The arguments are those of `predict`.
+    The arguments are those of `predict`. The result equals that of `fits` for the predicted current, but is
+    computed in less time.
     """
     values, count = [value for currents in commands for value in currents], len(commands)
     mean = sum(map(abs, values)) / count
@@ -282,7 +283,7 @@ class StuckLeg:
         return supplied.current > supplied.most + self._excess
 
     def ask_for_rest(self, why: str) -> None:
-        """Request zero currents in all coils, unless a search is running or the last request is recent."""
+        """Request zero currents in all coils, unless a search is running or a recent check found no fault."""
         if self._step is _Step.WATCHING and not self._pause:
             self._rest(why)
 

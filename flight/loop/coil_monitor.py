@@ -252,7 +252,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
-        """Drive the next untried axis, `prime` first; return the end time (ns), or None after all axes."""
+        """Drive the next untried axis, `prime` first; return the end time (ns), or None if all were tried."""
         candidates = axes - self._tried
         if not candidates:
             self._tried.clear()
@@ -394,7 +394,7 @@ class CoilMonitor:
 
     @property
     def _unknown(self) -> str:
-        """The reason why a coil's current may differ from its command; empty if all currents agree."""
+        """The reason why a coil's current may differ from its command; empty if there is none."""
         return self._leg.suspicion or self._strangeness or self._weak
 
     @property
@@ -626,7 +626,7 @@ class CoilMonitor:
         self._looked_ns = reading.time_ns
         seen = commands.supplied(reading, self._bounds, self._known)
         if self._proof:
-            for axis in self._proof.ingest(self._leg.exceeds(seen)):  # back to both inputs low
+            for axis in self._proof.ingest(self._leg.exceeds(seen)):  # these bridges are released
                 self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
             return
         found = self._leg.look(seen)
@@ -636,7 +636,7 @@ class CoilMonitor:
             self.interrupted(reading.time_ns)
 
     def _windows(self, reading: PowerReading) -> list[tuple[float, Commands, Bounds, Sampling, bool]]:
-        """Return the newest ADC sample, and the window's mean unless the circuit changed in the window.
+        """Return the newest ADC sample, and the mean reading unless the circuit changed in its time window.
 
         Each tuple contains the arguments of `predict`.
         """
@@ -692,7 +692,7 @@ class CoilMonitor:
         left = evidence.possible_faults(self._known)
         waited = now_ns >= self._judge_ns
         if evidence.is_normal_again(self._known, left):
-            # Coils that have been at zero current since the suspicion are probed, unless no probe is applied.
+            # Coils at zero current since the suspicion are probed. If no probe is applied, suspicion ends.
             if not evidence.is_driven and not (self._probe.has_begun and waited):
                 if not self._probe.has_begun:
                     self._begun_at_rest = True

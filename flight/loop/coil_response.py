@@ -63,7 +63,7 @@ _NOTED_LATE_NS = 25_000_000
 
 
 class CoilCommands:
-    """A record of the commanded currents and of the braking; `braked` lists the presently braked bridges."""
+    """A record of the commanded currents and of the braking; `braked` lists the bridges braked at present."""
 
     def __init__(self, reach_ns: int) -> None:
         """Store commands for `reach_ns` ns."""
@@ -106,7 +106,7 @@ class CoilCommands:
         return sampled[::-1]
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
-        """Return the newest ADC sample with the bounds for healthy coils besides `known` faults."""
+        """Return the newest ADC sample, with bounds of the supply current if only `known` faults exist."""
         window = self.window(reading.newest_since_ns, reading.time_ns)
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
         unsure = [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]
@@ -187,7 +187,7 @@ LARGEST_GAIN = 1.5
 _DISTURBANCE_NS = 10_000_000_000
 """Time (ns) for which the largest expected disturbance is assumed constant."""
 _SLOWEST_ROTATION = 1.1e-3
-"""Rate (rad/s) at which the direction of the air flow rotates in a body that points to an inertial target."""
+"""Rate (rad/s) at which the air flow rotates in the axes of a body that points to an inertial target."""
 _GAIN_PRIOR = 10.0
 """Prior standard deviation of a gain that a hypothesis does not restrict."""
 _LEAST_GAIN_ERROR = 0.05
@@ -249,7 +249,7 @@ class CoilResponse:
         spreads = [settings.torsion] * count + [settings.damping] * count + [1.0] * errors
         self._others = len(spreads)
         self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
-        # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniform within a bound.
+        # Prior weight (inverse variance) of a healthy coil's gain, for an error uniform within a bound.
         healthy = np.full(coils, 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2)
         # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
         each = np.eye(coils, dtype=bool)
@@ -327,7 +327,7 @@ class CoilResponse:
     def _field_without_coils(
         self, time_ns: int, span: float, rate: list[float], field: Sequence[float]
     ) -> tuple[float, ...] | None:
-        """Return the field of the last pause of the coils, rotated with the body, or None before a pause."""
+        """Return the field of the last pause of the coils, rotated with the body; None before the first."""
         since_ns, currents = self._commands[-1]
         settle_ns = self._settings.settle_ns or 0
         if not any(currents) and time_ns - since_ns >= settle_ns:
@@ -372,14 +372,17 @@ class CoilResponse:
         return float(change @ expected) / size
 
     def _residual(self, equations: list[FloatArray]) -> FloatArray:
-        """Return the mean residual acceleration (3,) of healthy coils in bins with equations (3, p + 1)."""
+        """Return the mean residual acceleration (3,) for healthy coils; `equations` has arrays (3, p + 1)."""
         rows = np.mean(equations, axis=0)
         modes, gains = rows[:, 2 * len(self._free) : self._others], rows[:, self._others : -1]
         return np.asarray(rows[:, -1] - gains.sum(axis=1) - modes @ self._weights)
 
     @property
     def strength(self) -> FloatArray | None:
-        """Angular acceleration (n,), rad/s^2/A, of the coils in the last pause's field, or None."""
+        """Angular acceleration per ampere (n,), rad/s^2/A, by each coil; None before the first pause.
+
+        The magnetic field is that of the last pause of the coils.
+        """
         if self._quiet_field is None:
             return None
         per_ampere = np.array(self._quiet_field) @ self._per_field
@@ -496,7 +499,7 @@ class CoilResponse:
             counts[axis] = counts[axis] + 1 if held else 0
 
     def _whitened(self, rows: FloatArray, counts: tuple[int, ...], span: float) -> FloatArray:
-        """Return the equations (w, m f, p + 1) of w fits, whitened and without the effect of a constant.
+        """Return the equations (w, m f, p + 1) of w fits, whitened and without the constant disturbance.
 
         The equations `rows` (m, f, p + 1) belong to m bins. In each fit, the equations of bins before the
         newest `counts` bins are zero. Whitening is needed, because the noise of a bin enters two differences
@@ -513,7 +516,7 @@ class CoilResponse:
     def _disturbance_walk(self) -> float:
         """Return the variance per second, (rad/s^2)^2/s, of the random walk of the disturbance.
 
-        Within the time in which the body rotates by 1 rad, the disturbance changes by its own magnitude. The
+        The disturbance is assumed to change by its own magnitude while the body rotates by 1 rad. The
         result is rounded to a power of two, so that few whitening matrices are needed.
         """
         disturbance = self._settings.disturbance
@@ -667,10 +670,10 @@ class MotionFit(NamedTuple):
 
 
 def _judged(costs: list[float]) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-    """Return for each of n coils whether only its fault explains the motion, and whether it is reversed.
+    """Return whether only a fault of the coil explains the motion, and whether the coil is reversed.
 
-    The 2 n + 2 `costs` belong to the hypotheses that all gains are free, that one is free, that none is free,
-    and that one coil is reversed.
+    Both results contain a value for each of n coils. The 2 n + 2 `costs` belong to the hypotheses that all
+    gains are free, that one is free, that none is free, and that one coil is reversed.
     """
     coils = len(costs) // 2 - 1
     free, sound = costs[0], costs[coils + 1]
@@ -711,11 +714,11 @@ class CoilCorrection:
         self._unreviewed: set[int] = set()
 
     def effective(self, wire: FloatArray) -> FloatArray:
-        """Return the currents (n,), A, with which healthy coils would have the same dipole as the coils."""
+        """Return currents (n,), A, with which healthy coils have the dipole of the actual coils at `wire`."""
         return self.factors * wire
 
     def wire(self, effective: FloatArray) -> FloatArray:
-        """Return the currents (n,), A, of the coils that cause the dipole of the effective currents (n,)."""
+        """Return the actual currents (n,), A, that cause the dipole of healthy coils at `effective`."""
         return effective / self.factors
 
     @property
@@ -781,7 +784,7 @@ class CoilCorrection:
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
 """Sign of the continuous current through the coil, for each kind of fault with a leg stuck high."""
 _LITTLE_RESPONSE = 0.4
-"""Share of the expected change of torque below which the diagnosed fault did not happen."""
+"""Share of the expected change of torque below which a diagnosed fault is considered refuted."""
 _DOUBTED_FOR_NS = 60_000_000_000
 """Time (ns) after a refuted diagnosis during which further diagnoses are rejected if the motion is
 inconclusive."""
