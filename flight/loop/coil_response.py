@@ -516,8 +516,8 @@ class CoilResponse:
     def _disturbance_walk(self) -> float:
         """Return the variance per second, (rad/s^2)^2/s, of the random walk of the disturbance.
 
-        The disturbance is assumed to change by its own magnitude while the body rotates by 1 rad. The
-        result is rounded to a power of two, so that few whitening matrices are needed.
+        The disturbance is assumed to change by its own magnitude while the body rotates by 1 rad. The result
+        is rounded to a power of two, so that few whitening matrices are needed.
         """
         disturbance = self._settings.disturbance
         if disturbance is not None and not 0 <= self._last_ns - self._disturbed_ns < _DISTURBANCE_NS:

@@ -121,7 +121,7 @@ _EVIDENT = 3000.0
 _WORST_FIRST = 12.0
 # Fraction of bright pixels above which the brightest regions of a frame are assumed to be blends of stars.
 _CROWDED = 0.05
-# Chi-square explained by the best fit below which a frame of blended stars is scanned completely.
+# Minimum chi-square explained by the best fit for which a frame of blended stars is not scanned completely.
 _BEYOND_CROWD = 100_000.0
 # Largest excess chi-square of a well-fitted star, as a fraction of the star's squared significance.
 _MOST_RESIDUAL = 0.01

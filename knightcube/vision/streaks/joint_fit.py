@@ -87,7 +87,7 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px) of a star without effect on the motion above which the first iteration reselects pixels.
+# Displacement (px) above which a star without effect on the motion makes the first iteration reselect pixels.
 # Later iterations ignore the displacements of such stars, which are often poorly known.
 _FAINT_DRIFT = 3.2
 # Change of the angular acceleration, as a fraction of the rotation, above which pixels are selected again.
