@@ -1,9 +1,10 @@
-"""Devices of a bench session: search for devices, open devices, and outcome of a step.
+"""Devices of a bench session: search for devices, opening of devices, and outcomes of steps.
 
 The driver sets a coil to zero if its command is not repeated within 0.25 s. The guardian sets all coils to
-zero if this process stops, and `Session.close` does so at the end of every session. A missing chip is
-searched for at all addresses of its bus, and a missing serial device on all serial lines of the configuration
-at all baud rates. Chips are identified by registers that no driver changes.
+zero if this process stops. `Session.close` sets all coils to zero at the end of every session. If a chip does
+not answer, all addresses of its bus are searched for it. If a serial device does not answer, its serial line
+is listened to at all baud rates, to find which device sends there. Chips are identified by registers that no
+driver changes.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ class Session:
         ask: function that requests an action of the person at the bench and waits for its completion.
         hand: emulation of the person at the bench (`sim_hal.rig.EmulatedBench`), or None at a real bench.
         guardian: guardian of the coils, or None with emulated devices.
-        coil_field: expected field of each coil (n, 3) at the magnetometer, T/A, body axes, or None if the
-            configuration does not describe it.
+        coil_field: expected field per ampere (n, 3), T/A, of each coil at the magnetometer, in body axes, or
+            None if the configuration does not describe it.
         known: outcomes of earlier steps, by name.
         live: function that shows a text while the focus is adjusted and returns whether to continue, or None
             if nobody adjusts the focus.
@@ -144,7 +145,7 @@ class Session:
         return device
 
     def _start(self, kind: str, device: Any) -> None:
-        """Configure an open device. Raises DeviceError, after which the same device can be started again."""
+        """Configure an open device. If this raises DeviceError, the same device can be started again."""
         if kind == "coils":
             cast(TorqueCoils, device).start()
         if kind == "inertial_unit":
@@ -224,9 +225,9 @@ class Session:
         return taken
 
     def _frame(self, source: FrameSource, exposure: float) -> Frame:
-        """Return the frame of one trigger. Raises DeviceError.
+        """Trigger a camera, and return its frame. Raises DeviceError if no frame arrives.
 
-        A camera that the previous trigger has lost is reopened by its service within `_REOPENING_NS`.
+        If the previous trigger closed the camera, its service reopens it within `_REOPENING_NS`.
         """
         clock = self.rig.clock
         until_ns = clock.now_ns() + _REOPENING_NS
@@ -257,14 +258,14 @@ class Session:
 _PCA9685 = [0xE2, 0xE4, 0xE8, 0xE0]
 """Registers 2 to 5 (SUBADR1 to ALLCALLADR) of a PCA9685, which our drivers leave at their power-on values."""
 _INA219 = {0x399F, *(config_for(bits) for bits in range(4))}
-"""Values of an INA219's configuration register: after power-on (first), and as set by our driver."""
+"""Values of an INA219's configuration register after power-on (0x399F), and as set by our driver."""
 _ADDRESSES = [address for address in range(0x08, 0x78) if address != 0x70]
 """7-bit addresses without the reserved ones and without 0x70, to which every PCA9685 answers."""
 _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}
 _LISTEN_NS = 1_200_000_000
 _LOOK_NS = 20_000_000
 _REGULAR, _PAUSE = 8, 5.0
-"""Limits above which a contact is loose: number of pauses between data, ratio of longest to median pause."""
+"""Limits that a loose contact exceeds: number of pauses between data, ratio of longest to median pause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,8 +295,8 @@ def talker(
     """Return which kind of device sends on a serial line, its baud rate, and its longest sending pause, s.
 
     The kind is `vn100` or `gps`, or "" if none is recognised. The pause is 0 for a device that sends
-    regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100. At the first rate,
-    the device may send only once per `period_ns`, for which the last flight has configured it.
+    regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100. The first rate is
+    tried for at least `period_ns`, because the last flight may have configured this interval of the messages.
     """
     listened_ns = max(_LISTEN_NS, period_ns)
     for rate in dict.fromkeys((*rates, *BAUD_RATES)):
@@ -339,7 +340,7 @@ def find(config: Config, rig: Rig) -> Iterator[Found]:
         place = _place(config, key, section, driver)
         try:
             if camera and rig.cameras is None:
-                with ExitStack() as opened:  # a camera cannot be opened a second time for a later step
+                with ExitStack() as opened:  # closes the camera, so that a later step can open it
                     open_camera(section, rig, opened)
             answer = "opens" if driver is None or camera else driver.probe(rig, section)
             finding = _wrong_part(key, section, rig, serial)
@@ -399,7 +400,7 @@ def _wrong_address(kind: str, section: Any, rig: Rig, taken: set[Any]) -> Findin
 
 
 def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Finding | None:
-    """Return why the device of a serial line is missing or sends nothing useful, or None if it is unknown."""
+    """Return the fault that the data on a device's serial line show, or None if they show no fault."""
     wanted = "vn100" if kind == "inertial_unit" else "gps"
     if wanted == "vn100" and section.driver != "vn100":
         return None

@@ -89,7 +89,7 @@ def _noise(difference: FloatArray) -> float:
 
 
 def _alone(bright: BoolArray) -> float:
-    """Return the fraction of the bright pixels without a bright neighbour in their row."""
+    """Return the fraction of the bright pixels that have no bright neighbour in their row."""
     beside = np.zeros_like(bright)
     beside[:, 1:] |= bright[:, :-1]
     beside[:, :-1] |= bright[:, 1:]
@@ -108,7 +108,7 @@ def _frozen(part: str, frames: Sequence[Frame]) -> list[Finding]:
 
 
 def _format_faults(part: str, camera: Camera | WideCamera, frames: Sequence[Frame]) -> list[Finding]:
-    """Return the finding about pixel values that the configured number of bits does not permit, if any."""
+    """Return a finding if the pixel values exceed the configured bits or are multiples of one number."""
     pixels = frames[-1].pixels
     top, most = 2**camera.bits - 1, int(pixels.max())
     cure = "correct `bits` and `pixel_format`, and the order of the bytes"
@@ -166,7 +166,7 @@ def _wrong_size(part: str, camera: Camera | WideCamera, pixels: Image) -> list[F
 
 
 def _no_light(dark: Outcome | None, pixels: Image, level: float, sources: int) -> Finding:
-    """Return the finding about a frame without point sources: the cap is on, or the cause is unknown."""
+    """Return the finding about a frame with too few point sources: no signal, cap on, or unknown cause."""
     before = {} if dark is None else dark.values
     same = abs(level - before.get("level", math.inf)) <= 3.0 * max(before.get("noise_counts", 0.0), 1.0)
     if pixels.max() == pixels.min() > 0:
@@ -239,7 +239,7 @@ def step_lens(session: Session) -> Outcome:
         raise StepSkipped(f"no frame could be solved: {found.images[0].reason}")
     calibration = lens.calibration
     findings = []
-    # The frames may be smaller or larger than the configuration states; then their size is written too.
+    # If the size of the frames differs from the configuration, the measured size is written too.
     field_deg = 2.0 * math.degrees(math.atan(0.5 * frames[0].shape[1] / calibration.lens.focal_length))
     if abs(field_deg / camera.field_of_view_deg - 1.0) > 0.02:
         text = f"{field_deg:.3f} deg across the columns, configured {camera.field_of_view_deg:g}"
@@ -316,7 +316,10 @@ def step_wide(session: Session) -> Outcome:
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
-    """Return the cameras whose covering darkens a frame: `pixels` uncovered, `covered` by covered camera."""
+    """Return the cameras whose covering darkens a frame.
+
+    The frame is `pixels` if no camera is covered, and `covered[key]` if camera `key` is covered.
+    """
     level = float(np.mean(pixels))
     levels = {key: float(np.mean(frame)) for key, frame in covered.items()}
     darkest = min(levels.values())
@@ -326,7 +329,7 @@ def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
 
 
 def _cover_faults(key: str, darkened: Sequence[str], covered: Image) -> list[Finding]:
-    """Return the fault that the frames show while the lens of camera `key` is covered."""
+    """Return the fault of camera `key`, from its covered frame and the cameras that its cover darkened."""
     others = [name for name in darkened if name != key]
     if key not in darkened and others:
         text = f"its cover darkens {others[0]}"

@@ -85,7 +85,7 @@ def signed_permutations() -> list[FloatArray]:
 
 
 def axis_names(matrix: FloatArray) -> str:
-    """Return a text about the body axis that each wrong axis measures, such as `x shows -y, y shows x`."""
+    """Return a text that names the body axis measured by each wrong axis, such as `x shows -y, y shows x`."""
     shown = []
     for name, row in zip(_AXES, matrix, strict=True):
         index = int(np.argmax(np.abs(row)))
@@ -126,9 +126,9 @@ def noise_of(values: FloatArray) -> FloatArray:
 def missing_share(change: FloatArray, noise: float) -> float:
     """Return the fraction of samples in which the coil produced no field.
 
-    The changes of the measured field by the coil are `change` (k, 3), T. The field of the coil is missing in
-    a sample if the change is less than half of the usual change. The fraction is 0 if the usual change does
-    not exceed eight times the `noise` (T) of a sample.
+    The coil changes the measured field by `change` (k, 3), T. The field of the coil is missing in a sample if
+    the change is less than half of the usual change. The fraction is 0 if the usual change does not exceed
+    eight times the `noise` (T) of a sample.
     """
     mean = change.mean(axis=0)
     along = change @ mean / (np.linalg.norm(mean) or 1.0)
@@ -303,7 +303,7 @@ def diagnose_axes(turns: Turns) -> AxesFound:
 
 
 def _common(found: dict[str, FloatArray]) -> FloatArray | None:
-    """Return the common axes of all sensors, except the magnetometer's sign, or None if they differ."""
+    """Return the common axes of all sensors, or None if they differ. The magnetometer's sign is ignored."""
     if "gyro" not in found:
         return None
     first = found["gyro"]
@@ -388,9 +388,9 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
 
 
 def _gyro_scale(turns: Turns) -> list[Finding]:
-    """Return the finding about a gyro whose angles about x and y differ from those of gravity, if any.
+    """Return a finding if the gyro's angles about x and y differ from the angles computed from gravity.
 
-    The gyro and gravity measure the same rotation, so its deviation from 90 deg does not matter.
+    Both angles belong to the same rotation, so that its deviation from 90 deg does not matter.
     """
     first, second = turns.before[:2, 0], turns.after[:2, 0]
     sizes = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
@@ -424,7 +424,7 @@ def _force_scales(force: FloatArray) -> list[Finding]:
 
 
 def _field_faults(field: FieldFound) -> list[Finding]:
-    """Return the fault in the fit of the magnetometer, if any: wrong scales, or a large constant field."""
+    """Return the magnetometer fault that the fit shows, if any: wrong scales, or a large constant field."""
     part = "inertial_unit.magnetometer"
     if field.scales is not None:
         return [_wrong_scales(part, field.scales, "relative scales")]
@@ -553,8 +553,8 @@ class CoilsFound:
         response, expected: measured and expected field of each command (n, 3), T/A, in body axes.
         serves: index (n,) of the configured coil that each command drives, or -1 if the command produces no
             magnetic field.
-        strength: field of each command (n,) relative to that of the coil that it drives; negative if
-            reversed.
+        strength: ratio (n,) of the field of each command to the expected field of the coil that the command
+            drives; negative if reversed.
         misfit: angle (n,), rad, between the axes of measured and expected field, from 0 to pi / 2.
         live: mask (n,) of the commands that produce a field.
         drawn: supply current (n,) relative to the command, corrected for a wrong shunt; NaN if unknown.
@@ -588,7 +588,7 @@ def diagnose_coils(
     """Return the faults of the coils, given the expected field (n, 3), T/A, of each coil in body axes.
 
     The matrix `magnetometer` (3, 3) maps body axes to measured axes; its sign may be wrong. If `size_known`
-    is false, the field strength per ampere is not known, and the coils' median is the expected strength.
+    is false, the expected field strength per ampere is unknown, and the median of all coils is used instead.
     """
     axes = np.eye(3) if magnetometer is None else magnetometer
     plus, minus = test.plus @ axes, test.minus @ axes  # rows in body axes
@@ -654,7 +654,7 @@ _OF_ALL_COILS = {"no field", "no supply", "no response", "wrong supply voltage",
 
 
 def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> tuple[float, list[Finding]]:
-    """Return -1 and a finding if all fields are reversed, which indicates a reversed magnetometer, else 1."""
+    """Return the magnetometer's sign (-1 if the fields of all coils are reversed), with its finding."""
     count = int(live.sum())
     if count < 2 or (strength[live] > 0).any() or (misfit[live] > RECOGNISED).any():
         return 1.0, []
@@ -666,7 +666,7 @@ def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> t
 def _match(
     response: FloatArray, expected: FloatArray, live: BoolArray
 ) -> tuple[list[int], FloatArray, FloatArray]:
-    """Return coil, ratio of measured to expected field, and angle error (rad), (n,), of each command."""
+    """Return driven coil, ratio of measured to expected field, and angle error (rad) of each command (n,)."""
     count = len(response)
     unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     length = np.linalg.norm(response, axis=1, keepdims=True)
@@ -684,11 +684,11 @@ def _match(
 
 
 _STILL, _MOVED = 5e-3, 0.1
-"""Largest rotation (rad) of a body at rest, and largest share of the field change that it may explain."""
+"""Largest rotation (rad) of a body at rest, and largest accepted share of rotation in a field change."""
 
 
 def _moved(test: CoilTest) -> list[Finding]:
-    """Return a finding if a rotation of the body changes the measured field like the field of a coil.
+    """Return a finding if a rotation of the body contributes noticeably to the measured field changes.
 
     In the field of a Helmholtz coil, the torque of a coil rotates a body that is not held.
     """

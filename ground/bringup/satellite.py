@@ -58,7 +58,10 @@ def step_power(session: Session) -> Outcome:
 def _readings(
     session: Session, monitors: Mapping[str, PowerMonitor], command: FloatArray
 ) -> dict[str, PowerReading | None]:
-    """Return the newest readings after the coils have carried the currents `command` (n,), A, for a while."""
+    """Return the newest readings after the coils have carried the currents `command` (n,), A, for a while.
+
+    The reading of a monitor is None if it is older than these currents.
+    """
     coils = session.device("coils")
 
     def repeat() -> None:
@@ -223,7 +226,7 @@ _STRINGS_S = 2.5  # time (s) in which each string is measured at least twice
 
 
 def step_strings(session: Session) -> Outcome:
-    """Illuminate one panel after the other, and check that only the string on this panel gives a current."""
+    """Illuminate one panel after the other, and check that its string has the largest relative current."""
     strings: SolarStrings = session.device("solar_strings")
     section = session.config.solar_strings
     assert section is not None, "the device is open"

@@ -150,7 +150,7 @@ def step_coils(session: Session) -> Outcome:
     if monitor is not None and math.isnan(test.idle):
         problem = monitor.error() or "no conversion arrives"
         found.findings.append(Finding("power_monitor", "no reading", problem, "check its supply and wiring"))
-    # A braked bridge carries no current, even if a leg that is stuck high drives the coil while it is off.
+    # If a leg is stuck high, current flows through the coil while the bridge is off, but not while it brakes.
     if any(one.kind == "current while off" for one in found.findings):
         coils.brake(frozenset(range(len(section.windings))))
     values = {
@@ -242,7 +242,7 @@ def _drive(
 
 
 def _rotation(session: Session, recorded: Sequence[Samples]) -> float:
-    """Return the largest rotation (rad) of the body between a recording and the next.
+    """Return the largest rotation (rad) of the body between two successive recordings.
 
     The gyro's bias is that of the step `rest`, or else the mean rate of all recordings. The rotation is 0
     for a gyro whose rates are not finite.
@@ -268,7 +268,7 @@ def _coil_changes(
     """Return the corrected configuration values of windings and shunt, given the findings for each coil.
 
     If `axes_known` is false, the axes of the coils are not changed, because a coil's field at the
-    magnetometer is not parallel to the axis of the coil.
+    magnetometer need not be parallel to the axis of the coil.
     """
     kinds = {(one.part, one.kind): one for one in found.findings}
     windings = [
@@ -313,7 +313,7 @@ STEPS: dict[str, Callable[[Session], Outcome]] = {
     "focus": step_focus,
     "lens": step_lens,
 }
-"""The steps in their order."""
+"""Functions of the steps by name, in the order of execution."""
 
 
 def steps_of(config: Config) -> list[str]:
