@@ -35,7 +35,7 @@ from knightcube.errors import UsageError
 
 _PLAIN_S = 10.0  # time (s) between two lines of progress if the output is not a terminal
 _WIDTH = 30  # width of the progress bar in characters
-_ATTEMPTS = 3  # number of worker processes whose death during the same case ends the campaign
+_ATTEMPTS = 3  # maximum number of attempts to run a case whose worker process dies
 _STOP_S = 5.0  # time (s) in which interrupted worker processes must end before they are killed
 _SCRATCH = "knightcube-campaign-"
 """Prefix of the name of the folder that contains the temporary files of the workers."""
@@ -232,7 +232,7 @@ def fly(
 
 
 def _without_nan(value: Any) -> Any:
-    """Return values for JSON, with None instead of NaN, the mean of a row without results."""
+    """Return values for JSON, with None instead of NaN. The mean of a row without results is NaN."""
     if isinstance(value, dict):
         return {key: _without_nan(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -241,7 +241,7 @@ def _without_nan(value: Any) -> Any:
 
 
 def _note_complete(out: Path) -> None:
-    """Write that no case ran, because an earlier campaign ran them all, and when that campaign began."""
+    """State that no case ran, because all cases already had results, and when the campaign began."""
     begun = datetime.fromtimestamp((out / _LABEL).stat().st_mtime).isoformat(" ", "minutes")
     whole = f"contains all results of the campaign of {begun}; delete the folder to run it again"
     sys.stderr.write(f"no case ran: {out} {whole}\n")
@@ -410,8 +410,8 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
                 error.add_note(f"in case {case.key}:\n{traceback.format_exc()}")
                 answer = None, error
             pipe.send(answer)
-            # A flight leaves reference cycles with large arrays. Because it suspends the collection of older
-            # objects, the automatic collection would not find them for dozens of flights.
+            # A flight leaves reference cycles with large arrays. Because a flight suspends the collection of
+            # older objects, the automatic collection would not find these cycles for dozens of flights.
             gc.collect()
 
 

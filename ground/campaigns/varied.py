@@ -125,7 +125,7 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
             raise UsageError("--vary simulation.seed: each flight has its own seed; --seed changes all seeds")
         _numbers_at(base, one)
         for value in one.choices:
-            # A value that the configuration check always refuses would never be drawn.
+            # Raises UsageError for a value that the configuration check always refuses.
             only = [_fixed(each, value) if each is one else each for each in variations]
             _case(base, only, duration, (0, 0))
 
