@@ -24,7 +24,7 @@ UTC_NS = 1_774_008_000 * SECOND_NS
 
 
 def bench_session(devices: dict[str, Any], **changes: Any) -> Session:
-    """Return a session with open devices, by key. The `changes` are sections of the configuration."""
+    """Return a session with open `devices` (by key). `changes` replace sections of the configuration."""
     config = reader.replace(orbit_config(camera=True), **changes)
     rig: Any = Mock(clock=SimClock(UTC_NS), cameras=None)
     return Session(config, rig, ExitStack(), lambda _: None, _open=devices)
@@ -107,7 +107,7 @@ class ScriptedUnit:
         return ImuReading(time_ns, time_ns, time_ns, np.array([0.0, 0.0, 0.0, 1.0]), *self.sample(number))
 
     def link(self) -> ImuLink:
-        """Return zeros at the first question, and then the given counters."""
+        """Return zeros at the first call, and the given counters at all later calls."""
         self.asked += 1
         zeros = dict.fromkeys(("bytes_received", "packets", "bad_checksum", "discarded_bytes"), 0)
         zeros |= {"out_of_range": 0, "not_finite": 0, "last_byte_ns": 0}

@@ -91,8 +91,8 @@ def fly(
     """Run a configuration in lock-step, and return its logs. The function `prepare` may schedule faults.
 
     `section` describes the simulated world and its seed; the default is the world of the demonstration.
-    Devices in `absent` are removed before they are opened, and the run waits for them. The coil currents must
-    be zero after the devices were closed, whatever ended the flight.
+    The function `absent` may remove devices before they are opened; the run then waits for them. The coil
+    currents must be zero after the devices were closed, whatever ended the flight.
     """
     folder.mkdir(parents=True, exist_ok=True)
     section = section or configuration.replace(demo_world(), seed=seed)

@@ -78,7 +78,7 @@ def slope_per_hour(
     too. The slope is the median of all pairwise slopes of the blocks, and its interval follows from Kendall's
     tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
     """
-    from scipy import stats  # noqa: PLC0415 - the bench is not to share the flight's libraries while it flies
+    from scipy import stats  # noqa: PLC0415 - sharing its pages would change the flight's measured memory
 
     times, levels = np.asarray(seconds, dtype=np.float64), np.asarray(values, dtype=np.float64)
     if len(times) < 3 * blocks:

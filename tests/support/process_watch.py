@@ -118,7 +118,7 @@ def unshared(processes: Mapping[str, int]) -> float:
     """Return the memory (bytes) that some processes would hold if no other process mapped their files.
 
     The result is the sum of their private memory and, for each mapped segment of a file, the largest amount
-    that any of the processes holds. All processes use the same libraries in the same way.
+    that any of the processes holds. This assumes that all processes use the same pages of a file.
     """
     private = 0.0
     of_files: defaultdict[tuple[str, str], float] = defaultdict(float)

@@ -20,7 +20,7 @@ from sim_hal.star_camera import StarCameraModel, image
 from tests.support.scenes import catalogue
 
 Turns = Callable[[FloatArray], FloatArray]
-"""Function that returns rotation vectors (m, 3), rad, since mid-exposure at times (m,), s, camera frame."""
+"""Function from times (m,), s after mid-exposure, to rotations (m, 3), rad since then, camera frame."""
 
 _LIMIT = 7.0
 # Largest step (px) of a star between two instants, and half width of the patch in units of the point spread's

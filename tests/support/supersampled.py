@@ -127,7 +127,7 @@ class Sky:
 
 
 Attitudes = Callable[[FloatArray], FloatArray]
-"""Function that returns attitudes (m, 4), sky to camera, at times (m,) since mid-exposure, in exposures."""
+"""Function from times (m,) after mid-exposure, in exposures, to attitudes (m, 4), sky to camera."""
 
 
 def light(
