@@ -177,7 +177,7 @@ def _flown(
 
 
 def _worst(*values: float | None) -> float:
-    """Return the largest value, or infinity if a step has none."""
+    """Return the largest value, or infinity if the value of a step is missing."""
     return max(math.inf if value is None else value for value in values)
 
 

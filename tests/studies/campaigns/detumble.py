@@ -3,11 +3,11 @@
 Two craft are detumbled, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law
 `magnetometer` has only a magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a
 coarse attitude. The law `inertia` has the same sensors, but the body's moments and principal axes differ from
-the configured ones by up to the default accuracies. The coils are off for a twentieth of each four seconds,
-as the magnetometer needs, and before the rate is known. While the rate is uncertain, they are off for a tenth
-of each two seconds. Coils are commanded each quarter of a second, and as often as the body rotates by 0.3
-rad. Each time is compared with a rigorous lower bound (`least_time`) for any control of these coils. The
-bound assumes that the coils are never off, and that the largest dipole can have any direction.
+the configured ones by up to the default accuracies. For the magnetometer, the coils are off for a twentieth
+of each four seconds, or for a tenth of each two seconds while the rate is uncertain. They are also off before
+the rate is known. The coils are commanded every quarter of a second, and at least once per 0.3 rad of the
+body's rotation. Each time is compared with a rigorous lower bound (`least_time`) for any control of these
+coils. The bound assumes that the coils are never off, and that the largest dipole can have any direction.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def hash_of(case: Case) -> int:
 
 
 class _Bound:
-    """Lower bound of the time of a flight, from the field along its orbit and its true craft."""
+    """Lower bound of the time of a flight, computed from its true craft and the field along its orbit."""
 
     def __init__(self, flight: FreeFlight) -> None:
         self._flight = flight

@@ -35,7 +35,7 @@ interval at the end of the shadow.
 
 
 def judged(error: FloatArray, sigma: FloatArray) -> Result | None:
-    """Return statistics of errors (n, 3), rad, with standard deviations (n, 3); None if there are none."""
+    """Return statistics of errors (n, 3), rad, with standard deviations (n, 3), or None if n is 0."""
     if not len(error):
         return None
     return {

@@ -1,8 +1,8 @@
 """Evaluation of a run of campaign `faults` by its log and its true states.
 
 The tables have the event and the reaction that each fault must cause. A fault counts as reported only by a
-specific event: a stuck coil also causes a tumbling event, but that event does not name the failed part. Where
-the table of events has a reaction, the reaction must follow. Times are determined from log and truth, not
+specific event: a stuck coil also causes a tumbling event, but that event does not name the failed part. If
+the table of events states a reaction, the reaction must follow. Times are determined from log and truth, not
 from events alone, because events are rate-limited.
 """
 
@@ -90,7 +90,7 @@ DRIVEN = 6.0e-3
 """Smallest current (A) at which the monitor can evaluate a driven coil."""
 
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
-"""Absolute (A) and relative difference of two readings of the same current that can still be noise."""
+"""Largest absolute (A) and relative differences, due to noise, of two readings of the same current."""
 LOOKED_FROM, LOOKED = 2.0, 3.0
 """Time (s) from which the monitor's mean is complete, and time (s) after a bit flip within which an effect
 is expected.

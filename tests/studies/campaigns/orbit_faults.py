@@ -2,12 +2,12 @@
 
 Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and injects one
 fault on the device lines, at a random time and for a random duration; faults of coils and bridges last to the
-end. There are also initial conditions: an element set that is a week old, no element set, and a wall clock
-that is wrong from the start. The campaign checks whether a specific event reported the fault, whether the
-body meets the requirements of its mode at the end, and the current of coils that were driven without valid
-data, sensor by sensor (readings, field, attitude). It also checks for how long the coils were driven by an
-attitude whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an unused part (a
-coil that is not driven, a camera that is idle) counts as not exercised.
+end. Some runs have a wrong initial condition instead: an element set that is a week old, no element set, or a
+wall clock that is wrong from the start. The campaign checks whether a specific event reported the fault,
+whether the body meets the requirements of its mode at the end, and the current of coils that were driven
+without valid data, sensor by sensor (readings, field, attitude). It also checks for how long the coils were
+driven by an attitude whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an
+unused part (a coil that is not driven, a camera that is idle) counts as not exercised.
 """
 
 from __future__ import annotations

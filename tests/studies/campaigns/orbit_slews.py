@@ -12,8 +12,8 @@ been estimated by then (`learned`).
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
 worker (`pointing_job`). As in flight, the rest of the slew is planned again every EVERY cycles from the
-newest estimate, later after plans that do not improve the present plan, and each new path is followed from
-its start.
+newest estimate, and less often after plans that do not improve the present plan. Each new path is followed
+from its start.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
 A case is one flight with active planner and vision, on devices in a separate process. Workers and guardian
 are killed or stopped at random times; the log must report each event, and each process must be replaced.
-Finally the flight process itself is killed or stopped. The coil currents must become zero, and no process and
-no file of the flight may remain in the folder for temporary files or in shared memory.
+Finally the flight process itself is killed or stopped. The coil currents must become zero, no process of the
+flight may remain, and none of its files may remain in the folder for temporary files or in shared memory.
 
-The emulated devices and the process that samples the coils represent hardware, which needs no processor. Both
-run under SCHED_FIFO if it is permitted, so that a busy machine delays only the flight.
+The emulated devices and the process that samples the coils represent hardware, which would not compete for
+the processor. Both run under SCHED_FIFO if it is permitted, so that a busy machine delays only the flight.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _LOAD = Load(600.0, camera_period=1.0, replan_period=0.5)
 _NOTICED_S = 8.0
 """Time (s) within which the end of a process must be in the log on disk.
 
-It is detected within two seconds and stored a second later, and the rest is a margin for busy machines.
+The end is detected within two seconds and stored a second later; the rest is a margin for busy machines.
 """
 _HARDWARE = 70
 """SCHED_FIFO priority of the processes that represent hardware, above that of the flight."""

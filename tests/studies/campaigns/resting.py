@@ -2,15 +2,15 @@
 
 The frames have each of `imperfections.IMPERFECTIONS`, streaks of 0, 1 and 3 px, an exposure of 0.2 s and the
 priors of a flight. The frames of `streaked` have streaks of 10, 20 and 40 px in the centre, and the rotation
-about the boresight is at most that across it. Their additional cameras have rolling shutters of 0, 20 and 30
-us per row, with known and unknown line time. `supersampled` renders the frames.
+about the boresight is at most the rotation across it. Their additional cameras have rolling shutters of 0, 20
+and 30 us per row, with known and unknown line time. `supersampled` renders the frames.
 
-The error of an attitude is given in claimed standard deviations (the square root of its NEES). More than 6
-counts as confidently wrong. A displaced optical axis, or a point spread function with a displaced centroid,
-rotates all attitudes by the same angle. A flight calibrates this rotation, as part of its mounting, with the
-same stars. In these rows (`SHIFTED`) the median error is subtracted, and the prior includes the displaced
-axis. The row `none` has an exactly known lens; all others have the default uncertainty of an uncalibrated
-lens.
+The error of an attitude is given in claimed standard deviations (the square root of its NEES). An error of
+more than 6 counts as confidently wrong. A displaced optical axis, or a point spread function with a displaced
+centroid, rotates all attitudes by the same angle. A flight calibrates this rotation, as part of its mounting,
+with the same stars. In these rows (`SHIFTED`) the median error is subtracted, and the prior includes the
+displaced axis. The row `none` has an exactly known lens; all others have the default uncertainty of an
+uncalibrated lens.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ across the boresight and in total.
 `streaks-thesis` has the thesis's camera, bilinear spots and uniform noise (2.5-2.11). The bound, given for
 comparison, is that of a camera with Poisson noise. As in the thesis (3.28), the exposure determines the
 length of its streaks, at 0.05 rad/s. The biases of the detected ends are those of the thesis's spots
-(`measured_bias`). Its sky has the 7,000 brightest stars. With the whole catalogue, streaks would cross at
+(`measured_bias`). The sky has the 7,000 brightest stars. With the whole catalogue, streaks would cross at
 rotations of 50 % of the field, which would displace ends by up to 1 px.
 """
 
