@@ -98,7 +98,8 @@ def run(options: argparse.Namespace) -> int:
     facts |= {"shutter_described": not likelihood.shutter_unstated}
     unstated = isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated
     assumed = _FIELD if options.fov and options.fov_error is None and found.rate is not None else ""
-    text = _text(found, objects) + (f"objects:       not searched: {unsearched}\n" if unsearched else "")
+    refused = found.rate is not None and unsearched
+    text = _text(found, objects) + (f"objects:       not searched: {unsearched}\n" if refused else "")
     text += (_SHUTTER if unstated else "") + assumed
     print_result(
         options, facts | {"prior_used": not unused}, text + (f"prior:         {unused}\n" if unused else "")
