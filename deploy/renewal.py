@@ -120,7 +120,7 @@ class State:
         number: number of this record; the copy with the higher number is used.
         handled: names of the newest executed requests.
         versions: highest confirmed version of each kind of artefact.
-        begun: name of the unfinished request, once for each attempt.
+        begun: number of attempts at the unfinished request, by its name.
         previous: name of the configuration that flew before the present one.
         bad: names of the releases that failed a trial.
         trial: open trial.
@@ -138,7 +138,7 @@ class State:
 
     number: int = 0
     handled: list[str] = dataclasses.field(default_factory=list)
-    begun: list[str] = dataclasses.field(default_factory=list)
+    begun: dict[str, int] = dataclasses.field(default_factory=dict)
     versions: dict[str, int] = dataclasses.field(default_factory=dict)
     previous: str = ""
     bad: list[str] = dataclasses.field(default_factory=list)
@@ -498,7 +498,7 @@ class Renewal:
     def _obey(self, name: str) -> None:
         """Execute a request, in at most `MOST_TRIES` attempts, and report the reason if it is refused."""
         state = self._state
-        state.begun = [name, *(one for one in state.begun if one == name)]
+        state.begun = {name: state.begun.get(name, 0) + 1}
         self._save()  # so that a request during which the board loses power is not repeated forever
         state.handled = [*state.handled, name][-KEPT_REQUESTS:]
         request: dict[str, Any] = {}
@@ -509,7 +509,7 @@ class Renewal:
             request = dict(decoded(file.read()))
         word, kind = str(request.get("do", "")), str(request.get("kind", ""))
         try:
-            if len(state.begun) > MOST_TRIES:
+            if state.begun[name] > MOST_TRIES:
                 raise Refused(f"the board or the renewal program stopped {MOST_TRIES} times during it")
             if word == "restart":
                 self._restart(name, str(request["part"]))
@@ -525,7 +525,7 @@ class Renewal:
                 raise Refused("the request is damaged")
         except (Refused, OSError, *_DAMAGED) as error:
             self._report(name, "failed", word or "request", str(error) or type(error).__name__)
-        state.begun = []
+        state.begun = {}
 
     def _restart(self, name: str, part: str) -> None:
         """Store the request as executed, so that it is never repeated, and restart flight, link or board."""
