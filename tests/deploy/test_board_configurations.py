@@ -123,7 +123,7 @@ def test_the_drop_in_and_check_refuse_a_wrong_value_with_the_same_words(
     assert capsys.readouterr().err.partition(": ")[2] == refused != ""
 
 
-def test_the_unit_knows_the_writes_that_stop_other_bridges(tmp_path: Path) -> None:
+def test_the_unit_has_the_writes_that_switch_drv8830_bridges_off(tmp_path: Path) -> None:
     tree = yaml.safe_load(TESTBED.read_text(encoding="utf-8"))
     tree["coils"] |= {"driver": "drv8830", "address": 0x61}
     path = tmp_path / "flight.yaml"

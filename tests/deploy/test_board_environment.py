@@ -94,7 +94,7 @@ def test_a_board_flies_without_the_ground_tools(board: Board) -> None:
     assert (board.folder / "flown").is_dir()
 
 
-def test_the_help_of_a_board_lists_what_is_there(board: Board) -> None:
+def test_the_help_of_a_board_lists_only_installed_commands(board: Board) -> None:
     done = board.python("-m", "flight", "--help")
     assert (done.returncode, done.stderr) == (0, "")
     commands = done.stdout.partition("COMMAND")[2].partition("examples:")[0]

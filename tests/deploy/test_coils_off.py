@@ -95,7 +95,7 @@ def test_the_coils_are_zeroed_by_i2cset_first(tools: Tools) -> None:
     assert tools.run() == (0, [f"i2cset -y 1 0x40 0x{ALL_LED_OFF_H:02x} 0x{FULL:02x} b"], "")
 
 
-def test_where_i2cset_fails_any_python_does_it(tools: Tools) -> None:
+def test_python_zeroes_the_coils_if_i2cset_fails(tools: Tools) -> None:
     tools.put("i2cset", 1)
     tools.put("python3", 0)
     status, calls, _ = tools.run()
@@ -103,7 +103,7 @@ def test_where_i2cset_fails_any_python_does_it(tools: Tools) -> None:
     assert calls[1] == f"python3 -I -S {tools.folder}/smbus_byte.py /dev/i2c-1 0x40 0xfd 0x10"
 
 
-def test_it_tries_again_and_says_so_when_all_is_in_vain(tools: Tools) -> None:
+def test_each_tool_is_tried_five_times_before_the_failure_is_reported(tools: Tools) -> None:
     tools.put("i2cset", 1)
     tools.put("python3", 1)
     status, calls, output = tools.run()
@@ -112,7 +112,7 @@ def test_it_tries_again_and_says_so_when_all_is_in_vain(tools: Tools) -> None:
     assert "the coils may be driven" in output
 
 
-def test_the_units_address_and_the_one_last_flown_are_both_written(tools: Tools) -> None:
+def test_the_address_of_the_unit_and_the_last_flown_address_are_written(tools: Tools) -> None:
     tools.put("i2cset", 0)
     CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", ((0x42, 0xFD, 0x10),)).note(tools.folder)
     status, calls, said = tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")
@@ -150,7 +150,7 @@ def test_every_write_of_a_unit_and_of_a_note_is_executed_whatever_another_chip_d
     assert "0x62" not in said
 
 
-def test_an_address_that_hangs_keeps_the_other_from_nothing(tools: Tools) -> None:
+def test_a_hanging_address_does_not_delay_the_other_address(tools: Tools) -> None:
     (tools.folder / "bin/i2cset").write_text(
         f'#!/bin/sh\necho "$3" >>"{tools.folder}/calls"\n'
         f'[ "$3" = 0x42 ] || exit 0\nuntil [ -e "{tools.folder}/end" ]; do sleep 0.02; done\n',
@@ -206,7 +206,7 @@ class Chips:
         (0x42, 0x43, 0, [0x40, 0x41], 1),
     ],
 )
-def test_of_the_known_addresses_each_that_acknowledges_is_off_whatever_another_does(
+def test_each_chip_that_acknowledges_is_switched_off_even_if_another_does_not(
     tools: Tools, note: int, unit: int, refusals: int, left: list[int], status: int
 ) -> None:
     """A PWM chip may refuse its first bytes. An address without a chip never acknowledges."""
@@ -229,7 +229,9 @@ def test_of_the_known_addresses_each_that_acknowledges_is_off_whatever_another_d
 
 
 @pytest.mark.parametrize("kind", ["FIFO", "sparse"])
-def test_a_note_without_an_end_keeps_nothing_from_the_units_address(tools: Tools, kind: str) -> None:
+def test_an_endless_note_does_not_prevent_the_write_to_the_address_of_the_unit(
+    tools: Tools, kind: str
+) -> None:
     tools.put("i2cset", 0)
     if kind == "FIFO":
         os.mkfifo(tools.folder / "coils")
@@ -240,7 +242,7 @@ def test_a_note_without_an_end_keeps_nothing_from_the_units_address(tools: Tools
 
 
 @pytest.mark.parametrize("half", ["", "/dev/i2c-7", "/dev/i2c-7 0x", "\0\0\0\0", "7 0x42\n"])
-def test_half_a_note_counts_for_nothing(tools: Tools, half: str) -> None:
+def test_an_incomplete_note_is_ignored(tools: Tools, half: str) -> None:
     tools.put("i2cset", 0)
     (tools.folder / "coils").write_text(half, encoding="ascii")
     assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3")[1] == ["i2cset -y 3 0x40 0xfd 0x10 b"]

@@ -23,7 +23,7 @@ def seen(folder: Path) -> dict[str, Any]:
     return container.boot(folder)
 
 
-def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
+def test_the_service_starts_and_reports_that_it_is_ready(seen: dict[str, Any]) -> None:
     assert seen["active"] == "active"
     # Without CAP_SYS_RESOURCE, systemd cannot raise the real-time limits of the service.
     granted, *refused = seen["status"].removeprefix("flying; ").split("; ")
@@ -34,7 +34,7 @@ def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
     ("act", "result", "limit"),
     [("killed", "signal", 0.5), ("killed with its guardian", "signal", 1.5), ("stopped", "watchdog", 0.5)],
 )
-def test_the_coils_are_at_zero_and_it_comes_back(
+def test_the_coils_are_at_zero_and_the_service_restarts(
     seen: dict[str, Any], act: str, result: str, limit: float
 ) -> None:
     """ExecStopPost zeroes the coils if guardian and flight are killed together.
@@ -49,7 +49,7 @@ def test_the_coils_are_at_zero_and_it_comes_back(
     assert facts["result"] == result
 
 
-def test_each_death_was_one_restart(seen: dict[str, Any]) -> None:
+def test_each_death_caused_one_restart(seen: dict[str, Any]) -> None:
     assert seen["restarts"] == 3
 
 
@@ -68,19 +68,19 @@ def test_a_command_over_its_socket_is_answered(seen: dict[str, Any]) -> None:
     assert seen["commanded"].startswith("obeyed: "), seen["commanded"]
 
 
-def test_a_configuration_with_a_flipped_bit_is_not_flown_but_waited_for(seen: dict[str, Any]) -> None:
+def test_the_service_waits_while_its_configuration_has_a_flipped_bit(seen: dict[str, Any]) -> None:
     assert seen["damaged"] == {"driven": False, "state": "activating", "restarted": False}
 
 
-def test_devices_that_were_not_named_are_closed_to_it(seen: dict[str, Any]) -> None:
+def test_the_service_cannot_open_devices_that_are_not_configured(seen: dict[str, Any]) -> None:
     assert seen["devices_closed"]
 
 
-def test_a_polite_stop_is_a_success(seen: dict[str, Any]) -> None:
+def test_a_stop_by_systemd_is_a_success(seen: dict[str, Any]) -> None:
     assert seen["end"] == {"driven": False, "result": "success", "reported": "success"}
 
 
-def test_without_its_release_it_is_given_up_and_the_safe_state_tries_it_again(seen: dict[str, Any]) -> None:
+def test_without_a_release_the_service_fails_and_the_safe_state_tries_it_again(seen: dict[str, Any]) -> None:
     assert seen["broken"] == {"tried_again": True, "safe_state_ended": True}
 
 
@@ -105,7 +105,7 @@ def test_uninstalling_with_purge_leaves_nothing(seen: dict[str, Any], folder: Pa
     assert (folder / "after_uninstall.txt").read_text(encoding="utf-8") == ""
 
 
-def test_no_cgroup_and_no_mount_is_left(seen: dict[str, Any]) -> None:
+def test_no_cgroup_and_no_mount_remains(seen: dict[str, Any]) -> None:
     assert seen
     assert not list(Path("/sys/fs/cgroup").glob("**/knightcube-test"))
     assert "/mnt/root" not in Path("/proc/self/mounts").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ from tests.deploy.container import needs_mount
 
 
 @pytest.mark.parametrize("place", ["/tmp", "/proc/self", "/dev"])
-def test_a_folder_below_the_containers_own_mounts_needs_one(place: str) -> None:
+def test_a_folder_below_the_mounts_of_the_container_needs_a_mount(place: str) -> None:
     assert needs_mount(Path(place))
 
 
@@ -20,5 +20,5 @@ def test_a_link_to_such_a_folder_is_followed(tmp_path: Path) -> None:
     assert needs_mount(link)
 
 
-def test_a_folder_of_the_root_file_system_is_seen() -> None:
+def test_a_folder_of_the_root_file_system_needs_no_mount() -> None:
     assert not needs_mount(Path("/"))

@@ -118,7 +118,7 @@ def test_without_a_usable_answer_of_releases_py_the_current_release_flies_and_sa
     assert re.search(named, said, re.M)
 
 
-def test_an_answer_counts_although_releases_py_does_not_end(board: FakeBoard) -> None:
+def test_a_printed_choice_is_used_although_releases_py_does_not_end(board: FakeBoard) -> None:
     """A release starts once releases.py has printed its choice, even if releases.py hangs afterwards."""
     _chooser(board).write_text(
         f"import time\nprint('{FIRST} as asked', flush=True)\ntime.sleep(600)", encoding="ascii"
@@ -138,7 +138,7 @@ RECORDS: dict[str, Callable[[Path], None]] = {
 
 
 @pytest.mark.parametrize("damage", RECORDS.values(), ids=RECORDS)
-def test_a_damaged_record_keeps_releases_py_from_nothing(
+def test_a_damaged_record_does_not_change_the_choice_of_releases_py(
     board: FakeBoard, damage: Callable[[Path], None]
 ) -> None:
     damage(board.root / "state" / TRIALS)
@@ -161,7 +161,7 @@ def test_a_damaged_record_keeps_releases_py_from_nothing(
         ),
     ],
 )
-def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_given(
+def test_a_release_without_a_readable_manifest_is_replaced_and_the_reason_reported(
     board: FakeBoard, damage: Callable[[Path], None], reason: str
 ) -> None:
     damage(board.prefix / "current/manifest")
@@ -190,7 +190,7 @@ PYTHONS: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.parametrize("chooser", ["healthy", "missing"])
 @pytest.mark.parametrize("damage", PYTHONS.values(), ids=PYTHONS)
-def test_a_release_that_cannot_start_gives_way_to_the_other(
+def test_a_release_that_cannot_start_is_replaced_by_the_other(
     board: FakeBoard, damage: Callable[[Path], None], chooser: str
 ) -> None:
     damage(_python(board, "current"))
@@ -201,7 +201,7 @@ def test_a_release_that_cannot_start_gives_way_to_the_other(
     assert f"fly: release {FIRST} flies (whole): " in said
 
 
-def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
+def test_a_proven_release_that_no_longer_starts_is_replaced_too(board: FakeBoard) -> None:
     """The starts of an accepted release are not counted, but a failed start leads to the previous release."""
     (board.root / "state" / TRIALS).write_bytes(starts_record({}, SECOND))
     PYTHONS["cannot import the flight"](_python(board, "current"))
@@ -212,7 +212,7 @@ def _hurt(board: FakeBoard, link: str) -> None:
     (board.prefix / link / "venv/lib/python3/site-packages/flight/label").write_text("hurt", encoding="ascii")
 
 
-def test_without_releases_py_a_damaged_release_gives_way_but_flies_where_none_is_whole(
+def test_without_releases_py_a_damaged_release_is_replaced_unless_none_is_intact(
     board: FakeBoard,
 ) -> None:
     _chooser(board).unlink()
@@ -230,13 +230,15 @@ def test_without_releases_py_a_damaged_release_gives_way_but_flies_where_none_is
 
 
 @pytest.mark.parametrize("package", ["flight", "knightcube"])
-def test_without_releases_py_damage_to_either_package_gives_way(board: FakeBoard, package: str) -> None:
+def test_without_releases_py_damage_to_either_package_replaces_the_release(
+    board: FakeBoard, package: str
+) -> None:
     _chooser(board).unlink()
     _replace(board.prefix / f"current/venv/lib/python3/site-packages/{package}/label", "hu")
     assert board.fly()[0] == "old"
 
 
-def test_without_releases_py_a_damaged_manifest_gives_way(board: FakeBoard) -> None:
+def test_without_releases_py_a_damaged_manifest_replaces_the_release(board: FakeBoard) -> None:
     _chooser(board).unlink()
     manifest = board.prefix / "current/manifest"
     manifest.write_text(manifest.read_text(encoding="ascii").replace("label", "lapel"), encoding="ascii")
@@ -386,7 +388,7 @@ def test_any_damaged_file_of_the_launcher_leaves_the_current_release_flying(
     assert _damaged_copy(board, "none") == "new"
 
 
-def test_where_no_checksum_can_be_compared_the_first_copy_starts(board: FakeBoard) -> None:
+def test_the_first_copy_starts_if_no_checksum_can_be_compared(board: FakeBoard) -> None:
     for copy in ("bin", "spare"):
         (board.prefix / copy / "sums").write_text("damaged\n", encoding="ascii")
     label, said = board.fly(*board.unit_words("knightcube.service"))
@@ -433,7 +435,7 @@ def test_the_link_counts_its_own_starts_and_falls_back_alone(board: FakeBoard) -
 
 
 @pytest.mark.parametrize("program", ["run", "link"])
-def test_what_fly_imports_as_a_trial_is_what_the_installer_imports(program: str) -> None:
+def test_fly_and_the_installer_try_to_import_the_same_modules(program: str) -> None:
     text = (DEPLOY / "fly").read_text(encoding="utf-8")
     (modules,) = re.findall(rf"^    {program}\) modules='(.*)' ;;$", text, re.MULTILINE)
     assert modules in (DEPLOY / "build_release.py").read_text(encoding="utf-8")

@@ -80,7 +80,7 @@ def image(installed: Image, tmp_path: Path) -> Image:
     return Image(tmp_path / "image", installed.environment)
 
 
-def test_everything_is_put_in_its_place_once(image: Image) -> None:
+def test_a_second_installation_changes_no_file_and_an_uninstallation_removes_them(image: Image) -> None:
     assert image.text("etc/modules-load.d/knightcube.conf").splitlines()[-1] == "i2c-dev"
     assert "\nRuntimeWatchdogSec=10\n" in image.text("etc/systemd/system.conf.d/knightcube.conf")
     assert image.config.read_bytes() == TESTBED.read_bytes()
@@ -136,7 +136,7 @@ def test_the_checksum_is_one_that_sha256sum_checks(image: Image) -> None:
     assert subprocess.run(words, cwd=image.sum.parent, capture_output=True, check=False).returncode == 0
 
 
-def test_an_update_accepts_no_changed_configuration_but_accept_does(image: Image, tmp_path: Path) -> None:
+def test_only_the_option_accept_accepts_a_changed_configuration(image: Image, tmp_path: Path) -> None:
     image.config.write_text(corrupted(TESTBED.read_text(encoding="utf-8"), 1, 7), encoding="utf-8")
     status, output = image.install()
     assert status == 2
@@ -149,7 +149,7 @@ def test_an_update_accepts_no_changed_configuration_but_accept_does(image: Image
     assert image.install()[0] == 0
 
 
-def test_what_cannot_be_flown_is_not_accepted(image: Image) -> None:
+def test_an_invalid_configuration_is_not_accepted(image: Image) -> None:
     accepted = image.sum.read_bytes()
     image.config.write_text("name: [", encoding="utf-8")
     status, output = image.call("--accept")
@@ -158,7 +158,7 @@ def test_what_cannot_be_flown_is_not_accepted(image: Image) -> None:
     assert image.sum.read_bytes() == accepted
 
 
-def test_another_configuration_than_the_installed_one_is_refused(image: Image) -> None:
+def test_a_configuration_other_than_the_installed_one_is_refused(image: Image) -> None:
     status, output = image.install("--config", str(CONFIG))
     assert status == 2
     assert f"another one is flown; put yours there first: rm {image.config}" in output
@@ -190,7 +190,7 @@ def test_device_names_that_were_edited_survive_an_update(image: Image) -> None:
         ("{device: {driver: v4l2, pixel_format: Y16}, star_tracker: {}}", True),
     ],
 )
-def test_the_sky_index_is_made_where_the_configuration_wants_one_however_it_is_written(
+def test_the_sky_index_is_built_if_the_configuration_has_a_star_tracker(
     image: Image, tmp_path: Path, camera: str, wanted: bool
 ) -> None:
     shutil.copy(changed_testbed(tmp_path, camera=camera), image.config)

@@ -44,7 +44,7 @@ def _flown(board: FakeBoard, times: int) -> list[str]:
     return [board.fly()[0] for _ in range(times)]
 
 
-def test_a_new_release_that_is_never_proven_gives_way_to_the_old_one_which_reports_it(
+def test_after_three_failed_starts_of_a_new_release_the_old_one_flies_and_reports_it(
     board: FakeBoard,
 ) -> None:
     assert _flown(board, 3) == ["new", "new", "new"]
@@ -55,7 +55,7 @@ def test_a_new_release_that_is_never_proven_gives_way_to_the_old_one_which_repor
     assert _flown(board, 5) == ["new"] * 5, "proven: power cuts no longer count"
 
 
-def test_a_release_that_ends_by_itself_has_its_starts_forgiven(board: FakeBoard) -> None:
+def test_the_end_of_a_flight_resets_the_count_of_starts(board: FakeBoard) -> None:
     assert _flown(board, 2) == ["new", "new"]
     FlownRelease({NAME: SECOND, "STATE_DIRECTORY": str(board.root / "state")}).end()
     assert _flown(board, 3) == ["new", "new", "new"]
@@ -70,7 +70,7 @@ DAMAGED = (
 
 
 @pytest.mark.parametrize("content", DAMAGED)
-def test_a_damaged_record_of_the_starts_keeps_nothing_from_flying(board: FakeBoard, content: str) -> None:
+def test_a_damaged_record_of_the_starts_does_not_prevent_the_flight(board: FakeBoard, content: str) -> None:
     (board.root / "state").mkdir()
     (board.root / "state" / TRIALS).write_text(content, encoding="ascii")
     assert _flown(board, 1) == ["new"]
@@ -80,7 +80,7 @@ def test_a_damaged_record_of_the_starts_keeps_nothing_from_flying(board: FakeBoa
 
 
 @pytest.mark.parametrize("content", DAMAGED[1:-1])
-def test_a_wrong_record_with_a_right_checksum_keeps_nothing_from_flying(
+def test_a_wrong_record_with_a_valid_checksum_does_not_prevent_the_flight(
     board: FakeBoard, content: str
 ) -> None:
     assert releases.record(content).encode() == to_record(content.encode())
@@ -93,7 +93,7 @@ def _ours(board: FakeBoard, link: str) -> Path:
     return board.prefix / link / "venv/lib/python3/site-packages/flight/label"
 
 
-def test_a_damaged_release_gives_way_to_a_whole_one_but_flies_where_there_is_none(board: FakeBoard) -> None:
+def test_a_damaged_release_is_replaced_unless_none_is_intact(board: FakeBoard) -> None:
     _ours(board, "current").write_text("nEw", encoding="ascii")
     label, complaint = board.fly()
     assert label == "old"
@@ -134,7 +134,7 @@ def test_verify_fails_if_a_link_does_not_point_to_a_complete_release(board: Fake
     assert verify() == (1, f"current: none {releases.INCOMPLETE}\nprevious: none\n")
 
 
-def test_of_libraries_the_size_is_compared_at_a_start_and_the_content_on_request(board: FakeBoard) -> None:
+def test_the_size_of_libraries_is_compared_at_a_start_and_their_content_on_request(board: FakeBoard) -> None:
     library = board.prefix / "current/venv/lib/python3/site-packages/numpy/numpy.py"
     library.write_text("NUMPY\n", encoding="ascii")
     current = releases.linked(board.prefix, "current")
@@ -161,7 +161,7 @@ def test_rollback_flies_the_previous_release_and_back_again(board: FakeBoard) ->
         assert board.fly()[0] == label
 
 
-def test_an_update_keeps_two_releases_and_a_second_run_of_it_none_more(board: FakeBoard) -> None:
+def test_an_update_keeps_two_releases_also_if_it_is_repeated(board: FakeBoard) -> None:
     board.install("newest")
     before = sorted((board.prefix / "releases").iterdir())
     board.install("newest")
@@ -216,7 +216,7 @@ def test_a_release_that_fails_its_self_test_changes_nothing(board: FakeBoard) ->
     assert board.fly()[0] == "newest"
 
 
-def test_a_flight_without_a_release_has_nothing_to_prove(tmp_path: Path) -> None:
+def test_a_flight_without_a_release_stores_no_record(tmp_path: Path) -> None:
     release = FlownRelease({"STATE_DIRECTORY": str(tmp_path), NOTE: ""})
     with ExitStack() as stack:
         release.serve(None, stack)  # type: ignore[arg-type] # no ticker is asked for

@@ -60,7 +60,7 @@ def test_a_confirmed_configuration_stays(board: RenewedBoard) -> None:
     assert board.flown() == before, "the version before is kept for the ground"
 
 
-def test_without_confirmation_the_time_with_power_decides(board: RenewedBoard) -> None:
+def test_an_unconfirmed_trial_ends_after_its_powered_time(board: RenewedBoard) -> None:
     before, request = board.flown(), activated(board, hours=1.0)
     board.step(3500.0)
     assert board.flown() == "second"
@@ -77,7 +77,7 @@ def test_without_confirmation_the_time_with_power_decides(board: RenewedBoard) -
 
 
 @pytest.mark.parametrize("unit", ["knightcube.service", "knightcube-link.service"])
-def test_a_unit_that_does_not_come_up_ends_the_trial(board: RenewedBoard, unit: str) -> None:
+def test_a_unit_that_does_not_start_ends_the_trial(board: RenewedBoard, unit: str) -> None:
     before, request = board.flown(), activated(board)
     board.set_active(unit, False)
     board.step(100.0)
@@ -222,7 +222,7 @@ def test_a_fault_ends_the_trial_unless_it_was_permitted(board: RenewedBoard) -> 
         ("extends", "`extends` cannot be used on a board"),
     ],
 )
-def test_what_is_not_whole_signed_and_flyable_is_refused(
+def test_bundles_that_are_damaged_unsigned_or_invalid_are_refused(
     board: RenewedBoard, damage: str, words: str
 ) -> None:
     before, path = board.flown(), board.changed("second")
@@ -252,7 +252,7 @@ def test_what_is_not_whole_signed_and_flyable_is_refused(
     assert board.flown() == before
 
 
-def test_versions_go_back_only_with_a_signature_that_says_so(board: RenewedBoard) -> None:
+def test_versions_decrease_only_with_a_signature_that_permits_it(board: RenewedBoard) -> None:
     first = board.bundle("configuration", board.changed("first"), 1)
     board.activate(first)
     board.step()
@@ -299,7 +299,7 @@ def test_the_expiry_of_a_signature_is_the_signers_choice(board: RenewedBoard) ->
     assert board.reports(request)[-1][0] == "started"
 
 
-def test_a_wrong_system_clock_bars_no_signature_while_the_mission_time_is_unknown(
+def test_a_wrong_system_clock_rejects_no_signature_while_the_mission_time_is_unknown(
     board: RenewedBoard,
 ) -> None:
     bundle = board.bundle("configuration", board.changed("second"), 1, expires="2020-01-01")
@@ -489,7 +489,7 @@ def test_a_release_that_fails_its_trial_is_never_returned_to(board: RenewedBoard
     assert board.release() == "old"
 
 
-def test_silence_leads_back_to_release_configuration_and_ground(board: RenewedBoard) -> None:
+def test_without_contact_the_board_returns_to_earlier_versions_one_after_another(board: RenewedBoard) -> None:
     ground = board.flown()
     for number, name in enumerate(("first", "second"), start=1):
         activated(board, name, number)
@@ -556,7 +556,7 @@ def test_a_request_that_is_not_a_small_regular_file_is_refused(board: RenewedBoa
 
 
 @pytest.mark.parametrize("copies", ["a", "b", "ab"])
-def test_a_damaged_copy_of_the_state_costs_nothing(board: RenewedBoard, copies: str) -> None:
+def test_the_state_survives_damage_to_one_of_its_copies(board: RenewedBoard, copies: str) -> None:
     before = board.flown()
     activated(board)
     for copy in copies:
@@ -568,7 +568,7 @@ def test_a_damaged_copy_of_the_state_costs_nothing(board: RenewedBoard, copies: 
     assert board.flown() == (before if len(copies) == 1 else "second"), "without any record the trial is lost"
 
 
-def test_one_failed_read_costs_no_state(board: RenewedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_failed_read_loses_no_state(board: RenewedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
     before = board.flown()
     activated(board)
     _fail_once(monkeypatch, renewal, "open_beneath", ["state.a"], ["state.b"])
@@ -614,7 +614,7 @@ def _fail_once(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, *wante
 
 
 @pytest.mark.parametrize("damage", ["missing", "bad sector"])
-def test_silence_leads_back_from_a_configuration_that_cannot_be_read(
+def test_without_contact_the_board_leaves_a_configuration_that_cannot_be_read(
     board: RenewedBoard, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ground = board.flown()
@@ -711,7 +711,7 @@ def test_restarts_of_one_step_are_all_executed(board: RenewedBoard) -> None:
     ]
 
 
-def test_long_texts_of_the_link_cost_no_state(board: RenewedBoard) -> None:
+def test_long_texts_of_the_link_lose_no_state(board: RenewedBoard) -> None:
     before, request = board.flown(), activated(board)
     board.request("x" * 60_000)
     board.contact(0, "s" * 20_000, fault="f" * 40_000)

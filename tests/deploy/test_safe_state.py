@@ -29,7 +29,7 @@ def packed(command: Command, number: int = 1) -> bytes:
     return CommandPacker().pack(command, number)
 
 
-def test_its_packets_are_those_of_the_tables() -> None:
+def test_packets_of_the_safe_state_agree_with_the_tables() -> None:
     assert {layout.identifier: name for name, layout in COMMANDS.items()} == safe_state.COMMANDS
     assert {name: layout.length for name, layout in COMMANDS.items()} == safe_state.LENGTHS
     layout = LAYOUTS[COMMAND.name]
@@ -69,7 +69,7 @@ def test_only_commands_are_answered(tmp_path: Path) -> None:
     assert [data for data in (b"", ping[:-1], ping + b"x", answer, *damaged) if state.answer(data, 1.0)] == []
 
 
-def test_each_try_waits_twice_as_long_until_a_flight_has_lasted(tmp_path: Path) -> None:
+def test_the_pause_doubles_with_each_try_until_a_flight_has_lasted_long_enough(tmp_path: Path) -> None:
     now, found = 0.0, []
     for _ in range(9):
         tries = safe_state.Tries(str(tmp_path), now)

@@ -60,7 +60,7 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_systemd
-def test_systemd_finds_nothing_to_complain_of(units: Path) -> None:
+def test_systemd_verifies_the_units_without_a_message(units: Path) -> None:
     words = ["systemd-analyze", "verify", *(str(units / name) for name in UNITS)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
@@ -106,7 +106,7 @@ def test_the_services_import_only_what_root_permits(name: str) -> None:
 
 
 @needs_systemd
-def test_a_radio_that_is_plugged_in_beside_a_network_costs_a_fifth(tmp_path: Path) -> None:
+def test_a_pluggable_radio_beside_a_network_has_an_exposure_of_at_most_1_2(tmp_path: Path) -> None:
     link = LINK.replace("/dev/null", "/dev/knightcube-radio")
     config = changed_testbed(tmp_path, commands="{socket: /run/knightcube/commands}", link=link)
     assert exposure(put_units(tmp_path, config) / "knightcube-link.service") <= 1.2
@@ -121,7 +121,7 @@ def test_a_link_by_one_line_is_exposed_by_at_most_1(tmp_path: Path, line: str) -
 
 
 @needs_systemd
-def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path) -> None:
+def test_a_usb3_vision_camera_beside_a_ground_link_has_an_exposure_of_at_most_1(tmp_path: Path) -> None:
     camera = "{device: {driver: aravis, name: Some-1, pixel_format: Mono16}}"
     config = changed_testbed(
         tmp_path, camera=camera, commands="{socket: /run/knightcube/commands}", link=LINK
@@ -129,7 +129,7 @@ def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path
     assert exposure(put_units(tmp_path, config) / UNITS[0]) <= 1.0
 
 
-def test_the_safe_state_listens_where_the_flight_does_and_starts_it_again(tmp_path: Path) -> None:
+def test_the_safe_state_has_the_command_socket_of_the_flight_and_restarts_the_flight(tmp_path: Path) -> None:
     config = changed_testbed(tmp_path, commands="{socket: /run/knightcube/commands}")
     assert 'Environment="KNIGHTCUBE_COMMANDS=/run/knightcube/commands"\n' in safe_dropin(config)
     assert "KNIGHTCUBE_COMMANDS" not in safe_dropin(TESTBED)
@@ -147,7 +147,7 @@ def test_a_satellite_flies_again_after_the_configured_duration_and_a_testbed_end
     assert "Restart=" not in dropin(TESTBED)
 
 
-def test_the_watchdog_leaves_room_for_four_meals() -> None:
+def test_the_watchdog_timeout_is_at_least_four_feeding_periods() -> None:
     text = (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
     (seconds,) = re.findall(r"^WatchdogSec=(\d+)$", text, re.MULTILINE)
     assert float(seconds) >= 4 * 0.25, "fed four times a second"
@@ -206,7 +206,7 @@ def test_a_devices_unit_is_named_as_systemd_does_it(path: str) -> None:
     )
 
 
-def test_the_flight_waits_for_bus_and_camera_too_which_udev_makes_units(tmp_path: Path) -> None:
+def test_the_flight_waits_for_the_units_of_bus_and_camera_too(tmp_path: Path) -> None:
     text = dropin(changed_testbed(tmp_path, camera=CAMERA, coils_bus="/dev/knightcube-i2c"))
     for name in ("i2c", "imu", "camera"):
         unit = rf"dev-knightcube\x2d{name}.device"
@@ -218,7 +218,7 @@ def test_the_flight_waits_for_bus_and_camera_too_which_udev_makes_units(tmp_path
         assert all('TAG+="systemd"' in line for line in tagged)
 
 
-def test_simulated_devices_ask_for_none_of_the_boards() -> None:
+def test_simulated_devices_need_no_device_of_the_board() -> None:
     assert "Device" not in dropin(CONFIG)
 
 
@@ -246,13 +246,13 @@ def test_the_network_is_open_only_to_the_link_and_its_peers(
         assert "IPAddressDeny=any\n" in (DEPLOY / unit).read_text(encoding="utf-8")
 
 
-def test_plain_commands_on_a_bench_open_the_machine_itself_alone(tmp_path: Path) -> None:
+def test_unprotected_udp_commands_on_a_bench_permit_loopback_only(tmp_path: Path) -> None:
     text = dropin(changed_testbed(tmp_path, commands="{udp: '127.0.0.1:5000'}"))
     assert re.findall("IPAddressAllow=(.*)", text) == ["127.0.0.0/8"]
     assert link_dropin(TESTBED) == ""
 
 
-def test_the_coils_bus_may_have_a_lasting_name_everywhere(tmp_path: Path) -> None:
+def test_the_coil_bus_may_have_a_persistent_name_in_each_unit(tmp_path: Path) -> None:
     config = changed_testbed(tmp_path, coils_bus="/dev/knightcube-i2c")
     for text in (dropin(config), safe_dropin(config)):
         assert "Environment=KNIGHTCUBE_I2C=/dev/knightcube-i2c KNIGHTCUBE_PWM=0x40\n" in text
@@ -271,7 +271,7 @@ def test_a_bus_that_is_neither_number_nor_path_is_refused(tmp_path: Path, bus: s
         dropin(changed_testbed(tmp_path, coils_bus=bus))
 
 
-def test_the_flight_opens_the_bus_by_its_lasting_name(tmp_path: Path) -> None:
+def test_the_flight_opens_the_bus_by_its_persistent_name(tmp_path: Path) -> None:
     config = changed_testbed(tmp_path, coils_bus="/dev/knightcube-nowhere")
     with pytest.raises(NotResponding, match="/dev/knightcube-nowhere: no such bus"):
         fly(RunRequest(config, tmp_path / "run"))
@@ -295,7 +295,7 @@ def board(folder: Path, below: str) -> Path:
     return folder
 
 
-def test_what_hangs_on_usb_is_let_through_whatever_number_it_comes_back_with(tmp_path: Path) -> None:
+def test_a_usb_device_is_permitted_with_any_device_number(tmp_path: Path) -> None:
     """`DeviceAllow` with a file permits only the device number of this file at the start of the unit.
 
     `DeviceAllow` with a class, such as char-ttyUSB, permits all devices of a driver.
@@ -307,7 +307,7 @@ def test_what_hangs_on_usb_is_let_through_whatever_number_it_comes_back_with(tmp
     assert board_dropin.allowed("/dev/null", board_dropin.SERIAL, fixed) == [node]
 
 
-def test_the_link_sees_of_all_devices_its_line_alone_unless_that_may_come_back_as_another(
+def test_the_link_sees_only_its_line_unless_the_device_of_the_line_is_pluggable(
     tmp_path: Path,
 ) -> None:
     config = changed_testbed(tmp_path, commands="{socket: /run/x}", link=LINK)
@@ -317,7 +317,7 @@ def test_the_link_sees_of_all_devices_its_line_alone_unless_that_may_come_back_a
     assert "DeviceAllow=/dev/null rw\nPrivateDevices=yes\nBindPaths=/dev/null\n" in soldered
 
 
-def test_what_is_not_there_yet_is_let_through_as_what_it_may_be(tmp_path: Path) -> None:
+def test_absent_devices_are_permitted_by_their_possible_classes(tmp_path: Path) -> None:
     text = dropin(changed_testbed(tmp_path, camera=CAMERA))
     for name in ("ttyUSB", "ttyACM", "video4linux"):
         assert f"DeviceAllow=char-{name} rw\n" in text
@@ -331,7 +331,7 @@ def test_what_is_not_there_yet_is_let_through_as_what_it_may_be(tmp_path: Path) 
         ("{driver: aravis, name: Some-1, pixel_format: Mono16}", "char-usb_device"),
     ],
 )
-def test_the_dropin_lets_the_configured_camera_through(tmp_path: Path, device: str, allowed: str) -> None:
+def test_the_dropin_permits_the_configured_camera(tmp_path: Path, device: str, allowed: str) -> None:
     config = changed_testbed(tmp_path, camera=f"{{device: {device}}}")
     assert f"DeviceAllow={allowed} rw\n" in dropin(config)
 
@@ -352,7 +352,7 @@ def test_shellcheck_is_silent() -> None:
     assert subprocess.run(words, capture_output=True, text=True, check=False).stdout == ""
 
 
-def test_every_udev_rule_is_of_matches_and_assignments() -> None:
+def test_every_udev_rule_consists_of_matches_and_assignments() -> None:
     rules = (DEPLOY / "99-knightcube.rules").read_text(encoding="utf-8").splitlines()
     term = re.compile(r'[A-Z_]+(\{[^}]+\})?(==|!=|=|\+=)"[^"]*"')
     lines = [line for line in rules if line and not line.startswith("# ")]

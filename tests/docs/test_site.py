@@ -37,7 +37,7 @@ def test_the_page_of_the_library_links_every_exported_name() -> None:
     assert all(hasattr(import_module(module), name) for name, module in linked.items())
 
 
-def test_every_picture_stands_in_the_gallery_with_its_command() -> None:
+def test_every_picture_is_in_the_gallery_with_its_command() -> None:
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"\]\(pictures/(\w+\.png)\)", page))
     assert shown == {path.name for path in (ROOT / "docs" / "pictures").glob("*.png")}

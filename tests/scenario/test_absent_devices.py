@@ -34,7 +34,7 @@ def give_back(lock: LockStep, device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_it_is_awaited_in_boot_and_flown_when_it_comes(tmp_path: Path, device: str) -> None:
+def test_an_absent_device_is_awaited_in_boot_and_used_when_it_appears(tmp_path: Path, device: str) -> None:
     def prepare(rigged: Rigged) -> None:
         rigged.at(4.0, lambda: give_back(rigged.lock, device))
 
@@ -51,7 +51,7 @@ def test_it_is_awaited_in_boot_and_flown_when_it_comes(tmp_path: Path, device: s
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_on_a_bench_it_is_an_error_at_once(tmp_path: Path, device: str) -> None:
+def test_an_absent_device_is_an_error_at_once_on_a_bench(tmp_path: Path, device: str) -> None:
     config = demo_config(1.0, camera=False)
     with ExitStack() as stack, opened_lockstep(config, demo_world(), tmp_path) as lock:
         take_away(lock, device)

@@ -31,7 +31,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly(config, tmp_path_factory.mktemp("cage"), section=section)
 
 
-def test_the_slew_ends_where_it_should_by_both_coils(flown: Run) -> None:
+def test_both_coils_bring_the_slew_to_its_target(flown: Run) -> None:
     attitude = true_attitude(flown)
     assert attitude is not None
     end = attitude.time > 30.0
@@ -42,7 +42,7 @@ def test_the_slew_ends_where_it_should_by_both_coils(flown: Run) -> None:
     assert set(event_names(flown)) <= {"started", "target", "stopped"}
 
 
-def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) -> None:
+def test_the_magnetometer_measures_the_field_of_the_cage_in_body_axes(flown: Run) -> None:
     """The magnetometer measures the field of the cage, rotated by the attitude of the body.
 
     By the table of `OrbitField`, the initial field of 0.225 mT is 67 deg from -z. The body is at 23 deg.
@@ -54,7 +54,7 @@ def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) ->
     assert towards == pytest.approx(67.0 + np.degrees(2.0 * np.arcsin(0.2)), abs=3.0)
 
 
-def test_the_world_cage_needs_its_sections(tmp_path: Path) -> None:
+def test_a_world_with_a_cage_needs_the_sections_of_the_cage(tmp_path: Path) -> None:
     config, section = _cage()
     with pytest.raises(ConfigError, match=r"simulation.cage.*is missing"):
         fly(config, tmp_path, section=configuration.replace(section, cage=None))

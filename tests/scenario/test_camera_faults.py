@@ -23,7 +23,7 @@ def flown(folder: Path, mode: str, fault: str = "") -> Run:
     return fly(config, folder, section=replace(demo_world(), faults=faults))
 
 
-def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
+def test_a_healthy_camera_raises_no_alarm(tmp_path: Path) -> None:
     run = flown(tmp_path, "hold")
     assert not ABOUT_VISION & set(event_names(run))
     assert len(run["stars"]) == 4
@@ -37,7 +37,7 @@ def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
         ("vision: slow", "vision-slow", 2.5),
     ],
 )
-def test_what_is_late_is_reported_with_the_next_frame(
+def test_a_late_result_is_reported_with_the_next_frame(
     fault: str, event: str, within: float, tmp_path: Path
 ) -> None:
     """A late result is reported at the next frame. The camera exposes a frame every 2 s."""
@@ -49,9 +49,7 @@ def test_what_is_late_is_reported_with_the_next_frame(
 @pytest.mark.parametrize(
     ("fault", "event"), [("camera: torn", "camera-torn"), ("camera: wrong", "camera-strange")]
 )
-def test_a_frame_that_is_not_in_order_is_reported_and_not_believed(
-    fault: str, event: str, tmp_path: Path
-) -> None:
+def test_a_torn_or_wrong_frame_is_reported_and_not_used(fault: str, event: str, tmp_path: Path) -> None:
     run = flown(tmp_path, "safe", fault)
     assert AT < event_time(run, event) < AT + 2.0
     streak = run["streak"]

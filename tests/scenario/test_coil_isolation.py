@@ -61,7 +61,7 @@ def torque(currents: FloatArray, quaternions: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(("fault", "within"), [("coil-x: open", 6.0), ("bridge-x: a-high", 6.0)])
-def test_an_axis_that_breaks_is_left_out_and_the_others_keep_the_direction_of_the_torque(
+def test_a_broken_coil_is_left_out_and_the_others_keep_the_direction_of_the_torque(
     fault: str, within: float, tmp_path: Path
 ) -> None:
     run, wishes = flown(fault, tmp_path, 16.0)
@@ -109,7 +109,7 @@ def test_a_coil_that_a_stuck_leg_drives_in_safe_is_reported_braked_and_left_out(
     assert np.count_nonzero(carried[:, 2]) * 0.025 < 1.6
 
 
-def test_a_sound_flight_in_safe_brakes_nothing(tmp_path: Path) -> None:
+def test_a_healthy_flight_in_safe_brakes_no_bridge(tmp_path: Path) -> None:
     run, _ = flown("disk: full", tmp_path, 8.0, initial="safe")
     assert not {"coil-suspect", "coil-broken"} & set(event_names(run))
     assert not run["truth"]["current"].any()

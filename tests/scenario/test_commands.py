@@ -51,7 +51,7 @@ def test_each_command_is_obeyed_recorded_and_answered(tmp_path: Path) -> None:
     assert event_names(run).count("commanded") == 2, "reported at once, the others at the end: throttled"
 
 
-def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(tmp_path: Path) -> None:
+def test_invalid_and_repeated_packets_are_refused_with_the_reason_and_change_nothing(tmp_path: Path) -> None:
     (hold,) = packed(ChangeMode(Mode.HOLD))
     broken = bytes([*hold[:-1], hold[-1] ^ 1])
     run, channel = said(tmp_path, (1.0, b"abort!"), (1.2, broken), (1.4, b""), (1.6, hold), (2.0, hold))
@@ -75,7 +75,7 @@ def test_control_characters_are_shown_escaped(tmp_path: Path) -> None:
     assert to_text(run["command"][0]["text"]) == "mode safe: smoke\\x1b[2J\\n"
 
 
-def test_nothing_latched_is_nothing_to_clear(tmp_path: Path) -> None:
+def test_a_clear_command_for_an_event_that_is_not_latched_is_refused(tmp_path: Path) -> None:
     (clear,) = packed(Clear("too-hot"))
     run, _ = said(tmp_path, (1.0, clear))
     (row,) = run["command"]
@@ -94,7 +94,7 @@ def test_a_defect_of_a_command_is_contained(tmp_path: Path, monkeypatch: pytest.
     assert "task-failed" not in event_names(run)
 
 
-def test_without_commands_configured_there_is_no_group_for_them(tmp_path: Path) -> None:
+def test_without_configured_commands_no_rate_group_runs_for_them(tmp_path: Path) -> None:
     run = fly(demo_config(1.5, camera=False), tmp_path)
     groups = {to_text(name) for name in run["rate_group"]["name"]}
     assert groups == {"control", "planning", "health", "housekeeping"}

@@ -88,7 +88,7 @@ def slewing(duration: float) -> TestbedConfig:
     ],
     ids=["demonstration", "thesis", "hold", "slew", "detumble"],
 )
-def test_whatever_takes_the_readings_away_no_coil_carries_current_a_tenth_of_a_second_later(
+def test_no_coil_carries_current_a_tenth_of_a_second_after_the_last_usable_reading(
     tmp_path: Path, configured: Callable[[float], TestbedConfig], rate: float, losses: tuple[str, ...]
 ) -> None:
     # The worst cases are a loss just after a reading, and a loss just after the start of a detumbling window.
@@ -122,7 +122,7 @@ def test_a_silent_unit_is_reported_at_its_age_limit(tmp_path: Path, initial: str
     assert event_time(run, "control-lost") - SILENT_AT < 0.1 + CYCLE
 
 
-def test_the_model_carries_the_estimate_on_and_its_error_stays_within_what_the_covariance_says(
+def test_the_error_of_the_propagated_estimate_stays_within_four_sigma(
     tmp_path: Path,
 ) -> None:
     run = fly(demo_config(5.0, camera=False), tmp_path, silence)
@@ -145,7 +145,7 @@ def test_a_hold_that_is_declared_impossible_ends_at_once(tmp_path: Path) -> None
     assert currents(run, lost + WITHIN, 5.0).max() == 0.0
 
 
-def test_with_the_planner_gone_and_no_readings_nothing_is_flown_to_its_end(tmp_path: Path) -> None:
+def test_without_planner_and_readings_no_path_is_followed_to_its_end(tmp_path: Path) -> None:
     """If the readings stop, no coil is driven along a planned path, even without a planner.
 
     A planned path is tracked only while readings arrive.
@@ -156,7 +156,7 @@ def test_with_the_planner_gone_and_no_readings_nothing_is_flown_to_its_end(tmp_p
     assert currents(run, SILENT_AT + WITHIN, 6.0).max() == 0.0
 
 
-def test_with_the_planner_gone_and_no_path_the_coils_stay_at_zero(tmp_path: Path) -> None:
+def test_without_planner_and_path_the_coils_stay_at_zero(tmp_path: Path) -> None:
     steps = ({"at": 1.0, "mode": "safe"}, {"at": 2.0, "slew": 0.0})
     config = commanded(8.0, *steps, slew_limit=3.0)
     run = fly(config, tmp_path, planner_latency=4.0)

@@ -89,7 +89,7 @@ def power(demonstration: Run) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_it_is_flown_whole_with_every_cycle_and_no_alarm(demonstration: Run) -> None:
+def test_the_demonstration_is_complete_with_every_cycle_and_no_alarm(demonstration: Run) -> None:
     run = demonstration
     assert len(run["control"]) == len(STARTS) * HELD * 40
     names = set(run["event"]["name"].tolist())
@@ -99,7 +99,7 @@ def test_it_is_flown_whole_with_every_cycle_and_no_alarm(demonstration: Run) -> 
 
 
 @pytest.mark.slow
-def test_it_keeps_within_table_5_3_on_the_true_attitude(
+def test_the_true_attitude_meets_the_limits_of_table_5_3(
     summary: dict[str, Any], power: dict[str, float]
 ) -> None:
     """The true attitude stays within the limits of Sease 2013, Table 5.3: 4.5 deg, 20 %, 8 s and 30 s.
@@ -119,7 +119,9 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(
 
 
 @pytest.mark.slow
-def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any], power: dict[str, float]) -> None:
+def test_the_demonstration_is_nearly_as_good_as_the_physics_permits(
+    summary: dict[str, Any], power: dict[str, float]
+) -> None:
     """The demonstration is nearly as good as the physics permits, with all simulated noise.
 
     The errors are angles from the target to the true attitude. R I^2 is compared with the optimum of the true
@@ -141,7 +143,7 @@ def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
 
 
 @pytest.mark.slow
-def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
+def test_the_errors_of_the_estimate_agree_with_its_sigmas(demonstration: Run) -> None:
     """The errors of angle and rate agree with their sigmas in 8,200 cycles.
 
     The test checks the fraction within 3 sigma, and rms / sigma.
@@ -189,7 +191,7 @@ def _assert_streaks_right(run: Run, moving: int) -> None:
 
 
 @pytest.mark.slow
-def test_every_frame_gives_an_attitude_that_the_estimate_takes(demonstration: Run) -> None:
+def test_every_frame_gives_an_attitude_that_the_filter_accepts(demonstration: Run) -> None:
     """Every frame gives an attitude that the filter accepts.
 
     The first frame has streaks of 300 px, from the release at 0.1 rad/s.
@@ -205,7 +207,7 @@ def test_every_frame_gives_an_attitude_that_the_estimate_takes(demonstration: Ru
 
 
 @pytest.mark.slow
-def test_the_star_attitudes_are_as_good_as_they_say(demonstration: Run) -> None:
+def test_the_errors_of_the_star_attitudes_agree_with_their_covariances(demonstration: Run) -> None:
     """The mean normalised squared error of the star attitudes is below its upper bound.
 
     The mean normalised squared error about the suspension thread, the only rotation axis, is also above a
@@ -237,7 +239,7 @@ def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
+def test_the_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
     demonstration: Run,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

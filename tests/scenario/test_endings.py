@@ -15,7 +15,7 @@ def test_the_configured_end(tmp_path: Path) -> None:
     assert abs(run["control"]["current_written"][-1, 0]) > 0.0, "the coils were in use until then"
 
 
-def test_a_polite_stop(tmp_path: Path) -> None:
+def test_a_requested_stop(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         rigged.at(2.0, lambda: rigged.loop.stop("asked to"))
 
@@ -25,7 +25,7 @@ def test_a_polite_stop(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, MemoryError])
-def test_an_exception_that_nobody_contains(tmp_path: Path, error: type[BaseException]) -> None:
+def test_an_exception_that_ends_the_process(tmp_path: Path, error: type[BaseException]) -> None:
     def prepare(rigged: Rigged) -> None:
         def fail() -> None:
             raise error("in the middle of a flight")

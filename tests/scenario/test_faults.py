@@ -74,7 +74,7 @@ def test_a_sound_flight_raises_no_alarm(sound: Run) -> None:
     ],
     ids=["silence", "garbage"],
 )
-def test_a_line_without_packets_loses_control_and_the_coils_are_off_until_they_come_again(
+def test_the_coils_are_off_while_the_line_delivers_no_packets(
     tmp_path: Path, faults: LineFaults, events: list[str]
 ) -> None:
     run = fly(demo_config(LONG, camera=False), tmp_path, line(faults), section=AT_TARGET)
@@ -87,7 +87,7 @@ def test_a_line_without_packets_loses_control_and_the_coils_are_off_until_they_c
     assert abs(final) < np.radians(4.5)
 
 
-def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_it(tmp_path: Path) -> None:
+def test_after_a_silence_of_a_second_the_estimate_continues_from_its_prediction(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         wire = rigged.lock.line.to_host
         for begin in (4.0, 14.0):
@@ -119,7 +119,7 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
     [LineFaults(cut_probability=0.3), LineFaults(flip_probability=3e-4)],
     ids=["cut packets", "flipped bits"],
 )
-def test_some_bad_packets_are_reported_and_flown_through(tmp_path: Path, faults: LineFaults) -> None:
+def test_some_damaged_packets_are_reported_and_do_not_end_control(tmp_path: Path, faults: LineFaults) -> None:
     run = fly(demo_config(DURATION, camera=False), tmp_path, line(faults))
     names = event_names(run)
     assert "imu-corrupt" in names
@@ -188,7 +188,7 @@ def test_an_unplugged_port_is_reported_and_the_coils_go_to_zero(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("fault", ["nack", "hang", "lose_arbitration"])
-def test_a_bus_that_fails_is_reported_and_flown_again_when_it_is_back(tmp_path: Path, fault: str) -> None:
+def test_a_bus_that_fails_is_reported_and_used_again_after_its_recovery(tmp_path: Path, fault: str) -> None:
     def prepare(rigged: Rigged) -> None:
         bus = rigged.lock.hardware.bus
 
@@ -212,7 +212,7 @@ def test_a_bus_that_fails_is_reported_and_flown_again_when_it_is_back(tmp_path: 
     assert abs(final) < np.radians(4.5)
 
 
-def test_a_chip_that_keeps_its_outputs_leads_the_estimate_astray_no_more_than_a_silent_one(
+def test_a_chip_that_keeps_its_outputs_causes_no_larger_error_than_a_silent_one(
     tmp_path: Path,
 ) -> None:
     """A PWM chip that keeps its outputs causes no larger error of the estimate than a chip that is silent.
@@ -245,7 +245,7 @@ def test_a_brown_out_of_the_pwm_chip_is_mended(tmp_path: Path) -> None:
     ("fault", "event"),
     [("black", "camera-black"), ("saturated", "camera-saturated"), ("frozen", "camera-frozen")],
 )
-def test_a_camera_that_shows_nothing_true_is_reported_and_gives_no_rate(
+def test_a_camera_with_false_images_is_reported_and_gives_no_rate(
     tmp_path: Path, fault: str, event: str
 ) -> None:
     def prepare(rigged: Rigged) -> None:
@@ -285,7 +285,7 @@ def test_a_frame_that_comes_late_is_not_accepted_as_fresh(tmp_path: Path, max_ag
     assert "camera-recovered" not in event_names(run)
 
 
-def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -> None:
+def test_a_stall_of_the_loop_is_counted_once_and_the_flight_continues(tmp_path: Path) -> None:
     """A stall of the loop for 1 s gives one event and 40 lost slots, which are not made up.
 
     The coil currents decay during the stall.

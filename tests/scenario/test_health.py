@@ -53,7 +53,9 @@ def last(run: Run, field: str) -> float:
     return float(run["health"][field][-1])
 
 
-def test_a_sound_flight_feeds_four_times_a_second_and_beats_every_cycle(tmp_path: Path) -> None:
+def test_a_healthy_flight_feeds_the_watchdog_four_times_a_second_and_beats_every_cycle(
+    tmp_path: Path,
+) -> None:
     signs = Signs()
     run = fly(demo_config(5.0, camera=False), tmp_path, signs.watch)
     assert len(signs.fed) == 20
@@ -70,7 +72,9 @@ def test_a_sound_flight_feeds_four_times_a_second_and_beats_every_cycle(tmp_path
     assert math.isnan(last(run, "cpu_share")), "in lock-step the board says nothing of the flight"
 
 
-def test_a_control_task_that_only_fails_beats_no_more_and_starves_the_watchdog(tmp_path: Path) -> None:
+def test_a_control_task_that_only_fails_sends_no_heartbeat_and_does_not_feed_the_watchdog(
+    tmp_path: Path,
+) -> None:
     signs = Signs()
 
     def prepare(rigged: Rigged) -> None:
@@ -86,7 +90,7 @@ def test_a_control_task_that_only_fails_beats_no_more_and_starves_the_watchdog(t
     assert int(last(run, "facts")) >> FACTS.index(TASK_FAILING) & 1
 
 
-def test_it_beats_and_is_fed_again_when_the_task_runs_again(tmp_path: Path) -> None:
+def test_heartbeats_and_feeding_resume_when_the_task_runs_again(tmp_path: Path) -> None:
     signs = Signs()
 
     def prepare(rigged: Rigged) -> None:
@@ -142,7 +146,7 @@ def test_too_much_memory_ends_the_flight_in_order_and_requests_a_restart(tmp_pat
         assert log.intact
 
 
-def test_a_wall_clock_that_is_set_is_reported_and_moves_nothing(tmp_path: Path) -> None:
+def test_a_step_of_the_wall_clock_is_reported_and_has_no_effect(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         clock = rigged.lock.clock
         rigged.at(2.0, lambda: setattr(clock, "_utc_start_ns", clock._utc_start_ns - 3600 * SECOND))
@@ -154,7 +158,7 @@ def test_a_wall_clock_that_is_set_is_reported_and_moves_nothing(tmp_path: Path) 
     assert run["control"].tobytes() == sound["control"].tobytes()
 
 
-def test_in_safe_the_heart_beats_on_and_the_watchdog_is_fed(tmp_path: Path) -> None:
+def test_in_safe_heartbeats_continue_and_the_watchdog_is_fed(tmp_path: Path) -> None:
     signs = Signs()
     fly(commanded(3.0, initial="safe"), tmp_path, signs.watch)
     assert len(signs.fed) == 12

@@ -25,7 +25,7 @@ def commands_of(target: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", SECONDS)
-def test_a_target_flies_and_judges_its_flight(
+def test_a_make_target_flies_and_evaluates_its_flight(
     target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "config").symlink_to(ROOT / "config")

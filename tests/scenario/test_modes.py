@@ -37,7 +37,7 @@ def test_the_demonstration_is_what_flies_by_default_after_one_cycle_of_boot(tmp_
     assert event_names(run) == ["started", "target", "stopped"]
 
 
-def test_boot_keeps_the_coils_at_zero_until_the_unit_speaks(tmp_path: Path) -> None:
+def test_boot_keeps_the_coils_at_zero_until_the_inertial_unit_sends(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         wire = rigged.lock.line.to_host
         rigged.at(-0.2, lambda: setattr(wire, "faults", LineFaults(silent=True)))
@@ -54,7 +54,7 @@ def test_boot_keeps_the_coils_at_zero_until_the_unit_speaks(tmp_path: Path) -> N
     assert (answer["obeyed"], to_text(answer["text"])) == (0, "mode hold: not while in boot")
 
 
-def test_safe_never_moves_a_coil_and_is_left_by_command_only(tmp_path: Path) -> None:
+def test_safe_drives_no_coil_and_is_left_by_command_only(tmp_path: Path) -> None:
     run = fly(commanded(6.0, {"at": 4.0, "slew": 0.0}, initial="safe"), tmp_path)
     assert modes_of(run) == [Mode.BOOT, Mode.SAFE, Mode.SLEW]
     assert currents(run, -1.0, 4.0).max() == 0.0
@@ -108,7 +108,7 @@ def test_a_slew_that_does_not_arrive_becomes_a_hold(tmp_path: Path) -> None:
     assert "slew-late" in event_names(run)
 
 
-def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
+def test_detumbling_reduces_the_rate_monotonically(tmp_path: Path) -> None:
     """Detumbling reduces the rate monotonically, from 0.5 rad/s with the coils x and z.
 
     The field is measured while the coils are off.
@@ -182,7 +182,7 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
     assert currents(run, entered(run, Mode.SAFE) + 0.1, 15.0).max() == 0.0
 
 
-def test_what_the_demonstration_is_on_its_way_to_and_a_target_that_moves_are_not_impossible_to_hold(
+def test_a_target_that_is_approached_or_moves_is_not_reported_as_impossible_to_hold(
     tmp_path: Path,
 ) -> None:
     """A target that is being approached, or that moves, is not reported as impossible to hold.
@@ -205,7 +205,7 @@ def test_a_body_spun_up_in_the_demonstration_is_detumbled(tmp_path: Path) -> Non
     assert "tumbling" in event_names(run)
 
 
-def test_what_led_to_safe_and_is_latched_bars_the_way_out_until_it_is_cleared(tmp_path: Path) -> None:
+def test_a_latched_cause_of_safe_prevents_other_modes_until_it_is_cleared(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         def fail(*_: object) -> None:
             raise ZeroDivisionError
@@ -270,7 +270,7 @@ def keeper_of(folder: Path) -> StateKeeper:
     return StateKeeper(StateStore(folder, notices.report), notices, SimClock(), period_ns=10_000_000_000)
 
 
-def test_every_mode_is_reached_by_command_and_the_demonstration_goes_on_where_it_is_due(
+def test_every_mode_is_reached_by_command_and_the_demonstration_continues_on_schedule(
     tmp_path: Path,
 ) -> None:
     steps: list[dict[str, Any]] = [

@@ -74,7 +74,7 @@ def assert_survived(run: Run, driven: Driven, written: set[str]) -> None:
     assert run["housekeeping"]["records_lost"][-1] == lost
 
 
-def test_every_integer_of_the_testbed_may_pass_its_end(
+def test_every_integer_of_the_testbed_may_exceed_its_range(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     driven = drive(monkeypatch)
@@ -103,7 +103,7 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
     assert_survived(run, driven, {packet.name for packet in PACKETS} - elsewhere)
 
 
-def test_every_integer_of_an_object_s_track_may_pass_its_end(
+def test_every_integer_of_the_track_of_an_object_may_exceed_its_range(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     driven = drive(monkeypatch)
@@ -111,7 +111,9 @@ def test_every_integer_of_an_object_s_track_may_pass_its_end(
     assert_survived(run, driven, _OF_OBJECTS)
 
 
-def test_every_integer_of_an_orbit_may_pass_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_integer_of_an_orbit_may_exceed_its_range(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     driven = drive(monkeypatch)
     run = fly(configuration.replace(orbit_config(4.0), camera=None), tmp_path, section=world(0.1))
     assert_survived(run, driven, {"spin", "navigation"})

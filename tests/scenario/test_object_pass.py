@@ -70,7 +70,7 @@ def _followed(run: Run) -> float:
     return float(events["time_ns"][index]) * 1e-9
 
 
-def test_it_is_found_once_and_never_lost(flown: Run) -> None:
+def test_the_object_is_found_once_and_never_lost(flown: Run) -> None:
     names = event_names(flown)
     assert names.count("object-found") == names.count("object-followed") == 1
     assert names.count("camera-lost") == names.count("camera-recovered") == 1
@@ -79,7 +79,7 @@ def test_it_is_found_once_and_never_lost(flown: Run) -> None:
     assert _followed(flown) < 35.0
 
 
-def test_it_is_kept_in_the_field_and_followed_while_the_camera_is_off(flown: Run) -> None:
+def test_the_object_is_kept_in_the_field_and_followed_while_the_camera_is_off(flown: Run) -> None:
     truth = flown["truth"]
     times = truth["time_ns"] * 1e-9
     after = times > _followed(flown)
@@ -94,7 +94,7 @@ def test_it_is_kept_in_the_field_and_followed_while_the_camera_is_off(flown: Run
     assert turn.min() > 0.3
 
 
-def test_its_track_is_where_the_object_is_to_what_it_claims(flown: Run) -> None:
+def test_the_errors_of_the_track_agree_with_its_covariance(flown: Run) -> None:
     track = flown["track"]
     again = track["middle_ns"] * 1e-9 > BLIND + GAP
     assert track["seen"][again].mean() > 0.8

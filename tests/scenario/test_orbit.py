@@ -42,7 +42,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly(config, tmp_path_factory.mktemp("orbit"), section=world(SPEED, silence))
 
 
-def test_it_detumbles_rests_and_is_braked_again_when_it_turns_too_fast(flown: Run) -> None:
+def test_the_satellite_detumbles_rests_and_detumbles_again_if_it_rotates_too_fast(flown: Run) -> None:
     assert modes_of(flown)[:4] == [Mode.BOOT, Mode.DETUMBLE, Mode.ACQUIRE, Mode.DETUMBLE]
     assert speed(flown)[0] == pytest.approx(SPEED, rel=0.05)
     rested = flown["mode"]["time_ns"][2] * 1e-9
@@ -53,7 +53,7 @@ def test_it_detumbles_rests_and_is_braked_again_when_it_turns_too_fast(flown: Ru
     assert not currents(flown, rested + 0.05, again).any()
 
 
-def test_its_own_rate_is_right_within_what_it_claims(flown: Run) -> None:
+def test_the_errors_of_the_rate_from_the_magnetometer_agree_with_its_sigma(flown: Run) -> None:
     spin = flown["spin"][flown["spin"]["known"] == 1]
     spin = spin[spin["time_ns"] > 5e9]
     times = spin["time_ns"] * 1e-9
@@ -106,7 +106,7 @@ def test_an_initial_mode_that_the_body_does_not_have_is_refused(tmp_path: Path) 
         fly(orbit_config(1.0, initial="hold"), tmp_path, section=world(0.01))
 
 
-def test_tools_of_the_testbed_refuse_it_with_file_and_line() -> None:
+def test_tools_of_the_testbed_refuse_an_orbit_with_file_and_line() -> None:
     with pytest.raises(ConfigError, match=r"orbit\.yaml:\d+: `body` is orbit: .* of the testbed"):
         configuration.load_testbed(ORBIT)
 

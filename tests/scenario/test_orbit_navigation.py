@@ -30,7 +30,7 @@ def settled(flown: Run) -> AttitudeErrors:
     return AttitudeErrors(found.times[later], found.error[later], found.sigma[later])
 
 
-def test_lost_in_space_it_becomes_fine_and_stays_so(flown: Run) -> None:
+def test_the_attitude_becomes_fine_lost_in_space_and_stays_fine(flown: Run) -> None:
     packets = flown["navigation"]
     after = packets[packets["time_ns"] > ACQUIRED * 1e9]
     assert len(after) > 30
@@ -39,7 +39,7 @@ def test_lost_in_space_it_becomes_fine_and_stays_so(flown: Run) -> None:
     assert "attitude-knowledge" in event_names(flown)
 
 
-def test_its_star_camera_is_within_a_hundredth_of_a_degree_and_within_its_claim(flown: Run) -> None:
+def test_the_attitude_of_the_star_camera_is_within_a_hundredth_of_a_degree_and_its_claim(flown: Run) -> None:
     found = camera_errors(flown)
     later = found.times > ACQUIRED
     error, sigma = found.error[later], found.sigma[later]
@@ -49,7 +49,7 @@ def test_its_star_camera_is_within_a_hundredth_of_a_degree_and_within_its_claim(
     assert (np.abs(error) < 5.0 * sigma).all()
 
 
-def test_its_attitude_is_within_the_accuracy_of_the_mounting_and_within_its_claim(
+def test_the_attitude_of_the_body_is_within_the_accuracy_of_the_mounting_and_its_claim(
     settled: AttitudeErrors,
 ) -> None:
     """The attitude error is within the accuracy of the mounting, and within the stated uncertainty.
@@ -62,7 +62,7 @@ def test_its_attitude_is_within_the_accuracy_of_the_mounting_and_within_its_clai
     assert (np.abs(settled.error) < 5.0 * settled.sigma).all()
 
 
-def test_it_learns_the_biases_of_the_inertial_unit(flown: Run) -> None:
+def test_the_biases_of_the_inertial_unit_are_estimated(flown: Run) -> None:
     last = flown["navigation"][-1]
     assert last["gyro_bias"] == pytest.approx(flown_bias(flown), abs=1.5e-4)
 

@@ -43,7 +43,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly(config, tmp_path_factory.mktemp("pointing"), section=section)
 
 
-def test_it_points_as_soon_as_its_attitude_is_known(flown: Run) -> None:
+def test_the_satellite_points_as_soon_as_its_attitude_is_known(flown: Run) -> None:
     assert modes_of(flown) == [Mode.BOOT, Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT, Mode.SUN]
     assert entered(flown, Mode.POINT, 0) < 30.0
     assert not {"planner-failed", "control-lost", "tumbling"} & set(event_names(flown))
@@ -52,7 +52,7 @@ def test_it_points_as_soon_as_its_attitude_is_known(flown: Run) -> None:
     assert targets[1] == "sun, roll free"
 
 
-def test_it_stays_near_its_target(flown: Run) -> None:
+def test_the_satellite_stays_near_its_target(flown: Run) -> None:
     packets = flown["attitude"]
     pointing = packets[(packets["mode"] == Mode.POINT) & np.isfinite(packets["target"][:, 0])]
     assert len(pointing) > 50
@@ -69,7 +69,7 @@ def test_the_coils_act_and_pause_for_the_magnetometer(flown: Run) -> None:
     assert np.mean(currents < 1e-3) == pytest.approx(0.1, abs=0.06)
 
 
-def test_no_step_of_the_coils_falls_into_an_exposure_while_it_points(flown: Run) -> None:
+def test_no_coil_switches_during_an_exposure_while_the_satellite_points(flown: Run) -> None:
     packets = flown["attitude"]
     times, dipoles = packets["time_ns"].astype(np.int64), packets["dipole"]
     changed = np.abs(np.diff(dipoles, axis=0)).max(axis=1) > 0.0

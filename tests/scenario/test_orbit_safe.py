@@ -29,7 +29,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly(config, tmp_path_factory.mktemp("safe"), section=world(SPEED))
 
 
-def test_safe_brakes_the_spin_and_stays_safe(flown: Run) -> None:
+def test_safe_damps_the_rotation_and_remains_the_mode(flown: Run) -> None:
     assert modes_of(flown)[-1] is Mode.SAFE
     time, since = flown["truth"]["time_ns"] * 1e-9, entered(flown, Mode.SAFE)
     assert since < 2.0
@@ -37,7 +37,7 @@ def test_safe_brakes_the_spin_and_stays_safe(flown: Run) -> None:
     assert currents(flown, since + 7.0, DURATION).any()
 
 
-def test_it_says_that_it_has_found_the_sun_without_camera_and_orbit(flown: Run) -> None:
+def test_the_sun_is_reported_as_found_without_camera_and_orbit(flown: Run) -> None:
     assert event_names(flown).count("sun-found") == 1
     assert "control-lost" not in event_names(flown)
 

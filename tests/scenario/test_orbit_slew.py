@@ -85,7 +85,7 @@ def part(run: Run, since: float, until: float) -> Any:
     return packets[(times >= since) & (times < until)]
 
 
-def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
+def test_a_slew_changes_to_pointing_without_a_jump(slewed: Run) -> None:
     begun, ended = at(slewed, "slew-begun"), at(slewed, "slew-ended")
     assert len(begun) == len(ended) == 1
     assert SLEW - 5.0 < ended[0] - begun[0] < SLEW + 5.0
@@ -109,7 +109,7 @@ def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
     assert there.max() < 2.0
 
 
-def test_a_body_that_leaves_its_path_is_held_still_and_planned_for_again(crippled: Run) -> None:
+def test_a_body_that_leaves_its_path_is_damped_and_a_new_path_is_planned(crippled: Run) -> None:
     begun, lost = at(crippled, "slew-begun"), at(crippled, "astray")
     assert len(lost) == 1
     assert BROKEN < lost[0] < begun[0] + SLEW
@@ -144,7 +144,7 @@ def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Pat
     assert np.degrees(angle_between(there["quaternion"], there["target"])).max() < 2.0
 
 
-def test_while_it_is_held_still_its_coils_only_take_energy(crippled: Run) -> None:
+def test_the_coils_only_remove_energy_while_the_body_is_damped(crippled: Run) -> None:
     """While a body is damped, its coils only remove energy.
 
     Before the restart of the flight, star fixes were also available along the path.

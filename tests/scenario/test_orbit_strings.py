@@ -23,7 +23,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly(config, tmp_path_factory.mktemp("strings"), section=world(0.008, dead))
 
 
-def test_sun_and_field_give_a_coarse_attitude_that_holds_though_a_string_dies(flown: Run) -> None:
+def test_sun_and_field_give_a_coarse_attitude_although_a_string_fails(flown: Run) -> None:
     assert (flown["navigation"]["knowledge"][4:] == COARSE).all()
     errors = attitude_errors(flown)
     assert len(errors.times)

@@ -101,7 +101,7 @@ def test_a_satellite_flies_with_a_sensor_on_spi_and_a_receiver_with_nmea_sentenc
     assert link["sentences"] >= 2
 
 
-def test_a_magnetometer_of_its_own_carries_the_testbed_while_the_inertial_unit_is_off(
+def test_a_separate_magnetometer_controls_the_testbed_while_the_inertial_unit_is_off(
     tmp_path: Path,
 ) -> None:
     """A separate magnetometer controls the testbed while the IMU is off.

@@ -56,7 +56,7 @@ def test_a_loaded_limit_holds_at_once_and_the_table_is_reported(tmp_path: Path) 
         (load({"modes.arrived_for": 0.2, "modes.tumble_rate": 0.02})[:-3] + b"abc", ""),
     ],
 )
-def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
+def test_a_table_with_a_wrong_predecessor_or_checksum_changes_nothing(
     tmp_path: Path, packet: bytes, reason: str
 ) -> None:
     run, _ = said(tmp_path, (1.0, packet))
@@ -65,7 +65,7 @@ def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
     assert reason in to_text(run["command"][-1]["text"])
 
 
-def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
+def test_the_ranges_of_the_command_are_within_the_ranges_of_the_schema() -> None:
     """The ranges of the command are within the ranges of the configuration schema.
 
     The configured values, which apply without a loaded table, are also within the ranges of the command.

@@ -67,7 +67,7 @@ def start_elsewhere(job: PlanJob, plan: StepPlan) -> StepPlan:
     ],
     ids=lambda value: getattr(value, "__name__", value),
 )
-def test_after_two_good_plans_only_bad_ones_come(
+def test_invalid_plans_are_refused_and_the_last_valid_path_is_flown_and_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil, event: str
 ) -> None:
     use_planner(
@@ -129,7 +129,7 @@ def test_late_plans_are_refused_and_without_any_path_the_coils_stay_off(tmp_path
     assert not run["truth"]["current"].any()
 
 
-def test_a_planner_that_is_just_in_time_is_flown(tmp_path: Path) -> None:
+def test_plans_that_arrive_just_in_time_are_flown(tmp_path: Path) -> None:
     run = fly(demo_config(7.0, camera=False), tmp_path, planner_latency=0.9)
     assert len(run["plan"]) >= 2
     assert run["plan"]["accepted"].all()

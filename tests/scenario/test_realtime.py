@@ -74,7 +74,7 @@ def test_planner_and_vision_worked_beside_the_loop(flown: Run) -> None:
 
 
 @pytest.mark.slow
-def test_it_flies_where_it_should(flown: Run) -> None:
+def test_the_body_moves_towards_its_target(flown: Run) -> None:
     truth = flown["truth"]
     q2 = truth["quaternion"][:, 1]
     start_time = truth["time_ns"][0]

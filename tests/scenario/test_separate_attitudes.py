@@ -33,7 +33,7 @@ def test_each_satellite_flies_the_cameras_of_its_sensor_file(name: str) -> None:
         assert (camera.field_of_view_deg, 1.0 / camera.period) == (67.0, suite.camera_rate_hz)
 
 
-def test_cameras_and_magnetometer_give_attitudes_beside_the_flown_one(tmp_path: Path) -> None:
+def test_cameras_and_magnetometer_give_attitudes_in_addition_to_the_one_in_use(tmp_path: Path) -> None:
     path = FOLDER / "ionf.yaml"
     config = as_orbit(configuration.load(path))
     small = tuple(

@@ -60,7 +60,7 @@ def test_streaks_of_a_slew_are_long_enough_to_tell_the_rate_and_no_longer(flown:
     assert "camera: slow" not in " ".join(to_text(text) for text in flown["event"]["text"])
 
 
-def test_no_step_of_the_coils_falls_into_an_exposure_of_a_slew(flown: Run) -> None:
+def test_no_coil_switches_during_an_exposure_of_a_slew(flown: Run) -> None:
     packets = flown["attitude"]
     changed = np.abs(np.diff(packets["dipole"], axis=0)).max(axis=1) > 0.0
     # First packets after changes of the commanded dipole.
@@ -75,7 +75,7 @@ def test_no_step_of_the_coils_falls_into_an_exposure_of_a_slew(flown: Run) -> No
         assert not ((after - 100_000_000 >= begin) & (after < end)).any()
 
 
-def test_their_rates_and_attitudes_enter_the_estimate(flown: Run) -> None:
+def test_rates_and_attitudes_of_frames_during_a_slew_enter_the_estimate(flown: Run) -> None:
     streaked, _ = _streaked(flown)
     frames, stars = flown["streak"][streaked], flown["stars"]
     # Of ten crowded frames with streaks of 7 to 8 px, one or two give no rate, because overlapping streaks do

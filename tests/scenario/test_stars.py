@@ -35,7 +35,7 @@ def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
     rigged.at(end, speak)
 
 
-def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
+def test_a_flight_without_an_estimate_identifies_the_stars_lost_in_space(tmp_path: Path) -> None:
     """A flight without an estimate identifies the stars lost in space and starts the filter.
 
     Without the IMU, no estimate predicts or uses an attitude.
@@ -46,7 +46,9 @@ def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: 
     assert run["stars"]["accepted"].tolist() == [0, 1]
 
 
-def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_tracked(tmp_path: Path) -> None:
+def test_after_a_blackout_the_first_frame_is_solved_lost_in_space_and_the_next_by_tracking(
+    tmp_path: Path,
+) -> None:
     """After ten seconds without frames and IMU, the first frame is solved lost in space.
 
     The next frame is solved by tracking. The filter's model cannot predict the attitude of the camera. The
@@ -71,7 +73,7 @@ def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_trac
     assert stars["accepted"][-1]
 
 
-def test_a_camera_knocked_out_of_place_is_found_out_and_misleads_nobody(tmp_path: Path) -> None:
+def test_star_attitudes_of_a_displaced_camera_are_refused_and_reported(tmp_path: Path) -> None:
     """If the camera is displaced, its star attitudes are refused and reported.
 
     The stars are identified in an unexpected direction.

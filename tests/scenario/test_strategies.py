@@ -48,7 +48,7 @@ def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
     assert event_names(run) == ["started", "target", "stopped"]
 
 
-def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None:
+def test_a_cost_of_time_determines_the_goal_time_which_later_plans_keep(tmp_path: Path) -> None:
     """A cost of time determines the goal time, which later plans keep.
 
     If the cost is doubled, the duration of the slew decreases by the fourth root of two. The first plan
@@ -104,7 +104,7 @@ def test_a_body_that_is_pushed_off_its_hold_is_planned_for_again(tmp_path: Path)
     ],
     ids=lambda control: control["tracker"],
 )
-def test_without_a_path_every_controller_is_shown_the_target_itself(
+def test_without_a_path_every_controller_gets_the_target_itself(
     tmp_path: Path, control: dict[str, Any]
 ) -> None:
     config = configured(32.0, (Step(at=0.0, q2=0.1),), strategy="step")

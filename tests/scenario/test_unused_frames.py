@@ -15,5 +15,5 @@ def test_frames_upside_down_are_reported_as_unused(tmp_path: Path) -> None:
     assert "frame-unused" in event_names(run)
 
 
-def test_frames_that_are_used_are_not(tmp_path: Path) -> None:
+def test_used_frames_are_not_reported_as_unused(tmp_path: Path) -> None:
     assert "frame-unused" not in event_names(fly(demo_config(8.0), tmp_path))

@@ -33,7 +33,7 @@ def test_sun_and_horizon_are_found_and_used(flown: Run) -> None:
     assert "wide-lost" not in event_names(flown)
 
 
-def test_the_attitude_is_better_than_strings_make_it_and_within_its_claim(flown: Run) -> None:
+def test_the_attitude_is_better_than_by_solar_strings_and_within_its_claim(flown: Run) -> None:
     assert (flown["navigation"]["knowledge"][4:] >= COARSE).all()
     errors = attitude_errors(flown)
     later = errors.times > SETTLED
