@@ -75,6 +75,9 @@ The command is `python -m ground.documentation --events > docs/events.md`.
 
 An event has a name, a severity, and a text with values, which `knightcube watch` shows.
 The text names the device and the reason; search for the name of the event on this page.
+Of each kind of event, at most one is written in 5 s, with the number of those that were held back.
+The last event held back is written up to 5 s after its time, so that it follows later events of other kinds.
+`report`, `export` and `watch` sort the events of a log by their times.
 An alarm is a monitored condition that is active now; the last table names the event that each alarm reports.
 In a remedy, `clear`, `mode` and `safe` are [commands](fly/commands.md) to the flight.
 The words `bringup`, `identify` and `calibrate` are [commands of the ground](fly/command-line.md).

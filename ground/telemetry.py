@@ -12,9 +12,9 @@ import csv
 import math
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -134,9 +134,19 @@ def decode(data: bytes) -> dict[str, PacketArray]:
     return result.packets
 
 
+def with_sorted_events(packets: Mapping[str, PacketArray]) -> dict[str, PacketArray]:
+    """Return packets by name with the events in the order of their times.
+
+    A log may contain an event up to some seconds after later events, because the flight holds it back
+    (`flight.loop.facts.EventLog`).
+    """
+    events = packets[EVENT.name]
+    return {**packets, EVENT.name: events[np.argsort(events["time_ns"], kind="stable")]}
+
+
 @dataclass(frozen=True)
 class Run:
-    """The packets of the logs in the folder of a run.
+    """The packets of the logs in the folder of a run, with the events in the order of their times.
 
     `truth` and `performance` are empty if the run has no such log.
     """
@@ -199,6 +209,7 @@ def read_run(folder: Path) -> Run:
     flight, truth, performance = logs
     if not flight.counts:
         raise UsageError(f"{folder}: no valid packet in the {flight.total_bytes} bytes of the flight log")
+    flight = replace(flight, packets=with_sorted_events(flight.packets))
     return Run(folder, flight, truth, performance)
 
 

@@ -34,7 +34,7 @@ from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
-from ground.telemetry import date_of, decode, flight_segments, is_first, named, scan
+from ground.telemetry import date_of, decode, flight_segments, is_first, named, scan, with_sorted_events
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import KnightCubeError, UsageError, reason_of
 
@@ -116,7 +116,9 @@ class LogTail:
     def new(self) -> dict[str, PacketArray]:
         """Return the packets that were written since the last call, by name. Raises UsageError.
 
-        A long log is returned in portions by several calls, and `behind` is true until its end is reached.
+        The events are sorted by time. An event that the flight held back may follow later events of an
+        earlier call. A long log is returned in portions by several calls, and `behind` is true until its end
+        is reached.
         """
         # After an error, the bytes that were already read remain in `_rest`.
         self._rest += self._read()
@@ -134,7 +136,7 @@ class LogTail:
         self._missing += sum(found.missing.values())
         self._others += found.other_versions
         self._packets += sum(found.counts.values())
-        return found.packets
+        return with_sorted_events(found.packets)
 
     @property
     def problem(self) -> str:
@@ -365,11 +367,10 @@ class PlainLines:
     def feed(self, packets: Mapping[str, PacketArray]) -> None:
         """Process new packets in the order of their times, and write their lines."""
         ordered = {}
-        for name, rows in packets.items():
+        for name, arrived in packets.items():
+            rows = arrived[np.argsort(arrived["time_ns"], kind="stable")]
             seconds = np.clip(rows["time_ns"] * 1e-9, -_MAX_TIME, _MAX_TIME)
-            slots = np.floor(seconds / self._every).astype(np.int64)
-            order = np.argsort(slots, kind="stable")
-            ordered[name] = slots[order], rows[order]
+            ordered[name] = np.floor(seconds / self._every).astype(np.int64), rows
         for slot in sorted(set().union(*(np.unique(slots).tolist() for slots, _ in ordered.values()))):
             inside = {
                 name: rows[slice(*np.searchsorted(slots, (slot, slot + 1)))]

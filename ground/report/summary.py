@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
-from flight.link.telemetry.definitions import MODES, SHED
-from flight.link.telemetry.packets import PacketArray
+from flight.link.telemetry.definitions import CONTROL, MODES, SHED
+from flight.link.telemetry.packets import LAYOUTS, SEQUENCE_MODULUS, PacketArray
 from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
 from flight.schema.bodies import OrbitConfig, as_orbit
@@ -182,11 +182,19 @@ def _rate_groups(packets: PacketArray) -> list[Object]:
 
 
 def _cycles(timing: PacketArray, control: PacketArray) -> Object:
-    """Return the numbers of control cycles, logged and skipped, and statistics of their times."""
-    slots = control["cycle"].astype(np.int64)
+    """Return the numbers of control cycles and statistics of their times.
+
+    The cycles are `count` in the log and `missing` from the log according to the sequence counts; in the
+    `skipped` slots the loop ran no cycle.
+    """
+    absent = np.maximum(np.diff(control["cycle"].astype(np.int64)) - 1, 0)
+    counts = LAYOUTS[CONTROL.name].sequence_counts(control.tobytes())
+    # A gap of the log hides multiples of the sequence count's range. They count as missing, not as skipped.
+    skipped = np.maximum(absent - (np.diff(counts) - 1) % SEQUENCE_MODULUS, 0) % SEQUENCE_MODULUS
     return {
         "count": len(control),
-        "skipped": int(slots[-1] - slots[0]) + 1 - len(slots) if len(slots) else 0,
+        "missing": int(np.sum(absent - skipped)),
+        "skipped": int(np.sum(skipped)),
         "lateness_s": _percentiles(timing["lateness"].astype(float)),
         "execution_s": _percentiles(timing["execution"].astype(float)),
     }

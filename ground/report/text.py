@@ -306,7 +306,10 @@ def _loop(summary: Object) -> list[str]:
     if rows:
         lines += [f"Times{clock}", *table(["", "median ms", "99 % ms", "max ms"], rows)]
     if cycles["count"]:
-        lines.append(f"Control cycles in the log: {cycles['count']}, skipped slots: {cycles['skipped']}")
+        lines.append(
+            f"Control cycles in the log: {cycles['count']}, missing from the log: {cycles['missing']}; "
+            f"slots skipped by the loop: {cycles['skipped']}"
+        )
     return lines
 
 

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from flight.link.telemetry.definitions import CONTROL, EVENT, HOUSEKEEPING, IMU, RUN, TARGET, TRUTH
 from flight.link.telemetry.log import FlightLog, find_segments
-from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
+from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16, to_text
 from ground import telemetry
-from ground.telemetry import FORMATS, Run, ScanResult, decode, export, read_run, scan
+from ground.telemetry import FORMATS, Run, ScanResult, decode, export, read_run, scan, with_sorted_events
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.ground.commands.in_process import command
@@ -66,6 +66,24 @@ def test_segments_are_read_in_order_and_dropped_ones_are_known(tmp_path: Path) -
     kept = run["cycle_timing"]["cycle"].tolist()
     assert kept == list(range(kept[0], 100))
     assert run.dropped_segments("truth") == 0
+
+
+def held_back_events() -> list[tuple[float, dict[str, Any]]]:
+    return [
+        (1.0, {"name": "a"}), (1.2, {"name": "b"}), (4.0, {"name": "c"}), (1.2, {"name": "d"}),
+        (2.0, {"name": "a", "suppressed": 3}),
+    ]  # fmt: skip
+
+
+def test_events_that_were_held_back_are_sorted_by_their_times(tmp_path: Path) -> None:
+    packets = with_sorted_events(packed_run(event=held_back_events()).flight.packets)
+    assert [to_text(name) for name in packets["event"]["name"]] == ["a", "b", "d", "a", "c"]
+    packer = Packer()
+    values = {"code": 1, "severity": 0, "suppressed": 0, "text": ""}
+    log = [packer.pack(EVENT, round(t * 1e9), {**values, **row}) for t, row in held_back_events()]
+    (tmp_path / "flight-0001.ccsds").write_bytes(b"".join(log))
+    assert read_run(tmp_path)["event"]["time_ns"].tolist() == packets["event"]["time_ns"].tolist()
+    assert read_run(tmp_path).flight.intact
 
 
 def test_a_tenth_thousand_segment_comes_after_the_ninth(tmp_path: Path) -> None:

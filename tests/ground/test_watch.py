@@ -111,13 +111,26 @@ def test_a_flight_that_is_over_is_shown_to_its_end(growing: Path) -> None:
     assert any(line.endswith("stopped: stopped by SIGTERM") for line in lines)
 
 
+def test_an_event_that_was_held_back_is_shown_at_its_time(growing: Path) -> None:
+    packer = continued(growing)
+    with (growing / "flight-0001.ccsds").open("ab") as file:
+        file.write(event(packer, events.IMU_CORRUPT, 5.65, "3 bytes"))
+        file.write(event(packer, events.STOPPED, 6.5, "stopped by SIGTERM"))
+    lines = command("watch", growing, "--every", "2").stdout.splitlines()
+    times = [float(line.split()[0]) for line in lines if "  warning  " in line or "  fault  " in line]
+    assert times == [5.65, 5.7]
+    seconds = (LogTail(growing).new()["event"]["time_ns"] / 1e9).tolist()
+    assert seconds[-4:] == [5.65, 5.7, 6.0, 6.5]
+
+
 def test_one_look_as_json_has_mode_currents_streams_and_events(growing: Path) -> None:
     facts = json.loads(command("watch", growing, "--json").stdout)
     assert (facts["mode"], facts["faults"], facts["ended"]) == ("hold", 1, None)
     assert facts["faults_since_s"] < 0.1
     assert facts["currents_a"] == [0.1, 0.0, 0.0]
     assert (facts["streams"]["imu"], facts["streams"]["coils"]) == ("good", "stale")
-    assert facts["events"][-1] == {
+    (fault,) = [one for one in facts["events"] if one["severity"] == 2]
+    assert fault == {
         "time_s": 5.7, "severity": 2, "name": "imu-silent", "text": "0.2 s without a byte", "suppressed": 0,
         "utc": "2023-11-14T22:13:25.700Z",
     }  # fmt: skip

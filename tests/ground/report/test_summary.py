@@ -11,7 +11,7 @@ import pytest
 
 from flight.link import events
 from flight.link.events import Mode
-from flight.link.telemetry.definitions import STREAK, TRUTH
+from flight.link.telemetry.definitions import CONTROL, STREAK, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from flight.loop.facts import FACTS, StreamState
@@ -285,14 +285,32 @@ def test_loop_planner_events_and_logs_are_counted(full: Run) -> None:
     assert all(log["skipped_bytes"] == log["missing_packets"] == 0 for log in summary["logs"])
 
 
-def test_slots_without_a_control_packet_are_counted(full: Run, tmp_path: Path) -> None:
+def test_a_control_packet_that_is_missing_from_the_log_does_not_count_as_a_skipped_slot(
+    full: Run, tmp_path: Path
+) -> None:
     raw = (full.folder / "flight-0001.ccsds").read_bytes()
     length = 155
     third = [m for m in range(len(raw)) if raw[m : m + 2] == b"\x09\x11"][2]
     (tmp_path / "flight-0001.ccsds").write_bytes(raw[:third] + raw[third + length :])
     summary = summarise(read_run(tmp_path))
-    assert summary["cycles"]["skipped"] == 1
+    assert (summary["cycles"]["missing"], summary["cycles"]["skipped"]) == (1, 0)
     assert summary["logs"][0]["missing_packets"] == 1
+
+
+@pytest.mark.parametrize(
+    ("lost", "slots", "expected"),
+    [(3, 4, (3, 1)), (16_390, 16_390, (16_390, 0)), (16_390, 16_395, (16_390, 5))],
+)
+def test_missing_cycles_and_skipped_slots_in_one_gap_are_distinguished(
+    lost: int, slots: int, expected: tuple[int, int]
+) -> None:
+    """Of `slots` slots without a packet, the loop ran a cycle in `lost` slots, whose packets are missing."""
+    packer, zero = Packer(), {f.name: [0] * f.count if f.count > 1 else 0 for f in CONTROL.fields}
+    packets = [packer.pack(CONTROL, k, {**zero, "cycle": k}) for k in range(lost + 1)]
+    packets.append(packer.pack(CONTROL, lost + 1, {**zero, "cycle": slots + 1}))
+    log = scan(packets[0] + packets[-1])
+    cycles = summarise(Run(Path("run"), log, scan(b""), scan(b"")))["cycles"]
+    assert (cycles["missing"], cycles["skipped"]) == expected
 
 
 def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
@@ -459,7 +477,9 @@ def test_cycles_jobs_rate_groups_and_plans_have_their_statistics() -> None:
         "longest_horizon_s": 13.0, "peak_current_a": pytest.approx(0.05),
     }  # fmt: skip
     empty = summarise(packed_run(event=[(0.0, {"name": "x"})]))
-    assert empty["cycles"] == {"count": 0, "skipped": 0, "lateness_s": None, "execution_s": None}
+    assert empty["cycles"] == {
+        "count": 0, "missing": 0, "skipped": 0, "lateness_s": None, "execution_s": None
+    }  # fmt: skip
     assert (empty["planner"]["longest_horizon_s"], empty["planner"]["peak_current_a"]) == (None, None)
 
 

@@ -21,7 +21,7 @@ EMPTY: dict[str, Any] = {
     "thesis": [],
     "power": {"source": None},
     "rate_groups": [],
-    "cycles": {"count": 7, "skipped": 2, "lateness_s": None, "execution_s": None},
+    "cycles": {"count": 7, "missing": 1, "skipped": 2, "lateness_s": None, "execution_s": None},
     "jobs": [],
     "planner": {"plans": 0},
     "estimate": None,
@@ -53,7 +53,7 @@ def blocks(**changes: Any) -> list[str]:
 
 
 HOST = ", in host time; the flight ran in lock-step"
-CYCLES = "Control cycles in the log: 7, skipped slots: 2"
+CYCLES = "Control cycles in the log: 7, missing from the log: 1; slots skipped by the loop: 2"
 
 
 def test_an_empty_run_has_its_headline_its_cycles_and_its_notes() -> None:
