@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from flight.link import events
 from flight.link.telemetry.log import find_runs, find_segments
 from flight.schema.document import read_document, read_text
 from ground.report.signals import last_time
-from ground.report.text import ARCSECONDS, number, provenance, table
+from ground.report.text import ARCSECONDS, DEGREES, number, provenance, table
 from ground.telemetry import Run, read_run, text_of
 from knightcube.errors import UsageError
 
@@ -68,24 +69,31 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield prefix, value
 
 
-def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
+_Figure = tuple[str, tuple[float | None, str]]
+"""Name, value and unit of a performance measure."""
+
+
+def _figures(summary: Object) -> Iterator[_Figure]:
     """Yield name, value and unit of each performance measure in a summary, in the order of the report."""
     yield "duration", (summary["run"]["duration_s"], "s")
-    for row in summary["thesis"]:
+    for row in [*summary["thesis"], *summary["requirements"]]:
         yield f"worst {row['quantity']}", (row["worst"], row["unit"])
-    times: dict[int, int] = {}
-    for step in summary["steps"]:
-        again = times[step["index"]] = times.get(step["index"], 0) + 1
-        name = f"step {step['index']}" + (f" ({again})" if again > 1 else "")
+    steps = summary["steps"]
+    for step, name in zip(steps, _counted(f"step {step['index']}" for step in steps), strict=True):
         yield f"{name}: steady state", (step["steady_state_deg"], "deg")
         yield f"{name}: overshoot", (step["overshoot_percent"], "%")
         yield f"{name}: rise", (step["rise_s"], "s")
         yield f"{name}: settling", (step["settling_s"], "s")
+    yield from _detumbling(summary["detumbling"])
+    yield from _knowledge(summary["knowledge"])
+    yield from _pointing(summary["pointing"])
     power = summary["power"]
+    yield "largest commanded current", (power["peak_current_a"], "A")
     yield "supply at the coils, V |I|, average", (_scaled(power["supply_average_w"], 1e3), "mW")
     yield "supply at the bus, average", (_scaled(power["bus_average_w"], 1e3), "mW")
     yield "heat R I^2 of steady currents, average", (_scaled(power["heat_average_w"], 1e3), "mW")
     yield "heat R I^2 of steady currents, energy", (power["heat_j"], "J")
+    yield from _battery(summary.get("battery"))
     estimate = summary["estimate"] or {}
     yield "estimate: angle, rms error", (_scaled(estimate.get("angle_rms_rad"), 1e3), "mrad")
     yield "estimate: rate, rms error", (_scaled(estimate.get("rate_rms_rad_s"), 1e3), "mrad/s")
@@ -104,6 +112,7 @@ def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
         yield f"{kind}: worst axis, rms error", (_scaled(worst, scale), unit)
         yield f"{kind}: mean e' P^-1 e / 3", (part["normalised"], "")
     yield "frames without rate or attitude", (len(summary["failed_frames"]), "")
+    yield from _objects(summary)
     for name in ("plans", "accepted", "stretched", "refused"):
         yield f"planner: {name}", (summary["planner"][name], "")
     timed = {f"cycle {name}": summary["cycles"][f"{name}_s"] for name in ("lateness", "execution")}
@@ -111,10 +120,96 @@ def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
     for name, durations in timed.items():
         for key, label in (("p50", "median"), ("p99", "99 %"), ("max", "max")):
             yield f"{name}, {label}", (_scaled((durations or {}).get(key), 1e3), "ms")
-    yield "skipped control slots", (summary["cycles"]["skipped"], "")
+    cycles = summary["cycles"]
+    yield "control slots skipped by the loop", (cycles["skipped"] if cycles["count"] else None, "")
+    for group in summary["rate_groups"]:
+        yield f"rate group {group['name']}: slips", (group["slips"], "")
+        yield f"rate group {group['name']}: overruns", (group["overruns"], "")
     for log in summary["logs"]:
         lost = log["missing_packets"] + log["skipped_bytes"] + log["truncated_bytes"]
         yield f"log {log['log']}: missing packets and bad bytes", (lost, "")
+
+
+def _counted(names: Iterable[str]) -> Iterator[str]:
+    """Yield the names; the second and later uses of a name have a number in brackets."""
+    uses: Counter[str] = Counter()
+    for name in names:
+        uses[name] += 1
+        yield name + (f" ({uses[name]})" if uses[name] > 1 else "")
+
+
+def _detumbling(found: Object | None) -> Iterator[_Figure]:
+    if found is None:
+        return
+    periods = found["periods"]
+    for period, name in zip(periods, _counted(["detumbling"] * len(periods)), strict=True):
+        yield f"{name}: duration", (period["duration_s"], "s")
+        yield f"{name}: maximum rate", (_scaled(period["largest_rate_rad_s"], DEGREES), "deg/s")
+        yield f"{name}: last rate", (_scaled(period["last_rate_rad_s"], DEGREES), "deg/s")
+    yield "rate from the magnetometer: available", (_scaled(found["rate_known_share"], 100.0), "%")
+    error = _scaled(found["rate_error_rms_rad_s"], DEGREES)
+    yield "rate from the magnetometer: rms error per axis", (error, "deg/s")
+    yield "rate from the magnetometer: restarts", (found["restarts"], "")
+
+
+def _knowledge(found: Object | None) -> Iterator[_Figure]:
+    if found is None:
+        return
+    for level, share in found["share"].items():
+        yield f"attitude knowledge: {level}", (_scaled(share, 100.0), "%")
+    yield "attitude knowledge: first fine at", (found["fine_after_s"], "s")
+    for key, name in (
+        ("fine_error_rms_rad", "rms error"),
+        ("with_stars_error_rms_rad", "rms error with stars"),
+        ("fine_error_worst_rad", "maximum error"),
+    ):
+        yield f"fine attitude: {name}", (_scaled(found[key], DEGREES), "deg")
+    yield "fine attitude: maximum error / sigma per axis", (found["worst_sigmas"], "")
+    yield "fine attitude: NEES per axis", (found["nees_per_axis"], "")
+    camera = found["star_camera"] or {}
+    error = _scaled(camera.get("with_stars_error_rms_rad"), DEGREES)
+    yield "star camera's attitude: rms error with stars", (error, "deg")
+    yield "star camera's attitude: NEES per axis", (camera.get("nees_per_axis"), "")
+    for one in found["description"]:
+        unit = "rad" if one["name"] == "camera" else ""
+        yield f"estimated {one['name']}: error at the end", (one["error"], unit)
+    for where, share in found["dipole_error_share"].items():
+        yield f"residual dipole: error in {where}", (_scaled(share, 100.0), "%")
+    yield "measurements refused by the filter", (found["refused"], "")
+    yield "GPS fixes refused by the filter", (found["fixes_refused"], "")
+    yield "restarts of the filter", (found["restarts"], "")
+
+
+def _pointing(found: Object | None) -> Iterator[_Figure]:
+    targets = found["targets"] if found else []
+    for target, name in zip(targets, _counted(f"target {one['target']}" for one in targets), strict=True):
+        yield f"{name}: duration", (target["duration_s"], "s")
+        yield f"{name}: axis error, rms", (_scaled(target["axis_rms_rad"], DEGREES), "deg")
+        yield f"{name}: axis error, maximum", (_scaled(target["axis_worst_rad"], DEGREES), "deg")
+        yield f"{name}: error of all axes, rms", (_scaled(target["all_axes_rms_rad"], DEGREES), "deg")
+        yield f"{name}: supply at the coils, average", (_scaled(target["supply_w"], 1e3), "mW")
+        yield f"{name}: heat R I^2, average", (_scaled(target["heat_w"], 1e3), "mW")
+
+
+def _battery(found: Object | None) -> Iterator[_Figure]:
+    if found is None:
+        return
+    for key, name in (("charge_lowest", "lowest"), ("charge_last", "at the end")):
+        yield f"state of charge, {name}", (_scaled(found[key], 100.0), "%")
+    yield "energy into the battery", (found["in_j"], "J")
+    yield "energy out of the battery", (found["out_j"], "J")
+
+
+def _objects(summary: Object) -> Iterator[_Figure]:
+    camera = summary["star_camera"] or {}
+    yield "unobstructed exposures with attitude or rate", (_scaled(camera.get("share"), 100.0), "%")
+    yield "longest gap without attitude or rate", (camera.get("longest_gap_s"), "s")
+    yield "objects among the stars", (len(summary["objects"]) or None, "")
+    for found in summary["objects"]:
+        yield f"object {found['number']}: detections", (found["seen"], "")
+        yield f"object {found['number']}: magnitude V", (found["magnitude"], "mag")
+        sigma = _scaled(found["sighting_sigma_rad"], ARCSECONDS)
+        yield f"object {found['number']}: sigma of a sighting", (sigma, "arcsec")
 
 
 def _scaled(value: float | None, scale: float) -> float | None:

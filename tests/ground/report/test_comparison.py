@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterator
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from ground.report.comparison import compare, format_archive, format_comparison,
 from ground.telemetry import read_run
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
+from tests.support.packed_run import packed_run
 
 LONG = Recipe(duration=90.0, planned=90.0, hold=30.0, rate_hz=10.0)
 
@@ -53,6 +57,58 @@ def test_every_figure_has_both_values_and_the_difference_of_the_second_less_the_
     error = figures["estimate: rate, rms error"]
     assert error["a"] == pytest.approx(0.1, rel=1e-3)
     assert error["b"] is None, "no truth to judge by"
+
+
+SATELLITE: dict[str, Any] = {
+    "detumbling": {
+        "periods": [{"duration_s": 20.0, "largest_rate_rad_s": 0.2, "last_rate_rad_s": 0.1}] * 2,
+        "rate_known_share": 0.9, "rate_error_rms_rad_s": 0.01, "restarts": 4,
+    },
+    "knowledge": {
+        "share": {"lost": 0.1, "coarse": 0.2, "fine": 0.7}, "fine_after_s": 61.0, "fine_error_rms_rad": 0.01,
+        "with_stars_error_rms_rad": 0.02, "fine_error_worst_rad": 0.03, "worst_sigmas": 3.5,
+        "nees_per_axis": 0.9, "refused": 5, "fixes_refused": 6, "restarts": 7,
+        "star_camera": {"with_stars_error_rms_rad": 0.04, "nees_per_axis": 1.1},
+        "dipole_error_share": {"sunlight": 0.3, "shadow": 0.4},
+        "description": [{"name": "coils", "error": 0.05}],
+    },
+    "pointing": {
+        "targets": [
+            {
+                "target": "sun", "duration_s": 100.0, "axis_rms_rad": 0.011, "axis_worst_rad": 0.012,
+                "all_axes_rms_rad": 0.013, "supply_w": 0.014, "heat_w": 0.015,
+            }
+        ] * 2
+    },
+    "requirements": [{"quantity": "detumbling time", "worst": 20.0, "unit": "s"}],
+    "star_camera": {"share": 0.9, "longest_gap_s": 30.0},
+    "objects": [{"number": 3, "seen": 8, "magnitude": 5.5, "sighting_sigma_rad": 1e-5}],
+    "battery": {"charge_lowest": 0.7, "charge_last": 0.8, "in_j": 10.0, "out_j": 20.0},
+    "rate_groups": [{"name": "control", "slips": 2, "overruns": 3}],
+}  # fmt: skip
+
+
+def with_other_numbers(value: Any) -> Iterator[Any]:
+    """Yield copies of a value, in each of which another number is larger."""
+    if isinstance(value, dict | list):
+        for key, below in value.items() if isinstance(value, dict) else enumerate(value):
+            for other in with_other_numbers(below):
+                copied = copy(value)
+                copied[key] = other
+                yield copied
+    elif not isinstance(value, str):
+        yield value + 1
+
+
+def test_every_result_of_a_satellite_is_compared() -> None:
+    summary = summarise(packed_run(event=[(0.0, {"name": "started"})])) | SATELLITE
+    for changed in with_other_numbers(SATELLITE):
+        figures = compare(summary, summary | changed)["figures"]
+        assert any(row["a"] != row["b"] for row in figures), changed
+    figures = {row["figure"]: row for row in compare(summary, summary)["figures"]}
+    assert figures["target sun: axis error, rms"]["a"] == pytest.approx(math.degrees(0.011))
+    assert figures["target sun (2): heat R I^2, average"]["a"] == pytest.approx(15.0)
+    assert "control slots skipped by the loop" not in figures, "the log has no control packets"
 
 
 def test_what_was_configured_otherwise_is_listed_by_its_key(pair: tuple[Path, Path]) -> None:
