@@ -87,13 +87,22 @@ def _figures(summary: Object) -> Iterator[_Figure]:
     yield from _detumbling(summary["detumbling"])
     yield from _knowledge(summary["knowledge"])
     yield from _pointing(summary["pointing"])
-    power = summary["power"]
+    yield from _power(summary["power"])
+    yield from _battery(summary.get("battery"))
+    yield from _sensing(summary)
+    yield from _objects(summary)
+    yield from _loop(summary)
+
+
+def _power(power: Object) -> Iterator[_Figure]:
     yield "largest commanded current", (power["peak_current_a"], "A")
     yield "supply at the coils, V |I|, average", (_scaled(power["supply_average_w"], 1e3), "mW")
     yield "supply at the bus, average", (_scaled(power["bus_average_w"], 1e3), "mW")
     yield "heat R I^2 of steady currents, average", (_scaled(power["heat_average_w"], 1e3), "mW")
     yield "heat R I^2 of steady currents, energy", (power["heat_j"], "J")
-    yield from _battery(summary.get("battery"))
+
+
+def _sensing(summary: Object) -> Iterator[_Figure]:
     estimate = summary["estimate"] or {}
     yield "estimate: angle, rms error", (_scaled(estimate.get("angle_rms_rad"), 1e3), "mrad")
     yield "estimate: rate, rms error", (_scaled(estimate.get("rate_rms_rad_s"), 1e3), "mrad/s")
@@ -112,7 +121,9 @@ def _figures(summary: Object) -> Iterator[_Figure]:
         yield f"{kind}: worst axis, rms error", (_scaled(worst, scale), unit)
         yield f"{kind}: mean e' P^-1 e / 3", (part["normalised"], "")
     yield "frames without rate or attitude", (len(summary["failed_frames"]), "")
-    yield from _objects(summary)
+
+
+def _loop(summary: Object) -> Iterator[_Figure]:
     for name in ("plans", "accepted", "stretched", "refused"):
         yield f"planner: {name}", (summary["planner"][name], "")
     timed = {f"cycle {name}": summary["cycles"][f"{name}_s"] for name in ("lateness", "execution")}
