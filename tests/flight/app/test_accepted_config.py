@@ -61,7 +61,7 @@ def texts_kept(folder: Path) -> list[str]:
     return [kept.text for kept in kept_configs(folder)]
 
 
-def test_no_single_bit_that_flips_is_flown(accepted: Path, service: dict[str, str]) -> None:
+def test_a_configuration_with_a_flipped_bit_is_never_flown(accepted: Path, service: dict[str, str]) -> None:
     for seed in range(40):
         accepted.write_text(corrupted(TEXT, 1, seed), encoding="utf-8")
         chosen = accepted_config(accepted, service)
@@ -69,7 +69,7 @@ def test_no_single_bit_that_flips_is_flown(accepted: Path, service: dict[str, st
         assert "differs from the accepted configuration" in chosen.problem
 
 
-def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
+def test_a_flipped_bit_that_gives_another_valid_body_is_found_by_the_checksum(
     accepted: Path, service: dict[str, str]
 ) -> None:
     """The characters 3 and 7 differ by one bit.
@@ -83,12 +83,12 @@ def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
     assert as_testbed(flown).plant.inertia == 1.05e-3
 
 
-def test_what_was_accepted_is_flown(accepted: Path, service: dict[str, str]) -> None:
+def test_the_accepted_configuration_is_flown(accepted: Path, service: dict[str, str]) -> None:
     assert accepted_config(accepted, service) == Chosen(accepted, TEXT, "", True)
     assert accepted_config(accepted, {}) == Chosen(accepted, TEXT, "", True)
 
 
-def test_without_a_checksum_a_file_is_taken_as_it_stands_unless_an_accepted_one_flew(
+def test_without_a_checksum_a_file_is_used_unless_an_accepted_one_has_flown(
     tmp_path: Path, service: dict[str, str]
 ) -> None:
     path = tmp_path / "mine.yaml"
@@ -100,7 +100,7 @@ def test_without_a_checksum_a_file_is_taken_as_it_stands_unless_an_accepted_one_
 
 
 @pytest.mark.parametrize("odd", ["dangling", "folder", "empty", "short", "text"])
-def test_an_odd_checksum_is_damage(accepted: Path, service: dict[str, str], odd: str) -> None:
+def test_an_invalid_checksum_file_counts_as_damage(accepted: Path, service: dict[str, str], odd: str) -> None:
     beside = sum_file(accepted)
     line = beside.read_text(encoding="ascii")
     beside.unlink()
@@ -115,7 +115,7 @@ def test_an_odd_checksum_is_damage(accepted: Path, service: dict[str, str], odd:
         accepted_config(accepted, {})
 
 
-def test_one_error_of_the_disk_is_not_yet_damage(
+def test_one_failed_read_does_not_count_as_damage(
     accepted: Path, service: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from flight.loop.state import LinuxFiles  # noqa: PLC0415
@@ -131,7 +131,7 @@ def test_one_error_of_the_disk_is_not_yet_damage(
     assert accepted_config(accepted, service) == Chosen(accepted, TEXT, "", True)
 
 
-def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
+def test_without_a_flown_copy_a_damaged_configuration_is_refused_with_the_remedy(
     accepted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7"), encoding="utf-8")
@@ -146,7 +146,7 @@ def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
     assert not (tmp_path / "run").exists()
 
 
-def test_configuration_and_sum_that_are_gone_or_damaged_are_replaced_by_the_newest_whole_one_that_flew(
+def test_a_missing_or_damaged_configuration_is_replaced_by_the_newest_intact_copy(
     accepted: Path, service: dict[str, str]
 ) -> None:
     folder = Path(service["STATE_DIRECTORY"])
@@ -168,7 +168,7 @@ def test_configuration_and_sum_that_are_gone_or_damaged_are_replaced_by_the_newe
         accepted_config(accepted, service)
 
 
-def test_a_kept_one_that_this_version_does_not_fly_is_passed_over(
+def test_a_stored_configuration_that_is_invalid_for_this_version_is_skipped(
     accepted: Path, service: dict[str, str]
 ) -> None:
     FlownConfig("name: of another version\n", Path(service["STATE_DIRECTORY"])).keep()
@@ -197,7 +197,7 @@ def test_a_configuration_is_kept_after_a_good_start_and_mended_where_it_was_dama
     assert texts_kept(tmp_path) == [TEXT, TEXT + "#"], "what flies again is the newest again"
 
 
-def test_a_crash_anywhere_while_one_is_kept_leaves_the_others(
+def test_a_crash_while_a_configuration_is_stored_leaves_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A crash at any change of the disk leaves the accepted configuration intact while another is stored."""

@@ -124,7 +124,7 @@ def test_arrays_of_megabytes_do_not_stretch_the_heap_of_a_settled_process() -> N
     assert int(_said(_FRAMES, "settled")) < 1_000
 
 
-def test_garbage_that_a_failure_made_is_found_and_what_stays_is_looked_at_once() -> None:
+def test_garbage_of_a_failure_is_collected_and_remaining_objects_are_examined_once() -> None:
     assert _said(_LOOPS) == "True True True False"
 
 

@@ -25,7 +25,7 @@ from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock
 
 
-def test_it_waits_twice_as_long_each_time_up_to_half_a_minute() -> None:
+def test_the_pause_doubles_with_each_attempt_up_to_half_a_minute() -> None:
     first = pauses()
     found = [next(first) for _ in range(12)]
     assert found[:8] == [0.2 * 2**number for number in range(8)]
@@ -59,7 +59,7 @@ class Attempts:
         self.open -= 1
 
 
-def test_what_may_pass_is_waited_for_and_reported(
+def test_transient_faults_are_waited_for_and_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = ManualClock(0)

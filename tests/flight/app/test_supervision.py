@@ -79,7 +79,9 @@ def supervision(watchers: Watchers, events: Events, clock: ManualClock, coils: C
     return Supervision(watchers, watchers, clock, events, "flying", coils.ticker)
 
 
-def test_ready_is_said_once_after_the_first_good_cycle(supervision: Supervision, watchers: Watchers) -> None:
+def test_ready_is_reported_once_after_the_first_completed_cycle(
+    supervision: Supervision, watchers: Watchers
+) -> None:
     supervision.feed()
     assert watchers.calls == ["feed"], "progress without a good cycle is not reported as readiness"
     supervision.beat()
@@ -87,7 +89,7 @@ def test_ready_is_said_once_after_the_first_good_cycle(supervision: Supervision,
     assert watchers.calls == ["feed", "beat", "ready: flying", "beat"]
 
 
-def test_what_becomes_of_the_guardian_is_reported_as_events(
+def test_changes_of_the_guardian_are_reported_as_events(
     supervision: Supervision, watchers: Watchers, events: Events
 ) -> None:
     watchers.news = list(GuardianNews)

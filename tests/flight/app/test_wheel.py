@@ -18,13 +18,13 @@ from flight.schema.document import FOLDER, config_path, names
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_a_bare_name_is_a_carried_configuration_and_a_path_stays_a_path() -> None:
+def test_a_bare_name_is_a_packaged_configuration_and_a_path_stays_a_path() -> None:
     assert config_path("step_demo").samefile(ROOT / "config" / "step_demo.yaml")
     for path in ("step_demo.yaml", "./step_demo", "config/step_demo", "unknown", "", ".", "/"):
         assert config_path(path) == Path(path)
 
 
-def test_the_repository_s_folder_is_the_one_source_of_the_carried_configurations() -> None:
+def test_the_folder_of_the_repository_is_the_only_source_of_packaged_configurations() -> None:
     assert FOLDER.resolve() == ROOT / "config"
     assert names() == sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
 

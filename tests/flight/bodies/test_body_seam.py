@@ -46,7 +46,7 @@ def test_the_attitude_packet_is_the_control_packet_in_three_axes(flown: Run) -> 
     np.testing.assert_allclose(attitude["target"][-1], about_axis_y(2.0 * np.arcsin(-0.3)), atol=1e-12)
 
 
-def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
+def test_a_body_of_a_third_party_is_flown_by_its_name(tmp_path: Path) -> None:
     """The third-party PD controller holds the target in the testbed world.
 
     The loop contains no code for this body.
@@ -66,7 +66,7 @@ def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
         ("tests.flight.bodies.plain_body:NO_BODY", "not a BodyKind"),
     ],
 )
-def test_a_body_that_is_not_there_is_one_clear_line(name: str, complaint: str) -> None:
+def test_a_missing_body_is_reported_in_one_line(name: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         body_kind(structs.replace(demo_config(1.0), body=name))
 

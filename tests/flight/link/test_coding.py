@@ -182,7 +182,7 @@ def test_cltus_are_found_among_noise_and_cut_units(seed: int, kind: str, step: i
     assert found == frames
 
 
-def test_a_stream_of_start_sequences_ends_neither_time_nor_memory() -> None:
+def test_a_stream_of_start_sequences_takes_limited_time_and_memory() -> None:
     stream = CltuStream(None, lambda _: None)
     for _ in range(20):
         assert stream.add(bytes.fromhex("EB90") * 5000) == []

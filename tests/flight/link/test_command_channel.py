@@ -123,9 +123,7 @@ def test_a_flight_that_does_not_answer_is_reported(place: Path, capsys: pytest.C
     assert "no answer within 0.05 s" in capsys.readouterr().err
 
 
-def test_an_answer_of_a_mode_that_there_is_not_is_none(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_answer_with_an_unknown_mode_is_invalid(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     channel = open_unix(place)
     thread = answer_once(channel, [], mode=200)
     status = main(["command", "--to", str(place), "ping"])
@@ -158,7 +156,7 @@ def test_a_flood_is_taken_in_small_portions_and_a_long_datagram_is_cut(place: Pa
     channel.close()
 
 
-def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_no_harm(
+def test_a_sender_without_an_address_or_with_a_closed_socket_gets_no_answer_and_does_no_harm(
     place: Path, tmp_path: Path
 ) -> None:
     channel = open_unix(place)
@@ -243,7 +241,7 @@ def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
         assert senders[0].startswith(folder)
 
 
-def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(place: Path) -> None:
+def test_a_stale_socket_is_replaced_but_no_other_file(place: Path) -> None:
     open_unix(place)._socket.close()  # as after a kill, the socket file remains
     second = open_unix(place)
     with pytest.raises(UsageError, match="another flight listens there"):

@@ -65,7 +65,7 @@ ANY: st.SearchStrategy[Command] = st.one_of(
 
 
 @given(ANY, st.integers(0, 2**62))
-def test_a_command_comes_out_as_it_went_in(command: Command, utc_ns: int) -> None:
+def test_a_command_is_equal_after_packing_and_unpacking(command: Command, utc_ns: int) -> None:
     data = CommandPacker().pack(command, utc_ns)
     assert unpack(data) == command
     assert command.packet.name in LAYOUTS
@@ -115,7 +115,7 @@ def test_values_that_cannot_be_obeyed_are_refused_before_they_are_sent(
         CommandPacker().pack(command, 0)
 
 
-def test_and_refused_again_where_they_arrive() -> None:
+def test_values_out_of_range_are_refused_again_on_arrival() -> None:
     """A complete packet with a value out of range is refused on arrival, whatever its sender accepts."""
     for packet, fields in (("slew", {"q2": math.nan}), ("mode", {"mode": 99}), ("mode", {"mode": 0})):
         layout = LAYOUTS[packet]
@@ -133,7 +133,7 @@ def test_a_packet_cut_short_or_grown_is_refused(cut: int) -> None:
             unpack(wrong)
 
 
-def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
+def test_random_bytes_are_always_refused_by_a_command_error() -> None:
     """None of 20,000 random packets (seed 7), half of them with a valid header, is accepted as a command."""
     generator = np.random.default_rng(7)
     heads = [layout.identifier.to_bytes(2, "big") for layout in LAYOUTS.values()]
@@ -158,7 +158,7 @@ def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
         (Goal.OBJECT, (), 0.5, "free roll"),
     ],
 )
-def test_a_target_that_nothing_can_point_to_is_refused(
+def test_a_target_that_defines_no_attitude_is_refused(
     goal: Goal, numbers: tuple[float, ...], roll: float | None, why: str
 ) -> None:
     with pytest.raises(UsageError, match=why):

@@ -107,7 +107,9 @@ def test_a_frame_that_is_only_authenticated_has_readable_data_and_the_mac_of_the
     assert mac == gmac(KEYS[2], iv, covered)
 
 
-def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vault, ground: Vault) -> None:
+def test_a_frame_is_accepted_once_and_forged_frames_are_refused_with_their_cause(
+    sky: Vault, ground: Vault
+) -> None:
     entrance, maker = gate(sky), Ground(ground)
     first, second = maker.frame(b"one"), maker.frame(b"two")
     assert entrance.admit(second).data == b"two"
@@ -141,7 +143,7 @@ def skip(at: Vault, count: int) -> None:
     at.write(replace(entry, unused=entry.unused + count))
 
 
-def test_a_restart_lets_nothing_in_again_and_one_copy_is_enough(
+def test_after_a_restart_no_frame_is_accepted_again_and_one_copy_is_sufficient(
     sky: Vault, ground: Vault, tmp_path: Path
 ) -> None:
     frame = Ground(ground).frame(b"one")
@@ -247,7 +249,7 @@ def test_a_new_key_of_the_same_generation_replaces_the_old_key(sky: Vault, groun
     assert entrance.admit(Ground(ground).frame(b"new")).data == b"new"
 
 
-def test_a_counter_that_cannot_be_stored_lets_nothing_in(
+def test_no_frame_is_accepted_if_its_counter_cannot_be_stored(
     sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entrance, frame = gate(sky), Ground(ground).frame(b"one")
@@ -280,7 +282,7 @@ def test_a_counter_that_could_not_be_read_at_the_start_is_read_when_a_frame_need
     assert entrance.admit(second).data == b"two"
 
 
-def test_a_folder_that_takes_nothing_lets_nothing_in(
+def test_no_frame_is_accepted_if_the_folder_cannot_be_written(
     sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entrance, frame = gate(sky), Ground(ground).frame(b"one")

@@ -34,7 +34,7 @@ ALLOWED = {
 """Functions whose calls may block on the control thread, by the start of the call's name, with the reason."""
 
 
-def test_the_control_thread_waits_nowhere_else() -> None:
+def test_the_control_thread_makes_only_the_permitted_waiting_calls() -> None:
     with tempfile.TemporaryDirectory(prefix="kc-") as name:  # the path of a UNIX socket must be short
         place = Path(name)
         (place / "devices").mkdir()

@@ -13,13 +13,13 @@ OBEYS = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "")
 REFUSES = OBEYS._replace(error="pca9685 at 0x40: does not keep the values written to its output registers")
 
 
-def test_what_a_chip_carries_that_obeys_is_known() -> None:
+def test_the_currents_of_a_chip_that_obeys_are_known() -> None:
     knowledge = CoilKnowledge()
     looks = [knowledge.look(OBEYS, 1000 * MS + 25 * MS * cycle) for cycle in range(4)]
     assert looks == [CurrentValidity(True, True, -1, None)] * 4
 
 
-def test_what_a_chip_does_not_keep_is_in_doubt_since_it_was_last_read_back() -> None:
+def test_the_currents_of_a_chip_that_refuses_are_unknown_since_it_was_last_read_back() -> None:
     knowledge = CoilKnowledge()
     knowledge.look(OBEYS, 1000 * MS)
     first, second = (knowledge.look(REFUSES, now * MS) for now in (1025, 1050))
@@ -40,7 +40,7 @@ def test_a_suspected_coil_may_carry_any_current_since_before_the_suspicion() -> 
     assert over == CurrentValidity(True, True, 1075 * MS, None), "unknown until the suspicion was over"
 
 
-def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None:
+def test_the_currents_during_a_stall_of_the_loop_are_unknown() -> None:
     knowledge = CoilKnowledge()
     knowledge.look(OBEYS, 1000 * MS)
     assert knowledge.look(OBEYS, 1150 * MS).since_last_look, "no guardian has acted yet"
@@ -49,7 +49,7 @@ def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None
     assert knowledge.look(OBEYS, 1475 * MS) == CurrentValidity(True, True, 1450 * MS, None)
 
 
-def test_no_guardian_acts_in_a_gap_that_is_not_seen() -> None:
+def test_no_guardian_acts_in_a_gap_that_the_loop_does_not_detect() -> None:
     """The guardian never acts in a heartbeat gap that the loop fails to detect.
 
     The gap may be nearly two cycles longer than the interval between the loop's checks.

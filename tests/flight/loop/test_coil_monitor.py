@@ -278,7 +278,7 @@ def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
     assert seen.readings > 500
 
 
-def test_a_monitor_that_lies_is_doubted_and_no_coil_is_taken_out_of_use() -> None:
+def test_a_faulty_monitor_is_distrusted_and_no_coil_is_isolated() -> None:
     seen = observe(hold(TARGET), 15.0, [f"monitor: wrong @ {FAULT_AT}"])
     assert seen.found == []
     assert "the monitor measures 2.0" in seen.watch.monitor_doubted
@@ -360,7 +360,7 @@ def test_braking_that_does_not_help_is_ended() -> None:
     assert leg.brake == {0, 1, 2}, "once all was normal it is looked for again"
 
 
-def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_more() -> None:
+def test_a_brake_that_does_not_confirm_a_stuck_leg_is_released() -> None:
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     watch._give(0, CoilFault.A_HIGH, 0, "a guess")
     watch._proof.add(0)

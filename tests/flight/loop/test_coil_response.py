@@ -208,7 +208,7 @@ def test_a_coil_that_makes_no_torque_is_found_at_currents_too_small_for_the_moni
 
 
 @pytest.mark.parametrize("gain", [0.0, 1.0])
-def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
+def test_no_coil_is_suspected_if_all_coils_are_healthy_or_none_has_an_effect(gain: float) -> None:
     """If no coil has an effect, no coil is suspected, because a wrong gyro or field is more likely."""
     body = Orbiting(np.full(3, gain), speed=0.02)
     body.fly(120.0, weak=True)

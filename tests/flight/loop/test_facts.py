@@ -39,7 +39,7 @@ def state(record: EventRecord, fact: facts.Fact, *statements: bool | None) -> No
         record.facts.update(fact, holds, 0, "text")
 
 
-def test_the_table_that_flies_is_sound() -> None:
+def test_the_table_of_facts_is_valid() -> None:
     check(FACTS, modes_moved_by)
 
 
@@ -130,7 +130,7 @@ def test_the_tables_of_the_design_name_facts() -> None:
     assert {*PERSISTENCE, *EVENTS_OF} <= {fact.name for fact in FACTS}
 
 
-def test_a_fact_counts_after_its_number_of_statements_in_a_row_and_not_before() -> None:
+def test_a_fact_becomes_true_after_its_number_of_consecutive_updates() -> None:
     record = EventRecord()
     record.facts.enter(Mode.HOLD)
     state(record, facts.TUMBLING, *[True] * 7, False, *[True] * 7)
@@ -140,7 +140,7 @@ def test_a_fact_counts_after_its_number_of_statements_in_a_row_and_not_before() 
     assert record.names == ["tumbling"]
 
 
-def test_a_fact_ends_after_its_number_of_statements_with_one_event_each_way() -> None:
+def test_a_fact_ends_after_its_number_of_consecutive_updates_with_one_event_each_way() -> None:
     record = EventRecord()
     state(record, facts.IMU_POOR, *[True] * 9)
     state(record, facts.IMU_POOR, *[False] * 7, True, *[False] * 7)
@@ -149,7 +149,7 @@ def test_a_fact_ends_after_its_number_of_statements_with_one_event_each_way() ->
     assert record.names == ["stream-poor", "stream-good"]
 
 
-def test_what_cannot_be_known_neither_counts_nor_mends() -> None:
+def test_an_unknown_condition_neither_begins_nor_ends_a_fact() -> None:
     record = EventRecord()
     state(record, facts.DISK_LOW, True, None, True)
     assert record.facts.holds(facts.DISK_LOW)
@@ -167,14 +167,14 @@ def test_a_latched_fact_stays_until_it_is_cleared_by_the_name_of_its_event() -> 
     assert not record.facts.clear("too-hot"), "there is nothing left to clear"
 
 
-def test_a_fact_that_is_not_latched_is_not_to_be_cleared_away() -> None:
+def test_a_fact_that_is_not_latched_cannot_be_cleared() -> None:
     record = EventRecord()
     state(record, facts.IMU_SILENT, True)
     assert not record.facts.clear("imu-silent")
     assert record.facts.holds(facts.IMU_SILENT)
 
 
-def test_in_a_mode_that_does_not_watch_it_a_fact_does_not_count_and_restarts_after() -> None:
+def test_a_fact_is_reset_in_a_mode_that_does_not_monitor_it() -> None:
     record = EventRecord()
     record.facts.enter(Mode.HOLD)
     state(record, facts.TUMBLING, *[True] * 7)
@@ -249,7 +249,7 @@ def test_a_stream_without_a_reading_is_awaited_for_its_age_limit_after_the_start
     assert watch.state(5_200_000_000) is StreamState.GOOD
 
 
-def test_it_is_good_while_it_comes_at_its_rate_and_stale_once_older_than_its_limit() -> None:
+def test_a_stream_is_good_at_its_rate_and_stale_beyond_its_age_limit() -> None:
     watch, now = fed(3.0)
     assert watch.state(now) is StreamState.GOOD
     assert watch.rate(now) == pytest.approx(40.0, abs=0.5)
@@ -263,7 +263,7 @@ def test_a_value_out_of_its_range_is_invalid_however_fresh(value: float) -> None
     assert watch.state(now) is StreamState.INVALID
 
 
-def test_half_its_rate_is_slow_once_a_whole_window_has_been_seen() -> None:
+def test_a_stream_at_half_its_rate_is_slow_after_a_whole_window() -> None:
     early, now = fed(1.5, every=2)
     assert early.state(now) is StreamState.GOOD, "not known yet"
     late, now = fed(4.0, every=2)
@@ -277,7 +277,7 @@ def test_after_a_silence_the_rate_is_counted_again() -> None:
     assert watch.state(now + 6_000_000_000) is StreamState.GOOD
 
 
-def test_what_is_not_fitted_takes_no_notes() -> None:
+def test_a_stream_of_a_device_that_is_not_fitted_ignores_readings() -> None:
     streams = Streams((ROW,))
     streams.note("camera", 1)
     assert streams.state("camera", 2) is StreamState.NOT_FITTED

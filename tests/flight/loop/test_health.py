@@ -91,7 +91,7 @@ def test_a_board_that_is_too_hot_is_latched() -> None:
     assert not record.facts.holds(facts.HOT)
 
 
-def test_what_the_board_does_not_have_is_neither_good_nor_bad() -> None:
+def test_quantities_that_the_board_does_not_measure_are_unknown() -> None:
     samples = [sample(5.0 * k, temperature=math.nan, disk_free=math.nan) for k in range(10)]
     _, record = watched(samples)
     assert record.names == []
@@ -128,7 +128,7 @@ def test_a_step_of_the_wall_clock_is_seen_either_way_and_slow_drift_is_not() -> 
     assert watch.steps == 2
 
 
-def test_the_board_shows_of_this_very_process(tmp_path: Path) -> None:
+def test_the_board_measures_time_and_memory_of_this_process(tmp_path: Path) -> None:
     read = Board(tmp_path)(123)
     assert read.time_ns == 123
     assert 0.0 < read.cpu <= sum(os.times()[:2]) + 0.05

@@ -115,7 +115,7 @@ def test_rounds_come_often_while_they_are_needed_and_seldom_otherwise() -> None:
     assert (record["frames"], record["sun_cameras"], record["sun_used"], record["nadir_used"]) == (3, 2, 1, 0)
 
 
-def test_a_dead_camera_does_not_keep_the_others_and_is_reported_until_it_is_back() -> None:
+def test_a_dead_camera_does_not_delay_the_others_and_is_reported_until_its_recovery() -> None:
     bench = Bench()
     bench.cameras[1].dead = True
     bench.fly(130)
@@ -126,7 +126,7 @@ def test_a_dead_camera_does_not_keep_the_others_and_is_reported_until_it_is_back
     assert not bench.said[-1]
 
 
-def test_a_worker_that_is_not_there_is_reported_and_the_next_round_comes() -> None:
+def test_an_unavailable_worker_is_reported_and_the_next_round_comes() -> None:
     bench = Bench()
     bench.busy = True
     bench.fly(4)
@@ -145,7 +145,7 @@ def test_a_camera_that_repeats_its_picture_gives_no_frames() -> None:
     assert bench.said[-1]
 
 
-def test_pictures_that_an_attitude_denies_are_reported_where_one_judges_them() -> None:
+def test_images_that_contradict_a_known_attitude_are_reported() -> None:
     bench = Bench()
     bench.denied = None
     bench.fly(11)

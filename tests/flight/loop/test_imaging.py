@@ -27,7 +27,7 @@ def exposed(noise: float = 10.0, dtype: str = "uint16") -> Image:
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
-def test_frames_of_a_living_camera_are_of_one_piece(dtype: str) -> None:
+def test_frames_of_a_working_camera_are_not_torn(dtype: str) -> None:
     rows = RepeatedRows()
     assert [rows.count(exposed(dtype=dtype)) for _ in range(50)] == [0] * 50
 
@@ -50,7 +50,7 @@ def test_the_same_frame_again_is_not_torn_but_frozen() -> None:
     assert rows.count(frame) == 0
 
 
-def test_rows_without_noise_say_nothing() -> None:
+def test_rows_without_noise_do_not_count_as_repeated() -> None:
     """Rows without noise are not counted as repeated.
 
     A dark 8-bit sensor gives rows of zeros and constant hot pixels.

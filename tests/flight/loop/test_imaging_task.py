@@ -325,7 +325,7 @@ def test_a_frame_is_judged_by_its_age_since_the_end_of_its_exposure(
     assert len(bench.jobs) == 1
 
 
-def test_a_frame_clears_what_was_due_and_its_age_counts_from_its_exposure() -> None:
+def test_a_frame_ends_the_wait_for_it_and_its_age_counts_from_its_exposure() -> None:
     bench = Bench()
     bench.task.trigger(bench.cycle(1 * S))
     bench.take(1, 1 * S, 1300 * MS)

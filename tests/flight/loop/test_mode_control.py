@@ -63,14 +63,14 @@ def test_a_spin_in_safe_is_braked_until_it_has_been_slow_and_then_the_sun_is_sou
     assert watched.watch.acquires_sun
 
 
-def test_one_fast_sample_brakes_nothing(watched: Watched) -> None:
+def test_one_fast_sample_does_not_start_detumbling(watched: Watched) -> None:
     watched.safe(0.5 * FAST, 3)
     watched.safe(20.0 * FAST, 1)
     watched.safe(0.5 * FAST, 3)
     assert "brake" not in watched.began
 
 
-def test_a_latched_fault_bars_both_also_what_has_begun(watched: Watched) -> None:
+def test_a_latched_fault_prevents_and_ends_detumbling_and_sun_acquisition_in_safe(watched: Watched) -> None:
     watched.safe(1.5 * FAST, 5, barred=True)
     assert not watched.began
     watched.safe(1.5 * FAST, 5)
@@ -102,7 +102,7 @@ def test_the_flight_starts_in_its_initial_mode_when_readings_and_coils_are_there
     assert bench.events == [], "the end of the boot is not reported as an event"
 
 
-def test_a_boot_without_readings_is_reported_after_its_patience() -> None:
+def test_a_boot_without_readings_is_reported_after_its_timeout() -> None:
     bench = ModeBench(settings=Modes(initial="hold", boot_patience=5.0))
     for _ in range(5):
         bench.step(known=False)
@@ -182,7 +182,7 @@ def test_a_satellite_that_acquires_its_attitude_waits_for_an_accurate_estimate()
     assert bench.texts[-2] == "no body rate for 6 s"
 
 
-def test_a_hold_with_a_large_error_is_impossible_after_its_patience() -> None:
+def test_a_hold_with_a_large_error_is_impossible_after_its_timeout() -> None:
     bench = flying(hold_error=0.5, hold_patience=3.0)
     bench.targets.off = 0.5
     for _ in range(10):

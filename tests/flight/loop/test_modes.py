@@ -49,12 +49,12 @@ def in_mode(mode: Mode, table: Table = TRANSITIONS) -> ModeMachine:
     return machine
 
 
-def test_the_table_that_flies_is_sound() -> None:
+def test_the_transition_table_is_valid() -> None:
     check(TRANSITIONS)
 
 
 @pytest.mark.parametrize(("mode", "trigger"), list(product(Mode, SAFING)))
-def test_whatever_asks_for_safe_gets_it_from_every_mode(mode: Mode, trigger: Trigger) -> None:
+def test_every_trigger_of_safe_leads_to_safe_from_every_mode(mode: Mode, trigger: Trigger) -> None:
     machine = in_mode(mode)
     machine.fire(trigger, 7)
     assert machine.mode is Mode.SAFE
@@ -103,7 +103,7 @@ def test_boot_is_for_the_start_only() -> None:
 
 
 @pytest.mark.parametrize(("mode", "trigger"), list(product(Mode, Trigger)))
-def test_a_table_with_a_hole_is_refused_by_name(mode: Mode, trigger: Trigger) -> None:
+def test_a_table_without_an_entry_is_refused_by_name(mode: Mode, trigger: Trigger) -> None:
     table = copied()
     del table[mode][trigger]
     with pytest.raises(KnightCubeError, match=f"{mode.label} has no entry for '{trigger.value}'"):

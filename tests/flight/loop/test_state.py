@@ -80,7 +80,7 @@ def test_crashes_at_once_are_never_forgotten_by_waiting() -> None:
         assert boot_record(begin_boot(state, LABEL), 600.0).unclean_recent == number
 
 
-def test_a_clock_that_lies_changes_the_labels_and_nothing_else() -> None:
+def test_a_wrong_clock_changes_only_the_labels() -> None:
     honest, lying = StoredState(), StoredState()
     for number, clean in enumerate((False, True, False, False)):
         honest = boot(honest, 40.0, clean, f"2026-01-0{number + 1}T00:00:00Z")
@@ -98,14 +98,14 @@ def test_only_the_newest_crashes_are_kept() -> None:
     assert crashes[-1].boot == state.boot_count
 
 
-def test_what_is_learned_again_replaces_the_old_and_the_rest_stays() -> None:
+def test_newly_estimated_values_replace_old_ones_and_the_others_stay() -> None:
     first, second = Learned((1.0,), ((0.1,),)), Learned((2.0,), ((0.1,),))
     begun = begin_boot(StoredState(learned={"a": first, "b": first}), LABEL)
     state = state_after(begun, 1.0, Noted("", {"a": second}, begun.table), LABEL)
     assert state.learned == {"a": second, "b": first}
 
 
-def test_a_table_that_a_crash_left_unproven_gives_way_to_the_one_before() -> None:
+def test_an_unproven_table_is_replaced_by_the_previous_one_after_a_crash() -> None:
     new = KeptTable(values={"modes.known_for": 2.0}, before={"modes.known_for": 3.0}, proven=False, loads=2)
     proven = KeptTable(values=new.values, before=new.before, proven=True, loads=2)
     for table, clean, flown in ((new, False, 3.0), (new, True, 2.0), (proven, False, 2.0)):
@@ -180,7 +180,7 @@ def test_the_second_boot_knows_the_plant_better_after_a_second_than_the_first_di
     assert better["damping"] < 1.0
 
 
-def test_what_may_have_changed_widens_the_start_and_what_is_known_stays_known() -> None:
+def test_possible_changes_increase_the_prior_variances_and_known_values_stay_known() -> None:
     believed = slow_prior(SUSPENDED, SETTINGS)
     learned = {GYRO_BIAS: Learned.of(np.array([5e-4, 4e-4, 0.0]), np.diag([0.0, 1e-10, 0.0]))}
     prior, problems = start_from(learned, believed, CHANGED)
@@ -198,7 +198,7 @@ def test_what_may_have_changed_widens_the_start_and_what_is_known_stays_known() 
         (GYRO_BIAS, [0.0], "3 values are required"),
     ],
 )
-def test_what_cannot_be_true_is_not_taken_and_reported(name: str, values: list[float], why: str) -> None:
+def test_impossible_stored_values_are_reported_and_not_used(name: str, values: list[float], why: str) -> None:
     believed = slow_prior(SUSPENDED, SETTINGS)
     learned = {name: Learned.of(np.array(values), np.eye(len(values)) * 1e-12)}
     prior, (problem,) = start_from(learned, believed, CHANGED)
@@ -237,7 +237,7 @@ def test_what_was_learned_of_other_devices_is_forgotten_and_reported() -> None:
     assert not keeper_on(disk, "b").notices(), "reported once"
 
 
-def test_a_plant_that_is_configured_otherwise_is_another_one() -> None:
+def test_a_changed_configuration_of_the_plant_counts_as_another_plant() -> None:
     config = flights.demo_config(1.0)
     heavier = configuration.replace(config, plant=configuration.replace(config.plant, inertia=2e-3))
     longer = configuration.replace(config, duration=2.0)

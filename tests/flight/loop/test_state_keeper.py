@@ -48,7 +48,7 @@ def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKe
     return StateKeeper(StateStore(folder, notices.report, disk), notices, clock, period_ns=10 * SECOND)
 
 
-def test_a_table_outlives_a_clean_end_and_a_new_one_no_crash() -> None:
+def test_a_table_survives_a_clean_end_and_a_new_table_does_not_survive_a_crash() -> None:
     disk, clock = Disk(), ManualClock()
     old, new = {"modes.known_for": 3.0}, {"modes.known_for": 2.0}
     keeper = keeper_on(disk, clock)
@@ -144,7 +144,7 @@ def test_damaged_files_are_reported_through_the_notices(tmp_path: Path) -> None:
     assert keeper.record.unclean_recent == 1
 
 
-def test_notices_that_nobody_takes_do_not_pile_up() -> None:
+def test_the_number_of_notices_that_are_not_read_is_limited() -> None:
     notices = Notices()
     for number in range(1000):
         notices.report(events.STATE_UNWRITTEN, str(number))

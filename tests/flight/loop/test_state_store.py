@@ -220,7 +220,7 @@ def _with_crc(text: str) -> bytes:
         ("unknown", 1),
     ],
 )
-def test_a_right_checksum_does_not_make_a_wrong_content_right(key: str, value: object) -> None:
+def test_a_wrong_content_with_a_valid_checksum_is_refused(key: str, value: object) -> None:
     good = json.loads(encode(1, state_of(1)).partition(b"\n")[0])
     assert decode(_with_crc(json.dumps(good))).state == state_of(1)
     good["state"][key] = value
@@ -229,7 +229,7 @@ def test_a_right_checksum_does_not_make_a_wrong_content_right(key: str, value: o
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_what_is_not_finite_is_refused_before_anything_is_written(tmp_path: Path, bad: float) -> None:
+def test_a_state_that_is_not_finite_is_refused_before_it_is_written(tmp_path: Path, bad: float) -> None:
     store = StateStore(tmp_path, Reports())
     with pytest.raises(ValueError, match="finite"):
         store.store(StoredState(learned={"b": Learned((bad,), ((1.0,),))}))

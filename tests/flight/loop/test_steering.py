@@ -375,7 +375,7 @@ def test_the_ground_can_trust_all_coils_again() -> None:
     assert told == [("coil-trusted", 9, "all coils are in use again")]
 
 
-def test_a_look_passes_the_command_the_readings_and_the_supply_current_to_the_monitor() -> None:
+def test_a_check_passes_the_command_the_readings_and_the_supply_current_to_the_monitor() -> None:
     drive, _, _ = _drive([False, False, False])
     watch = Mock(news=list, verdicts=(), braked=NO_AXES, suspicion="", monitor_doubted="odd")
     watch.begin_trial.return_value = None

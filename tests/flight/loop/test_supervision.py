@@ -16,7 +16,7 @@ def groups() -> tuple[RateGroup, RateGroup]:
     )
 
 
-def test_groups_that_complete_their_cycles_get_on_and_one_that_only_fails_does_not() -> None:
+def test_groups_with_completed_cycles_progress_and_a_group_that_only_fails_does_not() -> None:
     control, planning = groups()
     watch = GroupsAndWorkers([control, planning], [])
     watch.begin(0)
@@ -37,7 +37,7 @@ def test_a_slow_group_has_three_of_its_periods() -> None:
         assert still == (["planning"] if quarter > 60 else [])
 
 
-def test_a_worker_gets_on_while_idle_and_until_its_patience_is_over() -> None:
+def test_a_worker_counts_as_progressing_while_idle_and_until_its_timeout() -> None:
     busy: list[int | None] = [None]
     watch = GroupsAndWorkers([], [WorkerWatch("planner", lambda: busy[0], 4 * SECOND)])
     assert watch.stalled(100 * SECOND) == []

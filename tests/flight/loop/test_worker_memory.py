@@ -33,7 +33,7 @@ def fill_and_free(_: Any) -> tuple[int, float]:
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="this libc has no malloc_trim")
-def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
+def test_a_worker_frees_the_memory_of_a_job_after_its_result_is_sent() -> None:
     with closing(
         ProcessRunner(SystemClock(), [Worker("filler", fill_and_free, 0, 20_000_000_000)])
     ) as runner:

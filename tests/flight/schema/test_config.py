@@ -47,7 +47,7 @@ def test_the_demonstration_is_the_thesis(name: str) -> None:
     assert loaded.coils.current_limit == 0.148
 
 
-def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
+def test_the_thesis_configuration_has_the_thesis_control_and_the_world_of_the_demonstration() -> None:
     demo, thesis = (as_testbed(reader.load(FOLDER / name)) for name in ("step_demo.yaml", "step_thesis.yaml"))
     assert (thesis.control.tracker, thesis.guidance.strategy) == ("thesis", "receding")
     assert (thesis.control.state_weight, thesis.control.control_weight) == (20.0, 1.0)
@@ -267,7 +267,7 @@ def test_a_time_line_points_a_satellite_and_never_the_testbed() -> None:
         reader.parse(DEMO.replace("duration:", line, 1), "demo.yaml")
 
 
-def test_a_satellite_that_follows_an_object_needs_eyes_and_both_angles() -> None:
+def test_a_satellite_that_follows_an_object_needs_a_camera_and_both_angles() -> None:
     place = "point: object, right_ascension_deg: 90, declination_deg: -30"
     own = ORBIT.replace("star_tracker: {}", "star_tracker: {}\n  objects: {}", 1)
     line = f"commands: {{timeline: [{{at: 9.0, {place}}}]}}\nduration:"
@@ -296,7 +296,7 @@ def test_numbers_without_a_point_are_numbers() -> None:
     assert as_testbed(reader.parse(text)).plant.inertia == 2e-3
 
 
-def test_a_testbed_without_a_camera_says_none() -> None:
+def test_the_shipped_testbed_has_no_camera() -> None:
     assert reader.load(FOLDER / "testbed.yaml").camera is None
 
 

@@ -39,7 +39,7 @@ def networks(lines: str, commands: str = "{socket: /run/x}") -> list[str]:
         ("udp: '10.1.1.1:5', peers: [10.2.0.1], kiss: '10.3.3.3:8001'", ["10.2.0.1/32", "10.3.3.0/24"]),
     ],
 )
-def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expected: list[str]) -> None:
+def test_the_default_peers_are_the_network_of_the_address(lines: str, expected: list[str]) -> None:
     assert networks(lines) == expected
 
 
@@ -78,13 +78,13 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
         ("kiss: '127.0.0.1:8001', call_signs: [OK0GND, OK0SAT-16]", "`link.call_signs"),
     ],
 )
-def test_lines_that_make_no_sense_are_refused_with_what_would(lines: str, problem: str) -> None:
+def test_impossible_lines_are_refused_with_the_remedy(lines: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
         networks(lines)
 
 
 @pytest.mark.parametrize("address", ["192.168.7.2:5000", "0.0.0.0:5000", "board:5000"])
-def test_plain_commands_from_beyond_the_machine_are_refused(address: str) -> None:
+def test_unprotected_commands_from_other_machines_are_refused(address: str) -> None:
     with pytest.raises(
         ConfigError, match=r"`commands.udp` .* accepts unprotected commands from other machines"
     ):
@@ -96,7 +96,7 @@ def test_a_link_needs_the_flights_socket() -> None:
         networks("udp: '10.0.0.1:5000'", "{}")
 
 
-def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
+def test_a_datagram_from_an_unknown_address_is_ignored() -> None:
     ping = CommandPacker().pack(Ping(), 1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for peers, heard in ((["127.0.0.0/8"], [ping]), (["192.0.2.0/24"], [])):

@@ -121,7 +121,7 @@ def _disagreements(kind: type, section: type[msgspec.Struct]) -> list[str]:
     return found
 
 
-def test_no_default_stands_twice_with_different_values() -> None:
+def test_no_default_is_defined_twice_with_different_values() -> None:
     kinds = _settings()
     found = [
         line

@@ -123,7 +123,7 @@ def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> Non
         (WELL, {"restart": "the loop stood"}, "the loop stood"),
     ],
 )
-def test_what_counts_as_a_problem_of_a_flight(
+def test_alarms_faults_and_interruptions_are_problems_of_a_flight(
     ending: FlightEnding, changes: dict[str, object], problem: str | None
 ) -> None:
     result = replace(RunResult(Path(), "stopped by SIGINT", False, "", ending), **changes)  # type: ignore[arg-type]

@@ -63,7 +63,7 @@ def test_files_come_down_and_go_up_by_the_command(
         (["cancel", "1", "7"], "no transfer 7"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(
+def test_impossible_requests_are_refused_in_one_line(
     way: list[str], words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*way, *words]) == 1
@@ -72,7 +72,7 @@ def test_what_cannot_be_is_said_in_one_line(
     assert error.count("\n") == 1
 
 
-def test_ctrl_c_keeps_what_came_and_a_second_call_has_the_folder_to_itself(
+def test_a_second_process_is_refused_and_ctrl_c_says_how_to_continue(
     way: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [sys.executable, "-m", "flight", *way, "--rate", "2000", "put", "release", str(Path(__file__))]

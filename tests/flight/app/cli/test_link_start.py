@@ -133,7 +133,9 @@ def test_no_line_is_opened_during_the_separation_inhibit(
     assert service.process.wait(_LONGEST_S) == 0
 
 
-def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callable[[Path], Service]) -> None:
+def test_the_start_waits_for_configuration_keys_and_the_other_link_in_turn(
+    place: Path, start: Callable[[Path], Service]
+) -> None:
     """The start waits for a configuration, for unmounted keys, and for the end of another link process."""
     whole = write_linked_config(place, udp="127.0.0.1:0")
     config = place / "later.yaml"

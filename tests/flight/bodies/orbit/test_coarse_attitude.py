@@ -154,7 +154,7 @@ def test_a_field_that_is_too_strong_starts_nothing_and_is_reported() -> None:
     assert not lit.filter.runs
 
 
-def test_in_the_shadow_the_strings_are_not_asked_for_a_sun() -> None:
+def test_in_the_shadow_the_strings_are_neither_used_nor_reported_as_faulty() -> None:
     lit = Lit(3, sunlit=0.0)
     lit.fly(4)
     assert set(lit.wrong) == {None}

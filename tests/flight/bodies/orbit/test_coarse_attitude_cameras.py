@@ -123,7 +123,7 @@ def test_the_first_attitude_counts_the_misalignments_of_the_cameras_of_sun_and_n
     assert 0.3 < np.mean(squares) < 1.3
 
 
-def test_a_nadir_of_eleven_degrees_starts_it_too_and_alone_says_nothing() -> None:
+def test_a_nadir_with_a_sigma_of_eleven_degrees_starts_the_filter() -> None:
     craft = Still(2)
     craft.rest(3)
     assert craft.look(HorizonCameraResult(None, None)) == (False, False)
@@ -131,7 +131,7 @@ def test_a_nadir_of_eleven_degrees_starts_it_too_and_alone_says_nothing() -> Non
     assert craft.filter.runs
 
 
-def test_a_direction_is_used_only_where_it_says_more_so_that_repetition_does_not_narrow_the_claim() -> None:
+def test_repeated_directions_do_not_reduce_the_uncertainty_below_that_of_one() -> None:
     craft = Still(3)
     craft.rest(3)
     craft.look(craft.seen(1e-3))
@@ -173,7 +173,7 @@ def test_one_false_horizon_is_refused_and_three_in_a_row_start_a_coarse_estimate
     assert craft.filter.restarts == 1
 
 
-def test_the_strings_own_sun_is_not_fed_twice() -> None:
+def test_the_sun_of_the_solar_strings_is_not_used_twice() -> None:
     craft = Still(5)
     craft.rest(3)
     craft.look(craft.seen(1e-2))

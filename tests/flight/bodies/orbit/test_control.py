@@ -65,27 +65,27 @@ class Seen:
         return acted
 
 
-def test_it_says_that_the_sun_is_found_and_turns_to_it() -> None:
+def test_the_sun_is_reported_as_found_and_the_body_turns_to_it() -> None:
     seen = Seen()
     assert seen.fly(0, 6, np.maximum(np.concatenate([SUN, -SUN]), 0.0))
     assert [name for name, _ in seen.told] == ["sun-missed", "sun-found"]
     assert seen.told[0][1] == "the solar strings deliver no readings"
 
 
-def test_by_a_field_that_is_stuck_it_does_nothing_until_the_field_lives_again() -> None:
+def test_no_coil_is_driven_while_the_measured_field_is_stuck() -> None:
     seen, lit = Seen(), np.maximum(np.concatenate([SUN, -SUN]), 0.0)
     assert seen.fly(0, 6, lit)
     assert not seen.fly(6, 12, lit, noise=0.0)
     assert seen.fly(12, 18, lit)
 
 
-def test_in_the_dark_it_says_why_and_no_current_flows_in_a_body_that_does_not_turn() -> None:
+def test_in_the_dark_the_missing_sun_is_reported_and_a_body_at_rest_gets_no_current() -> None:
     seen = Seen()
     assert not seen.fly(0, 6, np.zeros(6))
     assert [name for name, _ in seen.told] == ["sun-missed"]
 
 
-def test_a_sun_that_has_gone_is_remembered_for_a_while_and_its_loss_told_with_the_reason() -> None:
+def test_a_lost_sun_is_remembered_for_a_while_and_its_loss_is_reported_with_the_reason() -> None:
     seen = Seen()
     seen.fly(0, 6, np.maximum(np.concatenate([SUN, -SUN]), 0.0))
     seen.fly(6, int(MEMORY), np.zeros(6))

@@ -186,7 +186,7 @@ def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(
 
 @pytest.mark.skipif(not INPUT.is_file(), reason="../shared/data/inputs/tle-bstar0-drag.txt is missing")
 @pytest.mark.parametrize("age", [4, 6, 30])
-def test_the_elements_of_the_report_do_not_outvote_good_fixes(age: int) -> None:
+def test_old_elements_with_a_wrong_drag_term_are_replaced_by_good_fixes(age: int) -> None:
     """Elements with B* 0 are replaced by good fixes of a satellite with B* 5e-4.
 
     The elements have errors of 226 km after 6 days and 5,514 km after 30 days.
@@ -337,7 +337,7 @@ def test_without_elements_a_first_orbit_that_was_false_is_given_up() -> None:
     assert off < 4.0 * sigma < 100.0
 
 
-def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLineElements) -> None:
+def test_a_fix_that_the_receiver_marks_as_invalid_is_not_used(elements: TwoLineElements) -> None:
     known = EstimatedEnvironment(None, SimClock(UTC_NS))
     assert not known.fix(replace(reading(elements, 0), valid=False))
     assert known.refused == 0
@@ -379,7 +379,7 @@ def test_a_long_prediction_from_the_known_state_agrees_with_the_environment(
     assert ahead.position_at(np.array([40.0]))[0] == pytest.approx(found.position, abs=5.0)
 
 
-def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements: TwoLineElements) -> None:
+def test_a_receiver_is_refused_while_its_time_does_not_advance(elements: TwoLineElements) -> None:
     known, frozen = EstimatedEnvironment(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
     assert known.fix(frozen)
     for seconds in range(11, 60):

@@ -222,7 +222,7 @@ def test_within_a_step_a_fast_body_is_propagated_by_the_learned_coils_in_the_rot
     assert flown.rate - found.rate == pytest.approx(error, abs=1.5e-5)
 
 
-def test_the_claim_of_the_star_camera_is_that_of_the_present_and_not_of_the_last_step() -> None:
+def test_the_covariance_of_the_star_camera_is_that_of_the_present_time() -> None:
     flown = Flown(pulses=True, errors=BodyErrors(camera=0.0))
     flown.fly(3.0)
     assert flown.filter.begin(flown.stars(flown.time_ns - PERIOD_NS))
@@ -364,14 +364,14 @@ def test_a_rate_from_streaks_is_used() -> None:
     assert used == [True]
 
 
-def test_currents_that_may_not_have_flown_widen_the_claim() -> None:
+def test_uncertain_currents_increase_the_uncertainty() -> None:
     flown = acquired()
     before = flown.filter.at(flown.time_ns).covariance[RATE, RATE].trace()
     flown.filter.mark_unknown(flown.time_ns - SECOND_NS)
     assert flown.filter.at(flown.time_ns).covariance[RATE, RATE].trace() > 2.0 * before
 
 
-def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
+def test_the_attitude_error_stays_within_its_claim_if_a_coil_fails() -> None:
     """The attitude error stays within 5 sigma if a coil fails in the middle of a step.
 
     The gyro measures the effect.

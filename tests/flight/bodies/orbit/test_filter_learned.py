@@ -80,13 +80,13 @@ def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
         assert np.allclose(off, np.diag(np.diag(off)), atol=1e-20), "dipole and sunlit part stay correlated"
 
 
-def test_a_clock_put_back_counts_as_a_day() -> None:
+def test_a_clock_that_was_set_back_counts_as_a_day() -> None:
     prior, problems = start_from(stored(known()), LAYOUT, CHANGED, THEN - 5.0)
     assert not problems
     assert np.allclose(np.diag(prior.covariance), grown(UNKNOWN_AGE), rtol=1e-12)
 
 
-def test_without_a_time_or_far_from_what_is_expected_nothing_is_believed() -> None:
+def test_stored_states_without_a_time_or_with_implausible_values_are_not_used() -> None:
     nothing = SlowStates(np.zeros(len(START)), PRIOR)
     timeless = {name: one for name, one in stored(known()).items() if name != LEARNED_AT}
     wild = stored(SlowStates(5.0 * START, known().covariance))
@@ -117,7 +117,7 @@ def test_the_first_boot_starts_from_the_described_residual_dipole() -> None:
     np.testing.assert_array_equal(prior.values, near.values)
 
 
-def test_the_filter_starts_from_them_and_a_contradiction_takes_their_claim_away() -> None:
+def test_the_filter_starts_from_stored_states_and_a_contradiction_resets_their_variances() -> None:
     prior, _ = start_from(stored(known()), LAYOUT, CHANGED, THEN)
     found = FreeFilter(INERTIA, SETTINGS, prior)
     gyro = np.array([1e-3, 2e-3, 3e-3])

@@ -132,7 +132,7 @@ def test_a_path_that_leaves_its_target_for_a_time_does_not_start_a_slew(
     assert planned(paths, SUN, SECOND_NS).slew is not None
 
 
-def test_a_body_astray_is_slewed_back(table: Any, paths: PointingPaths) -> None:
+def test_a_body_far_from_its_path_gets_a_new_slew(table: Any, paths: PointingPaths) -> None:
     paths.offer(table, NADIR, 0)
     paths.led(AWAY, STILL, SECOND_NS)
     assert planned(paths, NADIR, 2 * SECOND_NS).slew is not None
@@ -147,7 +147,7 @@ def test_a_body_that_leaves_its_path_is_planned_for_again(table: Any, paths: Poi
     assert job.slew is None
 
 
-def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, paths: PointingPaths) -> None:
+def test_a_path_is_followed_until_it_rotates_too_fast(table: Any, paths: PointingPaths) -> None:
     count = len(table.dipole)
     late, soon = (replace(table, path=_fast_from(table.path, part * count // 10)) for part in (6, 2))
     assert paths.offer(late, NADIR, 0) == ""

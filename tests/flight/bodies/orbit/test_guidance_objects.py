@@ -120,7 +120,7 @@ def chase(craft: tuple[FloatArray, float], rate: float, begin: float) -> Chase:
     return Chase(*craft, rate, begin, from_matrix(rows), first)
 
 
-def test_the_law_keeps_the_object_on_the_boresight_and_turns_nothing_about_it() -> None:
+def test_the_law_keeps_the_object_on_the_boresight_without_rotation_about_it() -> None:
     rng = np.random.default_rng(1)
     direction, velocity = rng.normal(size=3), 0.01 * rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -152,7 +152,7 @@ def test_a_3u_says_when_its_torque_does_not_suffice() -> None:
     assert flown.off[-1] > 2.0
 
 
-def test_where_it_is_looked_for_is_what_was_ordered_else_where_the_camera_looks() -> None:
+def test_an_object_is_searched_in_the_commanded_direction_or_along_the_boresight() -> None:
     flown = chase(CUBE, 0.0, 0.0)
     job = flown._job(0)
     flown.aim.aim(OBJECT)
@@ -168,7 +168,7 @@ def test_where_it_is_looked_for_is_what_was_ordered_else_where_the_camera_looks(
     assert not flown.aim.seeks
 
 
-def test_the_boresight_stays_where_an_object_is_looked_for_whatever_axis_the_body_points() -> None:
+def test_the_boresight_stays_on_the_search_direction_for_any_pointing_axis() -> None:
     """The boresight stays on the search direction, whichever body axis is the pointing axis.
 
     If the weights of the rotation about +z were small, the optimal path would deviate by up to 7 deg.

@@ -144,7 +144,7 @@ def test_near_its_end_a_slew_is_not_planned_again(slew: PointingTable) -> None:
         assert len(flight.jobs) == count
 
 
-def test_a_rest_is_followed_from_its_begin_and_one_that_is_late_from_the_present_time(
+def test_a_new_plan_is_followed_from_its_start_or_if_it_is_late_from_the_present_time(
     slew: PointingTable,
 ) -> None:
     for arrives, expected in ((41.0, 50.0), (55.0, 55.0)):

@@ -96,7 +96,7 @@ class _Fixed:
 
 
 @pytest.mark.parametrize("direction", np.linspace(0.0, 2.0 * np.pi, 9))
-def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less_current(
+def test_two_coils_make_the_torque_of_one_coil_in_any_field_with_less_current(
     config: TestbedConfig, direction: float
 ) -> None:
     """Two coils give the torque that was commanded of coil x, in any field direction and with less current.
@@ -116,7 +116,7 @@ def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less
         assert found.dipole == pytest.approx(dipole * found.currents)
 
 
-def test_plans_may_not_count_on_more_field_than_the_cage_makes(
+def test_plans_assume_no_larger_field_than_that_of_the_cage(
     config: TestbedConfig, section: Simulation
 ) -> None:
     strong = configuration.replace(config, plant=configuration.replace(config.plant, field=4.5e-4))

@@ -88,7 +88,7 @@ def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_
 
 
 @pytest.mark.parametrize("current", [0.0, 0.05])
-def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: float) -> None:
+def test_an_estimate_that_the_field_with_coils_off_contradicts_is_discarded(current: float) -> None:
     """An estimate is discarded if measurements with coils off contradict it repeatedly.
 
     Inaccurate measurements with driven coils, in between, are accepted.

@@ -54,7 +54,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("kind", [MODULAR, CRC32C, CRC32, NO_CHECKSUM])
 @pytest.mark.parametrize("source", [SATELLITE, GROUND])
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
-def test_a_file_comes_whole_and_is_closed_at_both_ends(
+def test_a_file_arrives_complete_and_is_closed_at_both_ends(
     tmp_path: Path, file: Path, loss: float, source: int, kind: int
 ) -> None:
     pair = Pair(tmp_path, loss, seed=7)
@@ -93,7 +93,7 @@ def test_a_killed_end_asks_again_for_a_second_at_most(tmp_path: Path, file: Path
 
 
 @pytest.mark.parametrize("point", range(2))
-def test_killed_while_a_whole_file_is_placed_it_is_placed_after(
+def test_a_received_file_is_stored_after_a_kill_during_its_storage(
     tmp_path: Path, file: Path, point: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pair = Pair(tmp_path, 0.0)
@@ -194,7 +194,7 @@ def test_names_that_could_leave_the_folder_are_refused(tmp_path: Path, file: Pat
         (Eof(15, 0, 0), 15),
     ],
 )
-def test_what_is_wrong_with_a_file_ends_its_transfer(
+def test_a_faulty_unit_of_a_file_ends_its_transfer(
     tmp_path: Path, unit: Metadata | FileData | Eof, condition: int
 ) -> None:
     pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
@@ -258,7 +258,7 @@ def test_metadata_that_a_failing_disk_could_not_judge_are_judged_when_they_come_
     assert unpack(answer)[1] == Finished(Condition.FILESTORE_REJECTION, False, FileStatus.REJECTED)
 
 
-def test_a_full_disk_holds_up_no_file_that_was_begun_before(
+def test_a_full_disk_does_not_stop_a_file_that_was_begun_before(
     tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pair = Pair(tmp_path, 0.0)

@@ -90,7 +90,7 @@ def test_a_file_goes_up_through_losses_and_restarts_and_waits_to_be_chosen(
     link.close()
 
 
-def test_the_last_chosen_of_a_kind_stands_alone(link: FiledEnds) -> None:
+def test_only_the_last_selected_file_of_a_kind_is_kept(link: FiledEnds) -> None:
     folder = link.place / "keys" / "files"
     for name in ("a.tle", "b.tle"):
         (folder / "received" / "elements").mkdir(exist_ok=True)
@@ -197,7 +197,7 @@ def test_nothing_outside_the_two_folders_comes_down_or_is_deleted(link: FiledEnd
 
 
 @pytest.mark.parametrize("name", ["flight.yaml", "secret/x", "configuration/a/b", "configuration"])
-def test_only_known_kinds_come_up(link: FiledEnds, name: str) -> None:
+def test_only_files_of_known_kinds_are_uplinked(link: FiledEnds, name: str) -> None:
     link.session.put(config(link), name, link.clock.now_ns())
     link.until_closed()
     (ended,) = link.ended
@@ -205,7 +205,7 @@ def test_only_known_kinds_come_up(link: FiledEnds, name: str) -> None:
     assert "KIND/NAME" in link.session.reason_of(ended)
 
 
-def test_what_came_has_a_limit(link: FiledEnds, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_received_files_is_limited(link: FiledEnds, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(filing, "MOST_RECEIVED", 5)
     link.session.put(config(link), "configuration/a", link.clock.now_ns())
     link.until_closed()
@@ -239,7 +239,7 @@ def test_verification_and_live_telemetry_come_before_a_file(tmp_path: Path) -> N
     link.close()
 
 
-def test_directives_survive_their_bytes() -> None:
+def test_directives_are_equal_after_packing_and_unpacking() -> None:
     for directive in (
         ListFiles("log/"),
         SendFile("log/a", 3),

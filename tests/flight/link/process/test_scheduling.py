@@ -339,7 +339,7 @@ def test_a_command_is_due_from_its_time_on_for_ten_seconds(
 
 
 @pytest.mark.parametrize(("early_ns", "scheduled"), [(1, True), (0, False), (-1, False)])
-def test_only_a_time_to_come_can_be_scheduled(early_ns: int, scheduled: bool, tmp_path: Path) -> None:
+def test_only_a_future_time_can_be_scheduled(early_ns: int, scheduled: bool, tmp_path: Path) -> None:
     scheduling, at_ns = _scheduling(tmp_path)
     at = f"{datetime.fromtimestamp(at_ns * 1e-9, UTC):%Y-%m-%dT%H:%M:%S}"
     done = Report(1, 12, Stage.COMPLETED, "schedule", "")

@@ -111,7 +111,7 @@ def test_a_flight_that_does_not_answer_is_reported_after_five_seconds(link: Both
     assert link.stages(counter) == ["accepted", "failed"]
 
 
-def test_refusals_and_the_highest_counter_stand_in_the_very_first_packet(link: BothEnds) -> None:
+def test_refusals_and_the_highest_counter_are_in_the_first_packet(link: BothEnds) -> None:
     frame_of = link.terminal.send(packet(Ping(1)))
     frame = link.wire.up[0]
     link.turn()
@@ -233,7 +233,7 @@ def test_a_log_that_states_any_time_does_not_end_the_link(link: BothEnds) -> Non
     assert link.status()["time_ns"] == 2**63 - 1
 
 
-def test_the_loop_shows_once_a_second_that_it_turns_also_while_it_takes_many_frames(
+def test_the_loop_reports_progress_once_a_second_also_while_it_processes_many_frames(
     link: BothEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     beats: list[int] = []
@@ -255,7 +255,7 @@ def test_the_loop_shows_once_a_second_that_it_turns_also_while_it_takes_many_fra
 
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC, errno.EIO, errno.EACCES])
-def test_a_disk_that_stores_no_counter_lets_no_frame_in_and_ends_nothing(
+def test_a_disk_that_stores_no_counter_prevents_commands_and_does_not_end_the_link(
     link: BothEnds, number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = link.terminal.send(packet(Ping(1)))
@@ -326,7 +326,7 @@ def test_live_packets_come_in_order_and_none_is_lost(link: BothEnds) -> None:
     assert link.terminal.lost_frames == 0
 
 
-def test_a_slow_line_thins_what_repeats_and_loses_no_event(tmp_path: Path) -> None:
+def test_a_slow_line_thins_periodic_packets_and_loses_no_event(tmp_path: Path) -> None:
     link = BothEnds(tmp_path, rate=2000.0)
     events = [link.packer.pack(EVENT, n, plain_contents(EVENT)) for n in range(10)]
     for one in events:
@@ -340,7 +340,7 @@ def test_a_slow_line_thins_what_repeats_and_loses_no_event(tmp_path: Path) -> No
     link.close()
 
 
-def test_a_stretch_of_the_archive_is_played_back_whole_beside_live_telemetry(link: BothEnds) -> None:
+def test_an_interval_of_the_archive_is_played_back_completely_beside_live_telemetry(link: BothEnds) -> None:
     old = timing_packets(4000)  # enough packets for several segments of the log
     link.record(*old)
     link.turn(4.0)
@@ -360,7 +360,7 @@ def test_a_stretch_of_the_archive_is_played_back_whole_beside_live_telemetry(lin
     assert link.obeyed == [], "a command of the link went to the flight"
 
 
-def test_a_new_key_makes_the_old_one_worthless(link: BothEnds) -> None:
+def test_after_a_key_change_frames_with_the_old_key_are_refused(link: BothEnds) -> None:
     key = bytes(range(32))
     change = link.terminal.send(directives.pack(NewKey(1, 2, key), 1))
     stale = link.terminal.send(directives.pack(NewKey(2, 7, key), 1))

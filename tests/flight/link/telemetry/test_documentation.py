@@ -70,7 +70,7 @@ def test_the_ground_database_is_enough_to_read_a_packet() -> None:
 
 
 @pytest.mark.parametrize("arguments", [[], ["--json"], ["--telecommands"]])
-def test_the_command_prints_either(
+def test_the_command_prints_the_page_or_the_database(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["documentation", *arguments])

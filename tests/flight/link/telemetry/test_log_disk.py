@@ -113,7 +113,7 @@ def test_a_segment_whose_name_cannot_be_synced_is_not_left_in_the_way(
     open_segment(path).close()
 
 
-def test_a_stump_that_cannot_be_cut_off_costs_no_later_packet(tmp_path: Path) -> None:
+def test_an_incomplete_packet_that_cannot_be_truncated_loses_no_later_packet(tmp_path: Path) -> None:
     class Uncut(SmallDiskFile):
         def truncate(self, size: int, /) -> int:
             raise OSError(errno.EIO, os.strerror(errno.EIO))

@@ -79,7 +79,9 @@ def test_a_packet_has_the_documented_bytes() -> None:
 @every_packet
 @settings(max_examples=25, deadline=None)
 @given(data=st.data(), stamp=st.integers(-(2**63), 2**63 - 1))
-def test_every_packet_comes_back_as_it_went(packet: Packet, data: st.DataObject, stamp: int) -> None:
+def test_every_packet_is_equal_after_packing_and_unpacking(
+    packet: Packet, data: st.DataObject, stamp: int
+) -> None:
     values = data.draw(contents(packet))
     row = decode(Packer().pack(packet, stamp, values))[packet.name][0]
     assert int(row["time_ns"]) == stamp
