@@ -76,16 +76,16 @@ def test_a_sensor_of_the_page_flies_by_the_commands_of_the_page(
 
 
 def test_the_interfaces_of_the_page_are_those_of_the_code() -> None:
-    for line in PAGE.splitlines():
-        if not (row := re.match(r"\| `(\w+)` \| (`\w+\(.*\)`) \|(.*)\|", line)):
-            continue
-        kind = getattr(wires if row[1] == "SerialPort" else devices, row[1])
-        for name, parameters in re.findall(r"`(\w+)\(([^`]*)\)`", row[2]):
+    rows = re.findall(r"^\| `(\w+)` \| (`\w+\(.*\)`) \|(.*)\|$", PAGE, re.MULTILINE)
+    assert {"SerialPort", "InertialUnit"} <= {name for name, _, _ in rows}
+    for interface, methods, results in rows:
+        kind = getattr(wires if interface == "SerialPort" else devices, interface)
+        for name, parameters in re.findall(r"`(\w+)\(([^`]*)\)`", methods):
             assert [*inspect.signature(getattr(kind, name)).parameters] == ["self", *_words(parameters)], name
         assert {name for name in vars(kind) if not name.startswith("_")} == set(
-            re.findall(r"`(\w+)\(", row[2])
-        ), row[1]
-        for name, parameters in re.findall(r"`([A-Z]\w+)\(([^`]*)\)`", row[3]):
+            re.findall(r"`(\w+)\(", methods)
+        ), interface
+        for name, parameters in re.findall(r"`([A-Z]\w+)\(([^`]*)\)`", results):
             assert [*inspect.signature(getattr(devices, name)).parameters] == _words(parameters), name
 
 

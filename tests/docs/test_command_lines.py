@@ -90,8 +90,9 @@ def test_every_mark_names_a_test_or_gives_a_reason() -> None:
         if block.mark == "run by":
             text = (ROOT / block.reason).read_text(encoding="utf-8")
             for line in block.commands:
-                word = re.match(r"python -m (?:flight|sim_hal) (\w+)", line)
-                assert word is None or word[1] in text, f"{where}: {block.reason} does not run {word[1]!r}"
+                word = re.match(r"(?:knightcube|python -m (?:flight|sim_hal)) ([a-z][\w-]*)", line)
+                runs = word is None or word[1] in text or Path(block.page).name in text
+                assert runs, f"{where}: {block.reason} does not run {line!r}"
         elif block.mark:
             assert len(block.reason) > 10, f"{where}: the reason is missing"
 
@@ -99,7 +100,7 @@ def test_every_mark_names_a_test_or_gives_a_reason() -> None:
 def test_commands_in_a_block_without_a_language_are_found() -> None:
     for block in blocks():
         if block.language in {"", "text", "bash", "shell"}:
-            assert not re.search(r"^\s*(\$ |python |make |sudo )", block.text, re.MULTILINE), (
+            assert not re.search(r"^\s*(\$ |python |make |sudo )|^knightcube ", block.text, re.MULTILINE), (
                 f"{block.page}:{block.line}: commands belong into a block of `sh`"
             )
 
@@ -117,10 +118,16 @@ def test_the_collector_finds_commands_and_their_marks() -> None:
 
 
 def mentions() -> set[tuple[str, str]]:
-    """Return (module, first argument) of every `python -m ...` on the pages, in code blocks and in text."""
+    """Return (module, first argument) of every command on the pages, in code blocks and in text.
+
+    `knightcube` is the same command as `python -m flight`.
+    """
     found = set()
     for path in pages():
-        for module, word in re.findall(r"python -m ([\w.]+)(?: ([\w-]+))?", path.read_text(encoding="utf-8")):
+        text = re.sub(
+            r"(?m)(^ *|`)knightcube (?=[a-z])", r"\1python -m flight ", path.read_text(encoding="utf-8")
+        )
+        for module, word in re.findall(r"python -m ([\w.]+)(?: ([\w-]+))?", text):
             found.add((module.rstrip("."), word))
     return found
 
