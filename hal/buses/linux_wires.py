@@ -6,8 +6,9 @@ rule keeps the device name when an adapter is unplugged and plugged in again.
 A call on an I2C bus waits until the previous transaction has ended. A transaction takes at most the timeout
 of the I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES
 0), so that the drivers count each failure. An advisory lock on the device file reserves the bus for one
-flight process. The kernel releases the lock when the process ends. The guardian and `deploy/coils-off` ignore
-the lock, because they may switch the coils off at any time.
+flight process. The kernel releases the lock when the process ends. A failed transaction does not release the
+lock, unless the adapter was unplugged. The guardian and `deploy/coils-off` ignore the lock, because they may
+switch the coils off at any time.
 """
 
 from __future__ import annotations
@@ -227,12 +228,14 @@ _MEANING = {
     errno.EBADF: "the bus has been closed",
     errno.EUSERS: "another flight drives the coils on this bus",
 }
-# Errors that do not indicate a failure of the bus, so that the device file stays open.
-_LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
 
 
 class LinuxI2cBus:
-    """Thread-safe I2C bus /dev/i2c-N, whose device file is reopened after a bus failure."""
+    """Thread-safe I2C bus /dev/i2c-N.
+
+    After a failure, the device file is reopened only if it was removed or replaced, because closing the file
+    releases the lock of the bus.
+    """
 
     def __init__(
         self, device: int | str, timeout_ns: int = 20_000_000, patient: bool = False, exclusive: bool = False
@@ -329,6 +332,19 @@ class LinuxI2cBus:
             raise
         return bus
 
+    def _is_current(self) -> bool:
+        """Return whether the open file is still the device file of the bus.
+
+        The kernel removes the device file when the adapter is unplugged, and waits for the closing of open
+        files before the adapter can be used again.
+        """
+        if self._bus is None or self._bus.fd is None:
+            return False
+        try:
+            return os.path.samestat(os.fstat(self._bus.fd), os.stat(self.name))
+        except OSError:
+            return False
+
     def _drop(self) -> None:
         if self._bus is not None:
             self._bus.close()
@@ -345,7 +361,7 @@ class LinuxI2cBus:
             return action(self._bus)
         except OSError as error:
             code = error.errno or errno.EIO
-            if code not in _LINE_IN_ORDER:
+            if not self._is_current():
                 self._drop()
             meaning = _MEANING.get(code, os.strerror(code))
             raise OSError(code, f"{meaning}, address 0x{address:02x} on {self.name}") from error

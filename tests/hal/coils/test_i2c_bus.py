@@ -87,21 +87,44 @@ def test_a_time_out_of_nothing_is_refused(kernel: IoctlWire) -> None:
         LinuxI2cBus("/dev/null", timeout_ns=0)
 
 
-def test_the_descriptor_is_reopened_after_the_line_failed_but_not_after_a_nack(kernel: IoctlWire) -> None:
-    """The bus is opened again after a timeout, but not after a NACK.
-
-    Each opening sets the timeout of the adapter once, so the test counts the openings by these settings.
-    """
-    bus = LinuxI2cBus("/dev/null")
-    with pytest.raises(OSError, match="no acknowledge"):
-        bus.read_byte_data(0x22, 0x00)
-    bus.read_byte_data(PCA, 0x00)
-    assert kernel.settings.count((I2C_TIMEOUT, 2)) == 1
-    kernel.wire.hang(times=1)
-    with pytest.raises(TimeoutError):
+@pytest.mark.parametrize("code", [errno.EIO, errno.ETIMEDOUT, errno.EREMOTEIO, errno.EBUSY])
+def test_a_failed_transaction_does_not_release_the_lock_of_the_bus(
+    kernel: IoctlWire, tmp_path: Path, code: int
+) -> None:
+    node = tmp_path / "i2c"
+    node.touch()
+    bus = LinuxI2cBus(str(node), exclusive=True)
+    kernel.slave_error = code
+    with pytest.raises(OSError, match="address 0x40") as caught:
         bus.read_byte_data(PCA, 0x00)
+    assert caught.value.errno == code
+    with pytest.raises(NotResponding, match="another flight drives the coils"):
+        LinuxI2cBus(str(node), exclusive=True)
+    kernel.slave_error = 0
     assert bus.read_byte_data(PCA, 0x00) == 0x11
-    assert kernel.settings.count((I2C_TIMEOUT, 2)) == 2
+    bus.close()
+
+
+def test_an_adapter_that_is_plugged_in_again_is_opened_and_locked_again(
+    kernel: IoctlWire, tmp_path: Path
+) -> None:
+    """The kernel gives an adapter that was unplugged and plugged in again a new device file."""
+    node = tmp_path / "i2c"
+    node.touch()
+    before = len(os.listdir("/proc/self/fd"))
+    bus = LinuxI2cBus(str(node), exclusive=True)
+    node.rename(tmp_path / "unplugged")
+    kernel.slave_error = errno.EIO
+    with pytest.raises(OSError, match="Input/output error"):
+        bus.read_byte_data(PCA, 0x00)
+    assert len(os.listdir("/proc/self/fd")) == before, "the kernel waits until the file is closed"
+    with pytest.raises(FileNotFoundError):
+        bus.read_byte_data(PCA, 0x00)
+    node.touch()
+    kernel.slave_error = 0
+    assert bus.read_byte_data(PCA, 0x00) == 0x11
+    with pytest.raises(NotResponding, match="another flight drives the coils"):
+        LinuxI2cBus(str(node), exclusive=True)
     bus.close()
 
 
