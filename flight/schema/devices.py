@@ -695,7 +695,8 @@ class Driver:
         open: function that takes the rig and the section, and returns the driver (`hal.interfaces.devices`).
             A driver of coils must be passive until its method `start` is called.
         probe: function that takes a rig and the section, queries the device without changing its state, and
-            returns its answer as text, or raises DeviceError if the device does not answer.
+            returns its answer as text, or raises DeviceError if the device does not answer. Only the driver
+            `sensors` starts its sensors, for which `knightcube check` locks the bus of the coils.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
             device to the emulated wires, and returns the device. A camera driver needs no function `emulate`,
             because the simulator emulates the cameras of all drivers. A device of another package without an

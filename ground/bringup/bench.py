@@ -9,6 +9,7 @@ driver changes.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from hal.drivers.vn100 import BAUD_RATES
 from hal.drivers.vn100_protocol import StreamParser
 from hal.interfaces.devices import Frame, FrameSource, ImuReading, InertialUnit, TorqueCoils
 from hal.interfaces.errors import DeviceError, NotResponding, Refused
-from hal.interfaces.guardian import CoilGuardian
+from hal.interfaces.guardian import CoilGuardian, GuardianNews
 from hal.interfaces.wires import SECOND_NS, I2cBus, Rig
 from knightcube.astro.arrays import FloatArray, Image
 
@@ -98,6 +99,8 @@ class Session:
     known: dict[str, Outcome] = field(default_factory=dict)
     live: Callable[[str], bool] | None = None
     _open: dict[str, Any] = field(default_factory=dict)
+    _lost: int = 0
+    _guarding: threading.Lock = field(default_factory=threading.Lock)
 
     def device(self, key: str) -> Any:
         """Return the open device of a section, such as `gps`, `power.bus_monitor` or `wide_cameras[1]`.
@@ -152,6 +155,25 @@ class Session:
             cast(InertialUnit, device).configure()
             self.wait(STILL_S)
             device.poll()
+
+    def beat(self) -> None:
+        """Send a heartbeat to the guardian, so that it permits currents, and replace a guardian that died."""
+        if self.guardian is not None:
+            with self._guarding:
+                self.guardian.beat()
+                self._lost += self.guardian.tend(self.rig.clock.now_ns()).count(GuardianNews.LOST)
+
+    def lost_guardians(self) -> list[Finding]:
+        """Return a finding if a guardian has died since the last call."""
+        lost, self._lost = self._lost, 0
+        text = f"the guardian of the coils died and was replaced, {lost} times"
+        cure = "repeat the step, and look into the kernel log: was the memory exhausted?"
+        return [Finding("guardian", "died", text, cure)] if lost else []
+
+    def hold_brake(self) -> None:
+        """Send heartbeats until the session ends, because a guardian without heartbeats releases brakes."""
+        if self.guardian is not None:
+            self.stack.callback(self.rig.clock.ticker("heartbeats", _POLL_NS, self.beat).stop)
 
     def wait(self, seconds: float, each: Callable[[], None] | None = None) -> None:
         """Wait for `seconds` s, and call `each` every 25 ms."""

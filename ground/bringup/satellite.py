@@ -66,8 +66,7 @@ def _readings(
 
     def repeat() -> None:
         coils.command(command)
-        if session.guardian is not None:
-            session.guardian.beat()
+        session.beat()
 
     begun_ns = session.rig.clock.now_ns()
     session.wait(_SETTLE_S + _MONITOR_S, repeat)

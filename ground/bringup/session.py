@@ -153,6 +153,7 @@ def step_coils(session: Session) -> Outcome:
     # If a leg is stuck high, current flows through the coil while the bridge is off, but not while it brakes.
     if any(one.kind == "current while off" for one in found.findings):
         coils.brake(frozenset(range(len(section.windings))))
+        session.hold_brake()
     values = {
         "commanded": commanded.tolist(),
         "volts": [None if math.isnan(v) else round(v, 3) for v in test.volts],
@@ -186,8 +187,7 @@ def _drive(
 
         def repeat() -> None:
             coils.command(command)
-            if session.guardian is not None:
-                session.guardian.beat()
+            session.beat()
             reading = None if monitor is None else monitor.latest()
             if reading is not None and reading.newest_since_ns >= settled_ns:
                 drawn[reading.time_ns] = reading.newest

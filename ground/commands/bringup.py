@@ -93,6 +93,7 @@ def run(options: argparse.Namespace) -> int:
             except StepSkipped as reason:
                 found = [] if reason.finding is None else [reason.finding]
                 outcome = Outcome(found, {"skipped": str(reason)})
+            outcome.findings.extend(session.lost_guardians())
             session.known[name] = outcome
             _keep(options, key, session.known, name)
             if not options.json:

@@ -249,7 +249,7 @@ class LinuxI2cBus:
             exclusive: whether the bus is locked, so that two flight processes cannot drive the same coils.
 
         Raises NotResponding if the bus does not exist. Raises Refused if the permission to open the bus is
-        missing or the adapter does not support block transfers.
+        missing, the adapter does not support block transfers, or another flight has locked the bus.
         """
         if timeout_ns <= 0:
             raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
@@ -271,7 +271,8 @@ class LinuxI2cBus:
             raise Refused(self.name, "no permission: add the user to the group that owns it (i2c)") from error
         except OSError as error:
             reason = _MEANING.get(error.errno or 0, error.strerror)
-            raise NotResponding(self.name, f"not a usable I2C bus: {reason}") from error
+            kind = Refused if error.errno == errno.EUSERS else NotResponding
+            raise kind(self.name, f"not a usable I2C bus: {reason}") from error
         if self._bus.funcs & I2cFunc.SMBUS_I2C_BLOCK != I2cFunc.SMBUS_I2C_BLOCK:
             self.close()
             raise Refused(self.name, "the adapter cannot do I2C block transfers; choose another bus")

@@ -2,7 +2,7 @@
 
 The function `probe` looks for the real devices that a configuration names. The function writes no settings to
 the devices and drives no coil. A device that does not respond is reported together with the suggested remedy.
-The serial port and the camera that a running flight uses are reported as busy.
+The serial ports, the cameras and the separate sensors that a running flight uses are reported as busy.
 """
 
 from __future__ import annotations
@@ -30,10 +30,17 @@ from flight.app.devices import (
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig
-from flight.schema.devices import Camera, WideCamera, driver_of, fitted_devices, structure_mask
+from flight.schema.devices import (
+    Camera,
+    SensorsSection,
+    WideCamera,
+    driver_of,
+    fitted_devices,
+    structure_mask,
+)
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
 from flight.schema.sections import Config
-from hal.interfaces.errors import DeviceError
+from hal.interfaces.errors import DeviceError, NotResponding
 from hal.interfaces.wires import LATE_NS
 from knightcube.compiled import report_compilations
 from knightcube.errors import KnightCubeError, UsageError, reason_of
@@ -280,7 +287,8 @@ def _probed(config: Config, cameras: ExitStack, name: str, kind: str, section: A
     """Check whether one device responds, over connections that are opened for this check.
 
     All cameras stay open until `cameras` closes them, because cameras that can be opened separately may
-    together exceed the bandwidth of a USB bus.
+    together exceed the bandwidth of a USB bus. Separate sensors are started for the check, which would
+    disturb a flight that reads them, so the bus of the coils is first locked like by a flight.
     """
     camera = isinstance(section, Camera | WideCamera)
     driver = driver_of(kind, section.device if camera else section)
@@ -292,6 +300,9 @@ def _probed(config: Config, cameras: ExitStack, name: str, kind: str, section: A
         try:
             if camera:
                 open_camera(section, rig, stack)
+            if isinstance(section, SensorsSection):
+                with suppress(NotResponding):  # a missing bus of the coils does not concern the sensors
+                    real_rig(config, own, exclusive=True).wires.i2c()
             return Probed(name, place, True, driver.probe(rig, section))
         except DeviceError as error:
             return Probed(name, place, False, error.message)

@@ -143,7 +143,7 @@ def test_a_monitor_without_a_new_reading_is_reported_and_not_compared() -> None:
 def test_the_guardian_of_the_coils_is_kept_awake() -> None:
     session, coils, _ = power_bench((7.4, 0.3, 1.0))
     beats: list[int] = []
-    session.guardian = SimpleNamespace(beat=lambda: beats.append(len(coils.commands)))
+    session.guardian = SimpleNamespace(beat=lambda: beats.append(len(coils.commands)), tend=lambda now_ns: [])
     step_power(session)
     assert beats == list(range(1, len(coils.commands)))  # after each command but the last, which sets zero
 

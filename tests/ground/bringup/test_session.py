@@ -22,6 +22,7 @@ from ground.bringup.session import (
     step_find,
     step_rest,
 )
+from hal.interfaces.guardian import GuardianNews
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
@@ -250,6 +251,7 @@ class Bench:
 
         self.unit = ScriptedUnit(lambda: self.session, sample)
         self.beats = 0
+        self.news: list[GuardianNews] = []
         self.clipped = False
         self.session = bench_session({"coils": self.coils, "inertial_unit": self.unit, "power_monitor": self})
         self.session.coil_field = FIELD
@@ -257,6 +259,10 @@ class Bench:
 
     def beat(self) -> None:
         self.beats += 1
+
+    def tend(self, now_ns: int) -> list[GuardianNews]:
+        news, self.news = self.news, []
+        return news
 
     def latest(self) -> Any:
         now_ns = self.session.rig.clock.now_ns()
@@ -324,6 +330,32 @@ def test_a_current_while_the_coils_are_off_is_braked_and_a_refused_command_is_re
     assert named(found.findings) == ["coils refused", "coils current while off"]
     assert found.findings[0].text == "no acknowledge"
     assert bench.coils.braked == [frozenset({0, 1, 2})]
+
+
+def test_the_guardian_does_not_release_the_brake_of_a_leg_that_is_stuck_high() -> None:
+    """Without heartbeats for 0.3 s, the guardian would set the inputs of the bridges to low."""
+    bench = Bench(idle=0.05)
+    step_coils(bench.session)
+    beats = bench.beats
+    bench.session.wait(2.0)
+    assert bench.beats - beats >= 20
+    bench.session.stack.close()
+    beats = bench.beats
+    bench.session.wait(2.0)
+    assert bench.beats == beats, "the session has ended"
+    sound = Bench()
+    step_coils(sound.session)
+    beats = sound.beats
+    sound.session.wait(2.0)
+    assert sound.beats == beats, "no bridge is braked"
+
+
+def test_a_guardian_that_dies_is_replaced_and_reported_once() -> None:
+    bench = Bench()
+    bench.news = [GuardianNews.READY, GuardianNews.LOST, GuardianNews.ACTED]
+    assert step_coils(bench.session).findings == []
+    assert [one.kind for one in bench.session.lost_guardians()] == ["died"]
+    assert bench.session.lost_guardians() == []
 
 
 def test_coils_of_a_body_that_moves_are_not_judged() -> None:

@@ -201,6 +201,7 @@ class Scripted:
         self, monkeypatch: pytest.MonkeyPatch, folder: Path, **outcomes: Outcome | StepSkipped
     ) -> None:
         self.done: list[str] = []
+        self.lost: list[Finding] = []
         self.known: dict[str, list[str]] = {}
         self.pictures: list[tuple[Any, ...]] = []
         self.folder = folder
@@ -214,7 +215,7 @@ class Scripted:
 
     @contextmanager
     def opened(self, *words: Any) -> Iterator[Any]:
-        yield SimpleNamespace(known={})
+        yield SimpleNamespace(known={}, lost_guardians=lambda: self.lost)
 
     def step(self, name: str, outcome: Outcome | StepSkipped) -> Callable[[Any], Outcome]:
         def run(session: Any) -> Outcome:
@@ -309,6 +310,13 @@ def test_the_status_is_1_for_faults_and_for_steps_that_could_not_be_done(
     assert ("rest" in scripted.done) == skipped
     if not skipped:
         assert scripted.pictures[1][1]["rest"].findings == [FAULT, FAULT]
+
+
+def test_a_guardian_that_died_is_a_fault_of_the_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scripted = Scripted(monkeypatch, tmp_path)
+    scripted.lost = [Finding("guardian", "died", "once", "repeat the step")]
+    assert scripted.run("--only", "dark") == 1
+    assert scripted.report()["steps"]["dark"]["findings"][0]["part"] == "guardian"
 
 
 def test_devices_that_were_missing_are_looked_for_again(

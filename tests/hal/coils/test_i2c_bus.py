@@ -98,7 +98,7 @@ def test_a_failed_transaction_does_not_release_the_lock_of_the_bus(
     with pytest.raises(OSError, match="address 0x40") as caught:
         bus.read_byte_data(PCA, 0x00)
     assert caught.value.errno == code
-    with pytest.raises(NotResponding, match="another flight drives the coils"):
+    with pytest.raises(Refused, match="another flight drives the coils"):
         LinuxI2cBus(str(node), exclusive=True)
     kernel.slave_error = 0
     assert bus.read_byte_data(PCA, 0x00) == 0x11
@@ -123,7 +123,7 @@ def test_an_adapter_that_is_plugged_in_again_is_opened_and_locked_again(
     node.touch()
     kernel.slave_error = 0
     assert bus.read_byte_data(PCA, 0x00) == 0x11
-    with pytest.raises(NotResponding, match="another flight drives the coils"):
+    with pytest.raises(Refused, match="another flight drives the coils"):
         LinuxI2cBus(str(node), exclusive=True)
     bus.close()
 
@@ -171,7 +171,7 @@ def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_el
     node.touch()
     first = LinuxI2cBus(str(node), exclusive=True)
     settings = len(kernel.settings)
-    with pytest.raises(NotResponding, match="another flight drives the coils"):
+    with pytest.raises(Refused, match="another flight drives the coils"):
         LinuxI2cBus(str(node), exclusive=True)
     assert len(kernel.settings) == settings
     LinuxI2cBus(str(node)).close()

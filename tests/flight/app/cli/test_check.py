@@ -15,13 +15,16 @@ from typing import Any
 
 import pytest
 import yaml
+from smbus2.smbus2 import I2C_FUNCS
 
+from flight.app import devices
 from flight.app.cli import run as checking
 from flight.app.cli.run import flight_problems
 from flight.app.run import RunResult
 from flight.loop.flight_loop import FlightEnding
 from flight.schema import reader
-from flight.schema.devices import V4l2Device, WideCamera
+from flight.schema.devices import Sensor, SensorsSection, V4l2Device, WideCamera
+from hal.buses.linux_wires import lock_bus
 from hal.interfaces.errors import Refused
 from tests.ground.commands.in_process import command
 from tests.support.orbit_devices import orbit_config
@@ -196,6 +199,38 @@ def test_all_cameras_are_open_at_the_same_time(monkeypatch: pytest.MonkeyPatch) 
     assert [item.found for item in found if item.name.startswith("wide")] == [True, True, False]
     assert found[2].text == "the bandwidth of its USB bus is exhausted"
     assert running == [], "the check closes the cameras"
+
+
+def test_separate_sensors_are_not_started_during_a_flight(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A start writes the settings of a sensor, so it would disturb a flight that reads the sensor."""
+
+    def adapter(descriptor: int, request: int, argument: Any = 0) -> int:
+        if request == I2C_FUNCS:
+            argument.value = (1 << 32) - 1
+        return 0
+
+    monkeypatch.setattr("smbus2.smbus2.ioctl", adapter)
+    monkeypatch.setattr("hal.buses.linux_wires.ioctl", adapter)
+    started: list[str] = []
+    monkeypatch.setattr(devices, "_started", lambda _, rig, sensor: started.append(sensor.part))
+    sensor = Sensor(part="lis3mdl", bus=str(tmp_path / "sensors"), measures={"magnetic": ("x", "y", "z")})
+    unit, node = SensorsSection(driver="sensors", sensors=(sensor,)), tmp_path / "coils"
+    node.touch()
+    config = reader.replace(orbit_config(), camera=None, wide_cameras=(), inertial_unit=unit)
+    config = reader.replace(config, coils=reader.replace(config.coils, bus=str(node)))
+
+    def answer() -> str:
+        (item,) = (item for item in checking.probe(config) if item.name == "inertial_unit")
+        return item.text
+
+    with node.open(encoding="ascii") as flight:
+        lock_bus(flight.fileno())
+        assert "another flight drives the coils on this bus" in answer()
+    assert started == []
+    assert answer() == "lis3mdl: each answers"
+    assert started == ["lis3mdl"]
 
 
 def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) -> None:
