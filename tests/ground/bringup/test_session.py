@@ -255,7 +255,7 @@ class Bench:
         self.clipped = False
         self.session = bench_session({"coils": self.coils, "inertial_unit": self.unit, "power_monitor": self})
         self.session.coil_field = FIELD
-        self.session.guardian = self  # type: ignore[assignment]
+        self.session.guardian = self
 
     def beat(self) -> None:
         self.beats += 1
