@@ -131,7 +131,7 @@ def test_a_picture_without_stars_has_a_reason() -> None:
 def test_a_date_without_a_zone_is_in_utc() -> None:
     assert utc("2026-11-21T20:15:00").isoformat() == "2026-11-21T20:15:00+00:00"
     assert utc("2026-11-21T20:15:00+01:00").isoformat() == "2026-11-21T19:15:00+00:00"
-    with pytest.raises(Exception, match="yesterday"):
+    with pytest.raises(argparse.ArgumentTypeError, match="yesterday"):
         utc("yesterday")
     with pytest.raises(argparse.ArgumentTypeError, match="give a time"):
         utc("0001-01-01T00:00:00+01:00")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -105,13 +106,19 @@ def test_commands_before_the_wrong_byte_are_returned_and_none_behind_it() -> Non
         next(packets)
 
 
-@given(st.binary(min_size=1, max_size=80))
-def test_no_bytes_but_commands_come_out(data: bytes) -> None:
-    stream = opened()
-    try:
-        found = list(stream.packets(data))
-    except StreamError:
-        return
-    assert b"".join(found) == data[: sum(map(len, found))]
-    begun = data[sum(map(len, found)) :][:HEADER_BYTES]
-    assert begun[:1] in (b"", bytes((PING[0],)), bytes((UNIT[0],)))
+packets = st.sampled_from((PING, SAFE, UNIT))
+damaged = st.tuples(packets, st.integers(0, HEADER_BYTES - 1), st.integers(0, 255)).map(
+    lambda drawn: drawn[0][: drawn[1]] + bytes((drawn[2],)) + drawn[0][drawn[1] + 1 :]
+)
+
+
+@given(st.lists(packets, max_size=3), st.lists(packets | damaged | st.binary(max_size=20), max_size=3))
+def test_only_packets_with_the_header_of_a_command_are_returned(sent: list[bytes], more: list[bytes]) -> None:
+    stream, found = opened(), list[bytes]()
+    with suppress(StreamError):
+        for packet in stream.packets(b"".join((*sent, *more))):
+            found.append(packet)
+    assert found[: len(sent)] == sent
+    for packet in found:
+        assert packet[:2] in {PING[:2], SAFE[:2], UNIT[:2]}
+        assert int.from_bytes(packet[4:HEADER_BYTES], "big") == len(packet) - HEADER_BYTES - 1

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.errors import UsageError
 from knightcube.reference.horizon import fit_circle
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
@@ -365,7 +366,7 @@ def test_a_frame_of_another_size_than_the_camera_is_refused(day: tuple[EarthScen
 
 def test_invalid_settings_are_refused() -> None:
     for wrong in ({"lines": 1}, {"run": 4}, {"threshold": 1.5}, {"contrast": 0.0}):
-        with pytest.raises(Exception, match=next(iter(wrong))):
+        with pytest.raises(UsageError, match=next(iter(wrong))):
             EdgeSettings(**wrong)
     assert HorizonSettings().edges.lines == 32
 
