@@ -231,7 +231,7 @@ def test_implausible_readings_of_a_foreign_driver_are_counted_and_omitted(
     assert link.rejection.startswith(says)
 
 
-def test_a_rate_in_counts_counts_as_no_rate() -> None:
+def test_a_rate_in_sensor_counts_is_out_of_range_and_not_used() -> None:
     foreign = ForeignUnit({"rate": np.array([310, -2, 7])}, {"rate": [1.0, np.nan, 0.0]}, {"rate": [1, 2, 3]})
     unit = CheckedUnit(foreign, 6e-4)
     unit.configure()

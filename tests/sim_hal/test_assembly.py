@@ -48,7 +48,7 @@ def measured(
     return seen, true
 
 
-def test_it_weighs_nothing_and_its_noise_is_the_data_sheets() -> None:
+def test_the_unit_in_orbit_measures_no_weight_and_has_the_noise_of_the_data_sheet() -> None:
     seen, _ = measured(ImuNoise(profile="datasheet"), 10.0)
     accelerations = np.array([sample.accel for sample in seen])
     assert np.abs(accelerations).max() < 0.1
@@ -57,7 +57,7 @@ def test_it_weighs_nothing_and_its_noise_is_the_data_sheets() -> None:
     assert np.std(np.diff(rates, axis=0)) / np.sqrt(2.0) == pytest.approx(6.1e-4, rel=0.2)
 
 
-def test_its_attitude_has_no_meaning_in_orbit_and_a_meaning_on_the_thread() -> None:
+def test_the_attitude_of_the_unit_is_valid_on_the_thread_and_meaningless_in_orbit() -> None:
     def errors(world: str) -> FloatArray:
         """Return the rotations (n, 4) from the true attitude to the attitude that the IMU measures."""
         pairs = zip(*measured(ImuNoise(), 20.0, world), strict=True)
@@ -130,7 +130,7 @@ def test_the_coils_add_their_matrix_times_their_currents() -> None:
     assert beside - alone == pytest.approx(1e4 * np.array(UNEQUAL) @ currents, abs=1e-9)
 
 
-def test_by_default_the_magnetometer_does_not_feel_them() -> None:
+def test_by_default_the_magnetometer_does_not_measure_the_field_of_the_coils() -> None:
     alone, _ = gauss(NONE, driven=False)
     beside, _ = gauss(NONE, driven=True)
     assert beside == pytest.approx(alone, abs=1e-9)

@@ -31,7 +31,7 @@ class Beeper:
     run_events = pass_to = advance_to
 
 
-def test_sleeping_takes_the_world_and_the_tickers_along_in_order() -> None:
+def test_sleeping_advances_the_world_and_the_tickers_in_order() -> None:
     clock, notes = SimClock(), list[tuple[str, int]]()
     clock.attach(Beeper(notes))
     clock.ticker("tick", 15 * MS, lambda: notes.append(("tick", clock.now_ns())))

@@ -32,7 +32,9 @@ PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
         ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # the pulse continues across the end of the period
     ],
 )
-def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current: float) -> None:
+def test_the_voltage_of_the_coil_is_that_of_table_5_2(
+    input_a: PwmCounts, input_b: PwmCounts, current: float
+) -> None:
     rig = Rig()
     rig.pca.configure()
     rig.pca.write_channels(0, [input_a, input_b])
@@ -101,7 +103,7 @@ def test_the_same_seed_gives_the_same_currents() -> None:
     assert fly() == fly()
 
 
-def test_a_coil_whose_resistance_is_not_what_the_driver_believes() -> None:
+def test_the_current_depends_on_the_true_resistance_of_the_coil() -> None:
     """A coil of 20 ohm that the driver assumes to have 23 ohm carries 0.115 A instead of 0.1 A."""
     rig = Rig()
     truth = replace(THESIS, coils=(CoilWiring(0, 1, 20.0), *THESIS_COILS[1:]))

@@ -30,7 +30,7 @@ from tests.hal.vn100.bench_line import Bench
 WATCHED = (1, 5, 6, 7, 21, 36, 38, 43, 44, 50, 51, 74, 75)
 
 
-def test_out_of_the_box_it_speaks_vnymr_at_40_hz() -> None:
+def test_by_default_the_unit_sends_vnymr_at_40_hz() -> None:
     items = Bench().run(1.0)
     assert 39 <= len(items) <= 41
     for item in items:
@@ -94,7 +94,7 @@ def test_mistakes_get_their_error_codes_and_change_nothing(line: bytes, code: st
     assert [bench.unit.registers.read(n) for n in WATCHED] == before
 
 
-def test_an_answer_is_checked_the_way_the_question_was() -> None:
+def test_an_answer_has_the_type_of_checksum_of_its_command() -> None:
     bench = Bench().quiet()
     for question in ("xor8", "crc16"):
         (answer,) = bench.exchange(build("RRG", 1, checksum=question))
@@ -141,7 +141,7 @@ def test_settings_outlive_a_reset_only_when_saved() -> None:
     assert {i.sentence.command for i in bench.run(0.5) if isinstance(i, AsciiLine)} == {"YMR"}
 
 
-def test_after_a_reset_it_is_silent_while_it_starts_and_its_clock_begins_at_zero() -> None:
+def test_after_a_reset_the_unit_is_silent_while_it_starts_and_its_clock_begins_at_zero() -> None:
     bench = Bench()
     bench.exchange(build("WRG", 75, 1, 20, "01", "0001"))
     bench.exchange(build("WNV"), 0.6)
@@ -151,7 +151,7 @@ def test_after_a_reset_it_is_silent_while_it_starts_and_its_clock_begins_at_zero
     assert packets[0].values == (25_000_000,)
 
 
-def test_its_clock_may_run_fast_and_out_of_step() -> None:
+def test_the_clock_of_the_unit_may_run_fast_and_out_of_phase() -> None:
     fast = Vn100EmulatorSettings(noise=PROFILES["none"], clock_ppm=20.0, uptime_ns=7_310_000_000)
     bench = Bench(fast).quiet()
     bench.exchange(build("WRG", 75, 1, 20, "01", "0001"))
@@ -165,7 +165,7 @@ def test_its_clock_may_run_fast_and_out_of_step() -> None:
     assert float(first.values[0]) % 25_000_000 == 0.0
 
 
-def test_every_ascii_type_says_what_its_register_says() -> None:
+def test_every_ascii_output_has_the_values_of_its_register() -> None:
     bench = Bench()
     for report in REPORTS:
         bench.exchange(build("WRG", 6, report.async_type), 0.05)
@@ -178,7 +178,7 @@ def test_every_ascii_type_says_what_its_register_says() -> None:
             assert answer.fields[1:] == line.sentence.fields
 
 
-def test_every_binary_field_of_a_vn100_can_be_had_and_agrees_with_the_others() -> None:
+def test_every_binary_field_of_a_vn100_is_available_and_agrees_with_the_others() -> None:
     bench = Bench().quiet()
     values: dict[str, tuple[float, ...]] = {}
     for group, word in SUPPORTED_FIELDS.items():
@@ -254,7 +254,7 @@ commands = st.sampled_from(
     )
 )
 @settings(max_examples=60, deadline=None)
-def test_whatever_it_receives_it_goes_on_and_can_be_restored(lines: list[bytes]) -> None:
+def test_after_any_received_bytes_the_unit_continues_and_can_be_restored(lines: list[bytes]) -> None:
     bench = Bench()
     for line in lines:
         bench.exchange(line, 0.03)
@@ -266,7 +266,7 @@ def test_whatever_it_receives_it_goes_on_and_can_be_restored(lines: list[bytes])
     assert {i.sentence.command for i in bench.run(0.2) if isinstance(i, AsciiLine)} == {"YMR"}
 
 
-def test_with_nothing_to_say_it_has_no_event_to_come() -> None:
+def test_a_unit_without_outputs_has_no_next_event() -> None:
     bench = Bench().quiet()
     assert bench.unit.next_event_ns() == NEVER
     bench.line.host.send(build("RRG", 1))
@@ -596,7 +596,7 @@ def test_tare_and_initial_heading_turn_the_attitude_about_the_vertical() -> None
     assert angles(bench.quiet())[0] == pytest.approx(turning[0], abs=3.0), "a reset finds north again"
 
 
-def test_with_an_absolute_heading_the_magnetometer_wins() -> None:
+def test_in_the_absolute_heading_mode_the_magnetometer_determines_the_heading() -> None:
     bench = Bench(NOISELESS).quiet()
     bench.exchange(build("WRG", 35, 1, 0, 1, 1))
     before = angles(bench)

@@ -68,7 +68,9 @@ def test_an_exposure_beyond_the_cameras_is_refused_with_its_limits() -> None:
         ({"exposure_ns": 20_000 * MILLISECOND_NS}, "exposure = 20.0 s"),
     ],
 )
-def test_what_the_camera_cannot_do_is_said(changes: dict[str, object], message: str) -> None:
+def test_settings_that_the_camera_does_not_support_are_refused(
+    changes: dict[str, object], message: str
+) -> None:
     with pytest.raises(DeviceError, match=message):
         aravis_rig(**changes)
 
@@ -90,7 +92,7 @@ def test_a_camera_whose_control_is_lost_is_reported_and_opened_again() -> None:
     source.close()
 
 
-def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None:
+def test_frames_without_a_trigger_are_returned_to_the_stream(fake: AravisCamera) -> None:
     clock = SystemClock()
     deadline_ns = clock.now_ns() + 500 * MILLISECOND_NS
     while clock.now_ns() < deadline_ns:  # the Fake camera sends frames without a trigger
@@ -101,7 +103,7 @@ def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None
     assert fake.counts.spoiled == 0
 
 
-def test_a_python_without_aravis_gets_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_aravis_the_remedy_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     monkeypatch.setitem(sys.modules, "gi", None)  # as if Aravis were not installed
     camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), SystemClock())

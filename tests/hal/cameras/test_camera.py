@@ -130,12 +130,12 @@ def test_a_closed_camera_answers_nothing() -> None:
         ([99, 0, 99, 0], [99, 100, 199, 200]),
     ],
 )
-def test_frame_numbers_go_on_where_the_count_wraps(counts: list[int], numbers: list[int]) -> None:
+def test_frame_numbers_increase_across_the_wrap_of_the_count(counts: list[int], numbers: list[int]) -> None:
     frames = FrameNumbers(100)
     assert [frames.number(count) for count in counts] == numbers
 
 
-def test_frame_numbers_go_on_where_the_camera_begins_again() -> None:
+def test_frame_numbers_increase_after_a_restart_of_the_camera() -> None:
     frames = FrameNumbers(100)
     first = [frames.number(count) for count in (0, 1, 2)]
     frames.begin_again()
@@ -145,7 +145,7 @@ def test_frame_numbers_go_on_where_the_camera_begins_again() -> None:
 PATIENCE_NS = 400_000_000
 
 
-def test_nothing_comes_untriggered(rig: Rig) -> None:
+def test_no_frame_arrives_without_a_trigger(rig: Rig) -> None:
     assert rig.source.poll() is None
     assert rig.frame_within(PATIENCE_NS) is None
 
@@ -179,7 +179,7 @@ def test_a_frame_keeps_its_pixels_when_others_follow(rig: Rig) -> None:
     assert not all(np.array_equal(first, other) for other in others)
 
 
-def test_the_frame_after_a_second_trigger_is_the_seconds(rig: Rig) -> None:
+def test_the_frame_after_a_second_trigger_belongs_to_the_second_trigger(rig: Rig) -> None:
     rig.source.trigger(EXPOSURE_NS)
     rig.wait(EXPOSURE_NS // 4)
     second_ns = rig.clock.now_ns()

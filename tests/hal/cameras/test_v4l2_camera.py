@@ -65,9 +65,7 @@ def test_the_first_whole_exposure_after_the_trigger_is_taken(kernel: IoctlCamera
     video.camera.close()
 
 
-def test_frames_that_lay_in_the_queue_are_not_the_triggered_one(
-    kernel: IoctlCamera, clock: ManualClock
-) -> None:
+def test_frames_from_before_the_trigger_are_not_used(kernel: IoctlCamera, clock: ManualClock) -> None:
     with closing(VideoDevice(str(kernel.path))) as device:
         device.set_format(64, 48, "GREY")
         assert device.start(3) == 3
@@ -84,7 +82,7 @@ def test_frames_that_lay_in_the_queue_are_not_the_triggered_one(
         assert later.sequence > 30
 
 
-def test_a_stamp_of_the_frames_end_is_traced_back_to_the_exposures_start(
+def test_the_start_of_the_exposure_follows_from_a_stamp_of_the_end_of_the_frame(
     kernel: IoctlCamera, clock: ManualClock
 ) -> None:
     kernel.stamp_source = 0
@@ -109,7 +107,7 @@ def test_uvc_stamps_are_of_the_start_only_when_the_kernel_uses_the_cameras_clock
 
 
 @pytest.mark.parametrize("stamp", [Stamp.START, Stamp.END])
-def test_the_configuration_can_say_what_the_stamps_are_of(
+def test_the_configuration_can_state_to_what_the_time_stamps_refer(
     kernel: IoctlCamera, clock: ManualClock, stamp: Stamp
 ) -> None:
     kernel.stamp_source = v4l2.STAMP_START_OF_EXPOSURE if stamp is Stamp.END else 0
@@ -135,7 +133,9 @@ def test_a_changed_exposure_is_waited_for_until_frames_have_it(
     video.camera.close()
 
 
-def test_the_exposure_is_what_the_camera_made_of_it(kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_the_reported_exposure_is_the_one_that_the_camera_has_set(
+    kernel: IoctlCamera, clock: ManualClock
+) -> None:
     video = settled(kernel, clock)
     video.camera.trigger(30_033_000)
     frame = video.rig.frame_within(SECOND_NS)
@@ -147,7 +147,7 @@ def test_the_exposure_is_what_the_camera_made_of_it(kernel: IoctlCamera, clock: 
 @pytest.mark.parametrize(
     ("kind", "dtype", "bits"), [("GREY", np.uint8, 8), ("Y10", np.uint16, 10), ("Y16", np.uint16, 16)]
 )
-def test_pixels_arrive_where_they_were_without_the_rows_padding(
+def test_pixels_are_read_without_the_padding_of_the_rows(
     kernel: IoctlCamera, clock: ManualClock, kind: str, dtype: type, bits: int
 ) -> None:
     kernel.padding = 24
@@ -191,7 +191,7 @@ def test_a_frozen_sequence_is_passed_on_as_it_stands(kernel: IoctlCamera, clock:
     video.camera.close()
 
 
-def test_sequence_numbers_go_on_where_the_kernels_count_wraps(
+def test_sequence_numbers_increase_across_the_wrap_of_the_count_of_the_kernel(
     kernel: IoctlCamera, clock: ManualClock
 ) -> None:
     kernel.first_sequence = (1 << 32) - 12
@@ -203,7 +203,7 @@ def test_sequence_numbers_go_on_where_the_kernels_count_wraps(
     video.camera.close()
 
 
-def test_a_late_frame_says_when_it_was_exposed(kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_a_late_frame_has_the_time_of_its_exposure(kernel: IoctlCamera, clock: ManualClock) -> None:
     video = settled(kernel, clock)
     kernel.held_ns = 1_500_000_000
     frame = video.rig.next_frame()
@@ -277,7 +277,7 @@ def test_a_camera_that_stands_still_is_opened_again(kernel: IoctlCamera, clock: 
     video.camera.close()
 
 
-def test_a_camera_no_longer_asked_may_be_silent(kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_a_camera_without_a_pending_trigger_may_be_silent(kernel: IoctlCamera, clock: ManualClock) -> None:
     video = settled(kernel, clock)
     video.rig.next_frame()
     kernel.stopped = True
@@ -287,7 +287,7 @@ def test_a_camera_no_longer_asked_may_be_silent(kernel: IoctlCamera, clock: Manu
     video.camera.close()
 
 
-def test_a_broken_exchange_is_not_a_crash(
+def test_failed_ioctls_are_reported_and_frames_arrive_again_after_them(
     kernel: IoctlCamera, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     video = settled(kernel, clock)
@@ -384,7 +384,9 @@ def test_the_time_between_frames_is_not_shorter_than_the_exposure(
     assert kernel.interval_asked_ns == 1_000_000 * chosen_ms
 
 
-def test_no_such_camera_names_the_cure(tmp_path: Path, kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_a_missing_device_file_is_reported_with_the_remedy(
+    tmp_path: Path, kernel: IoctlCamera, clock: ManualClock
+) -> None:
     with pytest.raises(NotResponding, match=r"nothing: no such camera.*v4l2-ctl --list-devices"):
         video_rig(kernel, clock, path=str(tmp_path / "nothing"))
 
@@ -427,7 +429,7 @@ def test_a_camera_on_an_exhausted_usb_bus_is_refused_with_the_cure(
         ({"exposure_ns": 2 * SECOND_NS}, r"exposure = 2\.0 s is outside"),
     ],
 )
-def test_what_the_camera_cannot_do_is_said(
+def test_settings_that_the_camera_does_not_support_are_refused(
     kernel: IoctlCamera, clock: ManualClock, changes: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DeviceError, match=message):

@@ -109,7 +109,7 @@ def test_names_of_pixel_formats_survive_their_code() -> None:
         assert coding.bits in PIXEL_BITS[name]
 
 
-def test_all_agree_with_this_machines_own_header(tmp_path: Path) -> None:
+def test_all_values_agree_with_the_header_of_this_machine(tmp_path: Path) -> None:
     compiler = shutil.which("cc")
     if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
         pytest.skip("no C compiler or no kernel headers here")

@@ -13,7 +13,7 @@ MS = 1_000_000
 
 
 @pytest.mark.parametrize("fault", ["nack", "arbitration"])
-def test_a_passing_fault_is_retried_and_counted(rig: Rig, fault: str) -> None:
+def test_a_transient_fault_is_retried_and_counted(rig: Rig, fault: str) -> None:
     rig.coils.start()
     if fault == "nack":
         rig.wire.bus.nack(PCA, times=2)
@@ -25,7 +25,7 @@ def test_a_passing_fault_is_retried_and_counted(rig: Rig, fault: str) -> None:
     assert (state.faults, state.error) == (2, "")
 
 
-def test_a_write_that_fails_for_good_ends_at_zero_and_says_why(rig: Rig) -> None:
+def test_a_write_that_fails_repeatedly_sets_the_coils_to_zero_and_reports_the_error(rig: Rig) -> None:
     """If three attempts of a write fail, the driver writes zero to all coils and reports the error.
 
     Each attempt fails after ten bytes, so that coil x has its new value and coil y still has its old value.
@@ -44,7 +44,7 @@ def test_a_write_that_fails_for_good_ends_at_zero_and_says_why(rig: Rig) -> None
     assert rig.coils.state().error == ""
 
 
-def test_a_dead_chip_keeps_its_error_until_it_is_back_and_then_obeys(rig: Rig) -> None:
+def test_the_error_of_a_dead_chip_remains_until_the_chip_responds_again(rig: Rig) -> None:
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)
     rig.wire.bus.nack(PCA, times=None)
@@ -62,7 +62,7 @@ def test_a_dead_chip_keeps_its_error_until_it_is_back_and_then_obeys(rig: Rig) -
     assert rig.currents()[0] == pytest.approx(0.03, abs=1e-4)
 
 
-def test_a_dead_chip_is_asked_once_a_period_and_with_zero(rig: Rig) -> None:
+def test_a_dead_chip_gets_one_write_of_zero_per_period(rig: Rig) -> None:
     """A chip that does not respond is accessed once per period of 50 ms, by one transaction that writes zero.
 
     On a hung bus, each transaction lasts until its timeout, so the number of transactions must be small.
@@ -86,7 +86,7 @@ def test_a_job_that_is_late_for_close_writes_nothing(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("action", ["off", "close"])
-def test_zero_asked_for_just_before_a_write_is_not_undone_by_it(action: str) -> None:
+def test_a_request_of_zero_just_before_a_write_is_not_undone_by_the_write(action: str) -> None:
     """A call of `off` or `close` just before a write is not undone by this write.
 
     The call is made as by a signal handler that interrupts the writing thread.

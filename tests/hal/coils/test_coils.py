@@ -44,7 +44,7 @@ USUAL = st.floats(-0.25, 0.25)
     command=st.tuples(USUAL | FINITE, USUAL | FINITE, USUAL | FINITE),
     limit=st.sampled_from([0.148, 0.1, 0.0201, 1.0]),
 )
-def test_the_world_feels_what_was_commanded_within_half_a_count(
+def test_the_coils_carry_the_commanded_currents_within_half_a_count(
     command: tuple[float, float, float], limit: float
 ) -> None:
     """The coil currents equal the commanded currents within half a count of the PWM.
@@ -127,7 +127,7 @@ def test_start_leaves_a_running_chip_at_zero(rig: Rig) -> None:
     assert rig.coils.state().error == ""
 
 
-def test_start_without_a_chip_says_so(rig: Rig) -> None:
+def test_a_start_without_a_chip_is_reported(rig: Rig) -> None:
     rig.wire.bus.detach(rig.wire.chip)
     with pytest.raises(NotResponding, match="pca9685 at 0x40"):
         rig.coils.start()
@@ -252,7 +252,7 @@ def test_before_the_first_command_the_state_is_all_zero(rig: Rig) -> None:
         lambda: replace(THESIS, tries=0),
     ],
 )
-def test_settings_that_cannot_be_are_refused(make: Callable[[], object]) -> None:
+def test_impossible_settings_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(DeviceError, match="is outside"):
         make()
 
@@ -295,7 +295,7 @@ def test_a_lower_limit_is_never_exceeded_by_rounding() -> None:
     assert largest * STEP <= 0.1 < (largest + 1) * STEP
 
 
-def test_a_limit_of_whole_counts_loses_none() -> None:
+def test_a_limit_of_whole_counts_is_reached_exactly() -> None:
     assert all(largest_counts(STEP, counts * STEP) == counts for counts in range(1, 4097))
 
 
@@ -356,7 +356,7 @@ def test_a_leg_stuck_high_drives_its_coil_at_zero_and_a_brake_ends_it(
     assert rig.coils.state().braked == Y
 
 
-def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig: Rig) -> None:
+def test_a_healthy_bridge_that_is_braked_carries_no_current_for_any_command(rig: Rig) -> None:
     rig.coils.start()
     rig.coils.brake(Y)
     rig.command(0.1, 0.1, -0.05)
@@ -379,7 +379,7 @@ def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
     assert rig.currents()[1] == pytest.approx(-FULL)
 
 
-def test_zero_keeps_what_is_braked_at_zero() -> None:
+def test_coils_stay_at_zero_while_a_stuck_leg_is_braked() -> None:
     rig = stuck()
     rig.coils.brake(Y)
     rig.command(0.1, 0.0, 0.0)
@@ -421,7 +421,7 @@ def test_a_brown_out_lifts_a_brake_for_half_a_second_at_most() -> None:
     assert rig.wire.chip.violations == set()
 
 
-def test_a_brake_that_the_chip_did_not_take_is_made_up_for() -> None:
+def test_a_brake_that_could_not_be_written_is_written_later() -> None:
     rig = stuck()
     rig.wire.bus.nack(PCA, times=None)
     rig.coils.brake(Y)

@@ -48,7 +48,7 @@ def test_config_asks_for_16_v_80_mv_and_128_samples() -> None:
 @pytest.mark.parametrize(
     ("current", "shunt"), [(3.3, 0.1), (0.0, 0.1), (math.nan, 0.1), (0.8, 0.0), (0.8, math.inf)]
 )
-def test_what_cannot_be_measured_is_refused(current: float, shunt: float) -> None:
+def test_currents_and_shunts_beyond_the_ranges_are_refused(current: float, shunt: float) -> None:
     rig = Rig()
     with pytest.raises(OutOfRange):
         Ina219(rig.bus, INA, rig.clock, shunt_ohm=shunt, maximum_current=current)
@@ -198,7 +198,7 @@ def test_a_silent_monitor_is_an_error_until_it_answers(rig: Rig) -> None:
     assert monitor.latest() is not None
 
 
-def test_a_brown_out_is_noticed_said_and_mended(rig: Rig) -> None:
+def test_a_brown_out_is_detected_reported_and_repaired(rig: Rig) -> None:
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.clock.advance(1000 * MS)
     rig.wire.monitor.brown_out()
@@ -209,7 +209,7 @@ def test_a_brown_out_is_noticed_said_and_mended(rig: Rig) -> None:
     assert monitor.error() == ""
 
 
-def test_a_brown_out_is_said_even_if_an_earlier_run_had_set_the_chip_up() -> None:
+def test_a_brown_out_is_reported_even_if_an_earlier_run_had_set_the_chip_up() -> None:
     rig = Rig()
     rig.bus.write_i2c_block_data(INA, 0x00, [0x0F, 0xFF])
     monitor = Ina219(rig.bus, INA, rig.clock)
@@ -360,7 +360,7 @@ def test_a_reset_of_the_whole_bus_costs_a_round_and_no_more() -> None:
     assert flown.clock.now_ns() - after.time_ns <= SECOND_NS // 2
 
 
-def test_dead_frozen_and_wrong_strings_look_as_they_do_on_a_satellite() -> None:
+def test_dead_frozen_and_wrong_strings_give_the_readings_of_real_ones() -> None:
     flown = bench()
     flown.wait(1.2)
     sound = flown.driver.latest()
@@ -423,7 +423,7 @@ def test_a_current_beyond_the_range_is_clipped_and_named_and_leaves_the_other_st
     assert flown.driver.error() == ""
 
 
-def test_wirings_and_periods_that_cannot_be_are_refused() -> None:
+def test_impossible_wirings_and_periods_are_refused() -> None:
     bus, clock = EmulatedI2cBus(), SimClock()
     twice = (StringWiring(0x48, 0, 1.0), StringWiring(0x48, 0, 1.0))
     for wirings, period in ((twice, 1.0), ((), 1.0), ((StringWiring(0x48, 4, 1.0),), 1.0), (WIRINGS, 0.02)):

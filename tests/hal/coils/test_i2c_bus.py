@@ -70,19 +70,19 @@ def test_a_write_cut_short_leaves_what_was_acknowledged(rig: Rig) -> None:
     assert rig.bus.read_i2c_block_data(PCA, 0x06, 4) == [1, 2, 0, 0x10]
 
 
-def test_a_closed_bus_says_so_and_closes_twice(rig: Rig) -> None:
+def test_a_closed_bus_refuses_transfers_and_can_be_closed_twice(rig: Rig) -> None:
     rig.bus.close()
     rig.bus.close()
     with pytest.raises(OSError, match="closed"):
         rig.bus.read_byte_data(PCA, 0x00)
 
 
-def test_the_adapter_gets_its_time_out_and_repeats_nothing(kernel: IoctlWire) -> None:
+def test_the_adapter_gets_its_timeout_and_no_retries(kernel: IoctlWire) -> None:
     LinuxI2cBus("/dev/null", timeout_ns=25_000_000).close()
     assert kernel.settings == [(I2C_TIMEOUT, 3), (I2C_RETRIES, 0)]
 
 
-def test_a_time_out_of_nothing_is_refused(kernel: IoctlWire) -> None:
+def test_a_timeout_of_zero_is_refused(kernel: IoctlWire) -> None:
     with pytest.raises(OutOfRange, match="time-out"):
         LinuxI2cBus("/dev/null", timeout_ns=0)
 
@@ -150,7 +150,7 @@ def test_an_adapter_without_block_transfers_is_refused(kernel: IoctlWire) -> Non
         LinuxI2cBus("/dev/null")
 
 
-def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path) -> None:
+def test_a_bus_that_may_be_missing_is_opened_when_it_appears(kernel: IoctlWire, tmp_path: Path) -> None:
     name = tmp_path / "knightcube-i2c"
     bus = LinuxI2cBus(str(name), patient=True)
     with pytest.raises(FileNotFoundError):
@@ -160,7 +160,7 @@ def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path
     bus.close()
 
 
-def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_else(
+def test_an_exclusive_bus_belongs_to_one_flight_and_is_locked_before_any_other_access(
     kernel: IoctlWire, tmp_path: Path
 ) -> None:
     """Only one flight can open a bus exclusively, and the bus is locked before any other access.
@@ -179,7 +179,7 @@ def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_el
     LinuxI2cBus(str(node), exclusive=True).close()
 
 
-def test_a_missing_bus_says_which_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_bus_is_reported_with_the_available_buses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hal.buses.linux_wires.adapters", lambda: [(1, "Synopsys DesignWare I2C adapter")])
     with pytest.raises(NotResponding, match=r"/dev/i2c-97: .*i2c-1 \(Synopsys.*udev rule"):
         LinuxI2cBus(97)
@@ -237,7 +237,7 @@ def test_words_are_little_endian_on_the_wire(bus: SMBus) -> None:
     assert bus.process_call(INA, 0x05, 0x7856) == 0x7856
 
 
-def test_bytes_without_a_register_go_on_where_the_pointer_stands(bus: SMBus) -> None:
+def test_bytes_without_a_register_continue_at_the_pointer(bus: SMBus) -> None:
     bus.write_byte_data(PCA, 0x00, 0x20)
     bus.write_byte(PCA, 0x02)
     assert [bus.read_byte(PCA) for _ in range(3)] == [0xE2, 0xE4, 0xE8]
@@ -266,7 +266,7 @@ def test_a_part_that_is_absent_acknowledges_nothing(bus: SMBus) -> None:
         assert caught.value.errno == errno.EREMOTEIO
 
 
-def test_faults_of_the_wire_meet_messages_too(bus: SMBus, kernel: IoctlWire) -> None:
+def test_faults_of_the_wire_affect_messages_too(bus: SMBus, kernel: IoctlWire) -> None:
     kernel.wire.flip_bits(PCA, index=1, mask=0x01)
     answer = i2c_msg.read(PCA, 2)
     bus.i2c_rdwr(i2c_msg.write(PCA, [0xFE]), answer)

@@ -66,7 +66,9 @@ def news_until(guardian: GuardianLine, wanted: GuardianNews, patience: float = 1
     return news
 
 
-def test_heartbeats_keep_it_quiet_and_silence_makes_it_act(guardian: GuardianLine, log: Path) -> None:
+def test_the_guardian_acts_after_silence_and_not_while_heartbeats_arrive(
+    guardian: GuardianLine, log: Path
+) -> None:
     begun_ns = time.monotonic_ns()
     last_ns = beat_for(guardian, 0.6)
     assert not [at for at in zeros(log) if begun_ns + 50_000_000 < at <= last_ns]
@@ -77,7 +79,7 @@ def test_heartbeats_keep_it_quiet_and_silence_makes_it_act(guardian: GuardianLin
     assert after[1] - after[0] > 0.09, "and again every 0.1 s"
 
 
-def test_a_heart_that_beats_again_is_let_go(guardian: GuardianLine, log: Path) -> None:
+def test_the_guardian_stops_its_writes_when_heartbeats_resume(guardian: GuardianLine, log: Path) -> None:
     beat_for(guardian, 0.05)
     news_until(guardian, GuardianNews.ACTED)
     begun_ns = time.monotonic_ns()
@@ -85,7 +87,9 @@ def test_a_heart_that_beats_again_is_let_go(guardian: GuardianLine, log: Path) -
     assert not [at for at in zeros(log) if begun_ns + 50_000_000 < at <= last_ns]
 
 
-def test_a_polite_end_zeroes_once_more_and_leaves_no_process(guardian: GuardianLine, log: Path) -> None:
+def test_an_orderly_end_zeroes_the_coils_again_and_leaves_no_process(
+    guardian: GuardianLine, log: Path
+) -> None:
     beat_for(guardian, 0.05)
     before = len(zeros(log))
     guardian.close()
@@ -209,7 +213,7 @@ def test_a_chip_that_is_silent_at_the_start_is_refused(log: Path) -> None:
         line.close()
 
 
-def test_it_is_small_and_knows_no_numpy(guardian: GuardianLine) -> None:
+def test_the_guardian_is_small_and_does_not_import_numpy(guardian: GuardianLine) -> None:
     process = Path(f"/proc/{guardian.process_id}")
     maps = (process / "maps").read_text(encoding="utf-8")
     assert "numpy" not in maps
@@ -224,7 +228,7 @@ def test_it_is_small_and_knows_no_numpy(guardian: GuardianLine) -> None:
 MS = 1_000_000
 
 
-def test_before_the_first_heartbeat_zero_is_said_at_once_and_again() -> None:
+def test_before_the_first_heartbeat_zero_is_written_at_once_and_repeatedly() -> None:
     watch = Watch(0)
     assert watch.attempt(0)
     assert not watch.attempt(REPEAT_NS - 1)
@@ -233,7 +237,7 @@ def test_before_the_first_heartbeat_zero_is_said_at_once_and_again() -> None:
 
 
 @given(st.lists(st.integers(0, SILENCE_NS - 1), max_size=40))
-def test_a_heart_that_beats_in_time_is_left_alone(gaps: list[int]) -> None:
+def test_heartbeats_in_time_cause_no_action(gaps: list[int]) -> None:
     watch, now_ns = Watch(0), 0
     watch.beat(0)
     for gap in gaps:
@@ -242,7 +246,7 @@ def test_a_heart_that_beats_in_time_is_left_alone(gaps: list[int]) -> None:
         watch.beat(now_ns)
 
 
-def test_silence_is_acted_on_after_its_time_and_counted_once() -> None:
+def test_silence_causes_an_action_after_its_time_and_is_counted_once() -> None:
     watch = Watch(0)
     watch.beat(0)
     assert watch.due_ns == SILENCE_NS
@@ -260,7 +264,7 @@ def test_a_heartbeat_after_silence_releases_at_once() -> None:
     assert watch.outages == 2
 
 
-def test_an_orphan_acts_at_once_and_ends_after_its_last_words() -> None:
+def test_an_orphan_acts_at_once_and_ends_after_its_final_writes() -> None:
     watch, now_ns = Watch(0), 5 * MS
     watch.beat(0)
     watch.orphan(now_ns)
@@ -272,14 +276,14 @@ def test_an_orphan_acts_at_once_and_ends_after_its_last_words() -> None:
     assert watch.over(now_ns)
 
 
-def test_an_orphan_that_reaches_nobody_gives_up_in_the_end() -> None:
+def test_an_orphan_without_a_response_gives_up_in_the_end() -> None:
     watch = Watch(0)
     watch.orphan(0)
     assert not watch.over(PATIENCE_NS)
     assert watch.over(PATIENCE_NS + 1)
 
 
-def test_who_is_not_an_orphan_never_ends() -> None:
+def test_a_guardian_that_is_not_an_orphan_never_ends() -> None:
     watch = Watch(0)
     for _ in range(10):
         watch.acknowledged()

@@ -30,7 +30,7 @@ def manager_end(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tupl
         yield end, name
 
 
-def test_every_word_arrives_as_a_datagram_of_its_own(manager_end: tuple[socket.socket, str]) -> None:
+def test_every_message_arrives_in_its_own_datagram(manager_end: tuple[socket.socket, str]) -> None:
     end, name = manager_end
     service = ServiceManager({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2000000"}, OWN)
     service.ready("flying")
@@ -52,7 +52,9 @@ def test_every_word_arrives_as_a_datagram_of_its_own(manager_end: tuple[socket.s
         ({}, 0),
     ],
 )
-def test_the_watchdog_is_ours_only_when_it_says_so(environment: dict[str, str], period_ns: int) -> None:
+def test_the_watchdog_applies_only_if_its_variables_name_this_process(
+    environment: dict[str, str], period_ns: int
+) -> None:
     assert ServiceManager(environment, OWN).watchdog_ns == period_ns
 
 
@@ -65,7 +67,7 @@ def test_a_watchdog_of_another_process_is_not_fed(manager_end: tuple[socket.sock
     assert end.recv(100) == b"STOPPING=1"
 
 
-def test_without_a_manager_or_with_a_dead_one_nothing_happens(tmp_path: Path) -> None:
+def test_messages_to_a_missing_or_dead_manager_raise_no_exception(tmp_path: Path) -> None:
     for environment in ({}, {"NOTIFY_SOCKET": str(tmp_path / "nobody")}):
         service = ServiceManager({**environment, "WATCHDOG_USEC": "2000000"}, OWN)
         service.ready("flying")
@@ -138,7 +140,7 @@ def test_a_refusal_is_reported_with_its_cure(monkeypatch: pytest.MonkeyPatch) ->
     )
 
 
-def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_real_time_priority_is_requested_for_each_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, int, int]] = []
     monkeypatch.setattr(
         os,

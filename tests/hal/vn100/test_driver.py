@@ -168,7 +168,7 @@ def test_ascii_output_gives_the_same_without_device_time() -> None:
         assert reading.acceleration == pytest.approx(truth.specific_force_body, abs=5.1e-4)
 
 
-def test_the_unit_may_be_found_in_any_state() -> None:
+def test_a_unit_in_any_state_is_configured() -> None:
     """A VN-100 with other outputs, and with half a command of a dead host in its buffer, is configured."""
     bench = bench_line()
     bench.line.host.send(b"\r\n" + build("WRG", 76, 1, 40, "01", "0729"))
@@ -181,7 +181,7 @@ def test_the_unit_may_be_found_in_any_state() -> None:
     assert bench.unit.registers.read(76)[0] == "0"
 
 
-def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
+def test_a_unit_that_was_set_up_beforehand_is_used_as_it_is() -> None:
     bench = bench_line(settings=replace(MISSION, configure=False), unit_settings=QUIET)
     bench.line.host.send(build("WRG", 75, 1, 16, "15", "0001", "060F", "0004"))
     bench.driver.configure()
@@ -193,7 +193,7 @@ def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
     assert readings[-1].quaternion == pytest.approx(turning(sampled_ns).quaternion, abs=2 * FLOAT32)
 
 
-def test_silence_is_not_responding_and_names_what_was_tried() -> None:
+def test_a_silent_unit_is_reported_with_the_baud_rates_that_were_tried() -> None:
     bench = bench_line()
     bench.line.to_host.faults = LineFaults(silent=True)
     with pytest.raises(NotResponding, match=r"VNASY,0 in 3 tries of 100 ms at 115200 baud, no byte received"):
@@ -210,7 +210,7 @@ def test_a_wrong_baud_rate_is_corrupt_data() -> None:
     assert bench.driver.link().packets == 0
 
 
-def test_a_unit_that_talks_but_does_not_hear_is_distinguished_from_a_silent_one() -> None:
+def test_a_unit_that_sends_but_does_not_receive_is_distinguished_from_a_silent_one() -> None:
     bench = bench_line()
     bench.line.to_device.faults = LineFaults(silent=True)
     with pytest.raises(NotResponding, match="though its output arrives"):
@@ -400,7 +400,7 @@ def received(values: dict[int, float]) -> tuple[Sequence[ImuReading], ImuLink]:
         ({"unit_port": 3}, Refused, "unit_port = 3"),
     ],
 )
-def test_what_unit_or_line_cannot_do_is_refused(
+def test_settings_beyond_the_unit_or_the_line_are_refused(
     change: dict[str, int], error: type[Exception], match: str
 ) -> None:
     make: Callable[..., Vn100Settings] = replace
@@ -443,7 +443,7 @@ def converse(settings: Vn100Settings, answers: Mapping[str, tuple[str, ...]] | N
 
 
 @pytest.mark.parametrize(("output", "questions"), [("binary", BINARY), ("ascii", ASCII)])
-def test_the_questions_are_those_of_the_manual(output: str, questions: list[str]) -> None:
+def test_the_commands_of_the_set_up_are_those_of_the_manual(output: str, questions: list[str]) -> None:
     settings = replace(MISSION, output="binary" if output == "binary" else "ascii", rate_hz=40)
     assert converse(settings) == questions
 
@@ -496,7 +496,7 @@ def test_an_answer_belongs_to_its_command_and_register() -> None:
     assert question.text() == "$VNWRG,75,1"
 
 
-def test_only_errors_of_the_line_are_worth_another_try() -> None:
+def test_only_errors_of_the_line_are_retried() -> None:
     """Only errors of the line are retried.
 
     The codes come from UM001 Table 18; -1 is an unreadable code.

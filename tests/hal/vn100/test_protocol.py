@@ -156,13 +156,13 @@ def test_a_line_that_is_not_a_sentence_gives_none(line: bytes) -> None:
     assert parse(line) is None
 
 
-def test_the_unit_may_be_spoken_to_without_a_checksum() -> None:
+def test_a_command_without_a_checksum_is_read() -> None:
     sentence = parse(b"$VNRRG,8*XX\r\n", allow_none=True)
     assert sentence is not None
     assert sentence.fields == ("8",)
 
 
-def test_count_and_status_behind_a_vnqmr_line_are_passed_over() -> None:
+def test_count_and_status_behind_a_vnqmr_line_are_ignored() -> None:
     body = VNQMR[1 : VNQMR.index(b"*")] + b",T0000000543,S0000"
     sentence = parse(b"$" + body + f"*{crc16(body):04X}\r\n".encode())
     assert sentence is not None
@@ -255,7 +255,7 @@ damaged = st.tuples(good, st.integers(0, 1000), st.integers(1, 255)).map(
 
 @given(st.lists(st.tuples(noise, good), max_size=6), noise, st.lists(st.integers(1, 60), min_size=1))
 @settings(max_examples=60, deadline=None)
-def test_every_chunking_gives_the_same(
+def test_the_result_does_not_depend_on_the_chunks(
     parts: list[tuple[bytes, bytes]], tail: bytes, sizes: list[int]
 ) -> None:
     data = b"".join(itertools.chain.from_iterable(parts)) + tail

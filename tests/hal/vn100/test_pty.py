@@ -58,7 +58,7 @@ def readings_for(seconds: float, driver: Vn100, clock: SystemClock) -> list[ImuR
     return readings
 
 
-def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.Popen[str]]) -> None:
+def test_the_driver_sets_the_unit_up_and_reads_at_40_hz(served: tuple[str, subprocess.Popen[str]]) -> None:
     name, process = served
     clock = SystemClock()
     port = PySerialPort(name, 115200, clock)
@@ -81,7 +81,7 @@ def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.
     assert process.wait(timeout=5) == 0
 
 
-def test_the_wrong_speed_is_known_for_what_it_is(served: tuple[str, subprocess.Popen[str]]) -> None:
+def test_a_wrong_baud_rate_is_named_as_the_probable_cause(served: tuple[str, subprocess.Popen[str]]) -> None:
     clock = SystemClock()
     driver = Vn100(PySerialPort(served[0], 57600, clock), clock, MISSION)
     with pytest.raises(CorruptData, match="check the baud rate"):
@@ -221,7 +221,7 @@ def test_a_port_that_is_not_there_is_named() -> None:
         PySerialPort("/dev/no-such-port", 115200, SystemClock())
 
 
-def test_a_patient_port_is_gone_until_it_is_there(tmp_path: Path) -> None:
+def test_a_port_that_may_be_missing_is_used_when_it_appears(tmp_path: Path) -> None:
     clock, name = SystemClock(), tmp_path / "imu"
     port = PySerialPort(str(name), 115200, clock, patient=True)
     with pytest.raises(NotResponding, match=f"{name}: cannot be opened at 115200 baud"):

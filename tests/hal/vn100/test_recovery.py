@@ -137,7 +137,7 @@ def test_readings_come_again_within_two_seconds_after_the_fault(
     assert len(bench.run(1.0)) >= 39
 
 
-def test_a_unit_that_was_reset_on_saved_binary_output_is_set_up_too(bench: BenchLine) -> None:
+def test_a_unit_with_saved_binary_output_is_set_up_again_after_a_reset(bench: BenchLine) -> None:
     """After a reset, a VN-100 that resumes its saved binary output is configured again.
 
     The packets continue without a command, so only the device clock shows the reset.
@@ -151,7 +151,7 @@ def test_a_unit_that_was_reset_on_saved_binary_output_is_set_up_too(bench: Bench
     assert bench.unit.registers.read(85)[:3] == ("20", "20", "20")
 
 
-def test_a_sound_unit_is_asked_nothing(bench: BenchLine) -> None:
+def test_a_healthy_unit_gets_no_commands(bench: BenchLine) -> None:
     sent: list[bytes] = []
     bench.line.host.send = sent.append  # type: ignore[method-assign,assignment]  # the ear is the test
     bench.run(20.0)

@@ -198,7 +198,7 @@ def test_the_disc_is_centred_where_the_lens_projects_the_suns_direction(model: E
         assert centroid == pytest.approx(sun_point(scene, model), abs=0.02)
 
 
-def test_all_the_suns_light_arrives_pi_in_these_units() -> None:
+def test_the_irradiance_of_the_sun_is_pi_in_these_units() -> None:
     """The irradiance of a matt white surface of radiance one is pi, whatever the size of the disc in px."""
     sun = ASTRONOMICAL_UNIT * np.array([0.1, 0.05, 1.0]) / np.linalg.norm([0.1, 0.05, 1.0])
     scene = _deep_space(sun, np.array([0.0, 0.0, 1.0]))

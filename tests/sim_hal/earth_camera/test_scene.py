@@ -320,7 +320,7 @@ def test_a_tilted_pole_carries_the_flattening_with_it() -> None:
     assert np.linalg.det(lying.earth_matrix) == pytest.approx(1.0)
 
 
-def test_a_camera_inside_the_earth_and_numbers_that_are_none_are_refused() -> None:
+def test_a_camera_inside_the_earth_and_values_that_are_not_finite_are_refused() -> None:
     with pytest.raises(OutOfRange, match="Earth radii"):
         EarthScene(np.array([6e6, 0.0, 0.0]), quaternion.IDENTITY, SUN)
     with pytest.raises(ValueError, match="finite"):

@@ -96,6 +96,6 @@ def test_no_torque_and_no_coil_ask_for_no_current() -> None:
     assert not nothing.currents.any()
 
 
-def test_what_is_not_finite_is_refused() -> None:
+def test_values_that_are_not_finite_are_refused() -> None:
     with pytest.raises(KnightCubeError, match="not finite"):
         allocate(np.array([np.nan, 0, 0]), np.ones(3), COILS, LIMITS)

@@ -70,7 +70,7 @@ def test_a_chip_that_fails_is_reported_within_half_a_second_and_obeys_again_afte
         assert all(lasting), "reported while the fault lasts"
 
 
-def test_a_sound_chip_is_never_complained_of() -> None:
+def test_a_healthy_chip_is_never_reported() -> None:
     seen, miss = errors_under("imu: silent @ 2 for 2")
     assert not any(error for _, error in seen)
     assert miss < 4e-3

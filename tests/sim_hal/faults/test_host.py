@@ -73,9 +73,7 @@ def outcome_at(fault: str, seconds: float, patience: float = 4.0) -> tuple[JobRe
         ("endless", "timed-out", 2.0),
     ],
 )
-def test_a_sabotaged_worker_comes_to_its_end_as_a_real_one_would(
-    kind: str, outcome: str, after: float
-) -> None:
+def test_a_faulty_worker_fails_like_a_real_worker(kind: str, outcome: str, after: float) -> None:
     result, seconds = outcome_at(f"planner: {kind} @ 2 for 3", 2.5)
     assert result.outcome == outcome
     assert seconds == pytest.approx(after, abs=0.026)
@@ -86,7 +84,7 @@ def test_a_sabotaged_worker_comes_to_its_end_as_a_real_one_would(
 
 
 @pytest.mark.parametrize("seconds", [1.5, 5.5])
-def test_before_and_after_its_fault_a_worker_is_sound(seconds: float) -> None:
+def test_a_worker_is_healthy_before_and_after_its_fault(seconds: float) -> None:
     result, _ = outcome_at("planner: exception @ 2 for 3", seconds)
     assert result.outcome == "done"
     assert result.value.angle == 0.5
@@ -143,7 +141,7 @@ def test_a_disk_fails_for_its_time_and_takes_bytes_again(tmp_path: Path, kind: s
     assert (tmp_path / "second").read_bytes() == b"beforeafter"
 
 
-def test_without_such_faults_everything_is_handed_through() -> None:
+def test_without_faults_of_the_host_its_parts_are_unchanged() -> None:
     clock, faults = flown("imu: silent")
     specs = [Worker("planner", find, 0, SECOND_NS)]
     runner = LockStepRunner(clock, specs)

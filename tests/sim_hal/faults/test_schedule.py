@@ -93,7 +93,7 @@ def test_every_device_has_faults_and_every_fault_is_listed() -> None:
     assert all(line.strip().startswith(name) for line, name in zip(lines, CATALOGUE, strict=True))
 
 
-def test_what_is_drawn_and_what_may_be_given_stands_in_the_list() -> None:
+def test_the_list_states_random_and_optional_parameters() -> None:
     (line,) = [line for line in listing().splitlines() if line.strip().startswith("pwm: upset")]
     assert "(register=drawn, bit=drawn)" in line
     assert "register one of 0, 1, 6 to 69, 254;" in line
@@ -110,7 +110,7 @@ def test_a_configuration_holds_faults_as_data() -> None:
     assert (fault.kind.name, fault.at, fault.span) == ("imu: silent", 120.0, 5.0)
 
 
-def test_a_fault_in_a_configuration_is_complained_of_with_its_place() -> None:
+def test_a_wrong_fault_in_a_configuration_is_reported_with_its_place() -> None:
     bad = (FaultEntry(fault="imu: silent"), FaultEntry(fault="imu: quiet"))
     with pytest.raises(UsageError, match=r"simulation\.faults\[1\].*'imu: quiet'"):
         schedule(bad)
@@ -121,7 +121,7 @@ def test_a_fault_in_a_configuration_is_complained_of_with_its_place() -> None:
         configuration.simulation_section(text, CONFIG.name, Simulation)
 
 
-def test_what_makes_sense_in_real_time_only_is_refused_in_lock_step() -> None:
+def test_faults_that_need_real_time_are_refused_in_lock_step() -> None:
     killed = entries(["process: killed @ 3"])
     with pytest.raises(UsageError, match="--realtime"):
         scheduled(killed, realtime=False)
@@ -184,14 +184,14 @@ def test_each_parameter_is_held_to_its_bounds(kind: FaultKind, name: str) -> Non
         "imu: silent for 1e300",
     ],
 )
-def test_what_once_hung_or_crashed_is_refused_in_one_line(text: str) -> None:
+def test_values_that_once_caused_a_hang_or_a_crash_are_refused_in_one_line(text: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse(text)
     assert "\n" not in str(caught.value)
     assert text.partition("(")[2].rstrip(")") in str(caught.value)
 
 
-def test_seconds_beyond_all_reason_are_refused_in_a_section_too() -> None:
+def test_excessive_times_are_refused_in_a_section_too() -> None:
     with pytest.raises(UsageError, match=r"simulation\.faults\[0\].*seconds go up to"):
         schedule((FaultEntry(fault="imu: silent", at=1e300),))
 

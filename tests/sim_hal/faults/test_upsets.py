@@ -93,7 +93,7 @@ def test_a_bit_of_the_monitors_set_up_is_measured_and_mended(bit: int) -> None:
     assert rig.wire.monitor.register(CONFIG) == sound
 
 
-def test_the_monitors_calibration_is_used_by_nobody() -> None:
+def test_an_upset_of_the_calibration_of_the_monitor_has_no_effect() -> None:
     rig = Rig()
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.coils.start()
@@ -138,7 +138,7 @@ def test_a_unit_whose_output_is_upset_is_set_up_again_within_two_seconds(registe
     # Upsets that change the output rate, change a field, or add sentences to the packets.
     [*((75, bit) for bit in (16, 17, 18, 19, 21, 22, 23, 48)), (6, 1), (6, 3)],
 )
-def test_a_unit_that_says_more_or_less_than_it_was_asked_is_set_up_again(register: int, bit: int) -> None:
+def test_a_unit_with_additional_or_missing_outputs_is_set_up_again(register: int, bit: int) -> None:
     bench = bench_line()
     bench.driver.configure()
     bench.run(0.5)
@@ -161,7 +161,7 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
 
 
 @pytest.mark.parametrize("name", UPSETS)
-def test_what_is_not_said_is_drawn(name: str) -> None:
+def test_an_upset_without_a_stated_register_changes_a_random_register(name: str) -> None:
     """An upset without a stated register changes a random register.
 
     40 upsets give more than ten different results.
@@ -180,7 +180,7 @@ def test_what_is_not_said_is_drawn(name: str) -> None:
     assert len(seen) > 10
 
 
-def test_a_monitor_that_is_behind_shows_what_was_two_seconds_ago() -> None:
+def test_a_delayed_monitor_reports_the_current_of_two_seconds_ago() -> None:
     rig = Rig()
     monitor = Ina219(rig.bus, INA, rig.clock, averaged=1)
     rig.coils.start()

@@ -29,7 +29,7 @@ _VALUES = st.recursive(st.integers() | st.text() | st.booleans(), lambda value: 
 
 
 @given(st.lists(_VALUES, max_size=6), st.integers(1, 9))
-def test_messages_come_out_whole_however_the_wire_cuts_them(messages: list[Any], piece: int) -> None:
+def test_messages_are_complete_however_the_wire_divides_them(messages: list[Any], piece: int) -> None:
     wire = b"".join(map(pack, messages))
     inbox = Inbox()
     cut = [wire[at : at + piece] for at in range(0, len(wire), piece)]
@@ -91,7 +91,7 @@ def test_an_answer_that_came_too_late_is_not_accepted_for_the_next_request(serve
     assert bus.read_byte_data(0x40, 0) == 22
 
 
-def test_the_guardians_end_is_light() -> None:
+def test_the_module_of_the_guardian_imports_no_large_package() -> None:
     away = {"numpy", "msgspec", "yaml"}
     script = f"import sys, sim_hal.serving.device_link; print({away} & set(sys.modules))"
     done = subprocess.run(
@@ -105,7 +105,7 @@ def test_devices_that_run_are_flown_in_real_time_only(tmp_path: Path) -> None:
         fly(RunRequest(CONFIG, tmp_path / "run", devices=tmp_path / "facts.json"))
 
 
-def test_real_devices_are_not_looked_for_in_a_file(tmp_path: Path) -> None:
+def test_the_option_devices_is_refused_for_real_devices(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--devices"):
         fly(RunRequest(ROOT / "config/testbed.yaml", tmp_path / "run", devices=tmp_path / "facts.json"))
 
@@ -119,7 +119,7 @@ def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | Non
         fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))
 
 
-def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
+def test_a_server_that_has_ended_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "facts.json"
     unit = {"lines": {"/dev/knightcube-imu": "/dev/ptmx"}, "coil_bus": "/dev/i2c-1", "camera": False}
     gone = {**unit, "socket": str(tmp_path / "gone"), "wide": [], "utc_offset_ns": None}

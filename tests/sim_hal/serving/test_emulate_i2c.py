@@ -98,7 +98,9 @@ def test_smbus2_makes_every_transfer(environment: Mapping[str, str]) -> None:
     ]
 
 
-def test_files_copies_and_children_are_as_ever(environment: Mapping[str, str], tmp_path: Path) -> None:
+def test_files_copied_descriptors_and_child_processes_work_as_usual(
+    environment: Mapping[str, str], tmp_path: Path
+) -> None:
     (tmp_path / "note").write_text("kept", encoding="utf-8")
     said = run(
         environment,

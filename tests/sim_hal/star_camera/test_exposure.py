@@ -233,7 +233,7 @@ def test_a_track_that_ends_before_the_exposure_is_refused() -> None:
         expected_electrons(MODEL, np.zeros((0, 3)), [], *turning([0.0, 0.0, 0.0]), extra=[track])
 
 
-def test_tracks_that_cannot_be_are_refused() -> None:
+def test_impossible_tracks_are_refused() -> None:
     directions = at_pixels(MODEL, [[40.0, 40.0], [100.0, 70.0]])
     times = np.array([0.0, 1.0])
     with pytest.raises(ValueError, match="give"):

@@ -260,7 +260,7 @@ def test_stray_light_grows_across_the_frame_and_brings_its_own_noise(slopes: tup
     )
 
 
-def test_a_gradient_that_cannot_be_is_refused() -> None:
+def test_an_impossible_gradient_is_refused() -> None:
     with pytest.raises(OutOfRange, match="background_gradient"):
         replace(DEEP, background_gradient=(0.0, float("nan")))
 
@@ -414,7 +414,7 @@ def test_the_real_sky_puts_each_bright_star_where_the_pinhole_does() -> None:
     ("name", "value"),
     [("columns", 0), ("field_of_view", 3.2), ("gain", 0.0), ("read_noise", float("nan")), ("bits", 17)],
 )
-def test_a_camera_that_cannot_be_is_refused(name: str, value: float) -> None:
+def test_an_impossible_camera_is_refused(name: str, value: float) -> None:
     with pytest.raises(OutOfRange, match=name):
         StarCameraModel(**{name: value})  # type: ignore[arg-type] # wrong on purpose
 
@@ -426,7 +426,7 @@ def test_unknown_options_and_hot_pixels_off_the_detector_are_refused() -> None:
         StarCameraModel(hot_pixels=((1024, 0, 10.0),))
 
 
-def test_stars_and_attitudes_that_cannot_be_are_refused() -> None:
+def test_impossible_stars_and_attitudes_are_refused() -> None:
     star, (times, attitudes) = at_pixels(SMALL, [30.0, 20.0]), still()
     with pytest.raises(ValueError, match="finite"):
         expected_electrons(SMALL, star * np.nan, [3.0], times, attitudes)

@@ -285,7 +285,7 @@ def test_several_objects_come_in_their_order_and_brightness() -> None:
     assert [track.magnitude for track in tracks] == [6.5, 4.0]
 
 
-def test_a_track_that_cannot_be_is_refused() -> None:
+def test_a_track_with_impossible_arguments_is_refused() -> None:
     camera, leader = _pair(0.1)
     with pytest.raises(OutOfRange, match="end of the exposure"):
         source_tracks(camera.orbit, [leader], EPOCH, 1.0, 1.0)

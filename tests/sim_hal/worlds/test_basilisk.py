@@ -35,7 +35,7 @@ def both(
     return theirs, ours
 
 
-def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradient() -> None:
+def test_orbit_field_and_rotation_agree_with_the_world_free_body() -> None:
     """Two worlds with coils and gravity gradient agree in orbit, field and rotation.
 
     The degree 13 of IGRF-14, which WMM2025 does not have, changes the attitude by a milliradian.
@@ -58,7 +58,7 @@ def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradie
     assert theirs.truth().energy == pytest.approx(ours.truth().energy, rel=0.01)
 
 
-def test_disturbances_turn_the_body_about_as_ours_do() -> None:
+def test_disturbances_rotate_the_body_as_in_the_world_free_body() -> None:
     """Disturbances rotate the body equally in both worlds.
 
     Sunlight, dipoles and drag act for five minutes on a body that was at rest.
@@ -77,7 +77,7 @@ def test_disturbances_turn_the_body_about_as_ours_do() -> None:
     assert np.linalg.norm(one.rate - two.rate) < 0.2 * np.linalg.norm(two.rate)
 
 
-def test_it_flies_behind_the_seam_with_the_devices_of_an_orbit() -> None:
+def test_a_configuration_selects_the_basilisk_world_with_the_devices_of_an_orbit() -> None:
     pytest.importorskip("Basilisk", reason="Basilisk is not installed (extra `worlds`)")
     section = reader.replace(
         demo_world(), world="sim_hal.worlds.basilisk.world:make", free_body=FreeBodySection()
@@ -86,7 +86,7 @@ def test_it_flies_behind_the_seam_with_the_devices_of_an_orbit() -> None:
     assert isinstance(world, OrbitingWorld)
 
 
-def test_without_basilisk_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_basilisk_the_package_to_install_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("Basilisk")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delitem(sys.modules, "sim_hal.worlds.basilisk.scenario", raising=False)

@@ -299,7 +299,7 @@ FOLDER = Path(__file__).resolve().parents[3] / "config"
 
 
 @pytest.mark.parametrize("name", ["orbit.yaml", "orbit_3u.yaml", "orbit_object.yaml", "orbit_object_1u.yaml"])
-def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
+def test_configured_coils_and_inertia_agree_with_the_true_ones(name: str) -> None:
     """The configuration has the coils and the inertia of the world, within a few per cent.
 
     Entirely different coils would be a wrong configuration.

@@ -254,7 +254,7 @@ def test_the_perigee_turns_at_the_secular_rate(inclination: float) -> None:
     assert moved == pytest.approx(expected, abs=0.02 * 4.0 * scale)
 
 
-def test_what_lies_between_the_steps_is_as_good_as_the_steps() -> None:
+def test_positions_between_the_steps_are_as_accurate_as_at_the_steps() -> None:
     orbit = propagate(LOW, 6000.0)
     steps = orbit.solution.ts
     middle = 0.5 * (steps[:-1] + steps[1:])
@@ -273,7 +273,7 @@ def test_many_times_in_any_order_are_read_at_once() -> None:
     assert orbit.positions_at(np.zeros(0)).shape == (0, 3)
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_impossible_elements_durations_and_times_are_refused() -> None:
     with pytest.raises(OutOfRange, match="eccentricity"):
         replace(LOW, eccentricity=1.0)
     with pytest.raises(OutOfRange, match="semi_major_axis"):

@@ -41,7 +41,7 @@ def test_a_free_body_turns_at_constant_rate() -> None:
     assert world.angle == pytest.approx(0.1 - 0.2, abs=1e-12)
 
 
-def test_before_the_release_a_hand_holds_it() -> None:
+def test_the_body_does_not_move_before_its_release() -> None:
     model = TestbedModel(1.05e-3, 0.648, 4.5e-4, 0.0, 0.0, (23.0, 23.0, 23.0), 3.4)
     world = Testbed(model, 0.3, -0.1, lambda: np.array([0.1, 0.0, 0.0]))
     world.advance_to(2 * SECOND)
@@ -54,7 +54,7 @@ def test_before_the_release_a_hand_holds_it() -> None:
     assert world.energy == pytest.approx(0.23)
 
 
-def test_on_the_thread_it_swings_with_the_period_of_a_torsion_pendulum() -> None:
+def test_the_body_on_the_thread_swings_with_the_period_of_a_torsion_pendulum() -> None:
     world = bed(np.zeros(3), angle=0.3, stiffness=1e-5)
     period = 2 * math.pi * math.sqrt(1.05e-3 / 1e-5)
     world.advance_to(round(period * SECOND))
@@ -94,7 +94,7 @@ def test_the_torque_is_the_cross_product_of_dipole_and_field(angle: float) -> No
     assert world.rate == pytest.approx(torque / 1.05e-3 * 1e-3, rel=1e-4)
 
 
-def test_what_a_sensor_feels_is_consistent_with_the_attitude() -> None:
+def test_field_and_specific_force_in_body_axes_agree_with_the_attitude() -> None:
     motion = bed(np.zeros(3), angle=0.6, rate=0.02).motion(0)
     matrix = attitude_matrix(motion.quaternion)
     np.testing.assert_allclose(motion.field_body, matrix @ [0.0, 0.0, -4.5e-4], atol=1e-18)
@@ -109,7 +109,7 @@ def test_energy_of_coils_and_of_the_supply_are_integrated() -> None:
     assert world.supply_energy == pytest.approx(2 * 3.4 * 0.17)
 
 
-def test_the_result_does_not_depend_on_how_the_time_was_cut() -> None:
+def test_the_result_does_not_depend_on_the_time_steps() -> None:
     whole, pieces = (bed(np.array([0.1, 0, 0]), angle=0.2, rate=-0.1, stiffness=1e-5) for _ in range(2))
     whole.advance_to(5 * SECOND)
     for k in range(1, 1001):
@@ -143,7 +143,7 @@ def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
     assert flown == pytest.approx(9 * 0.5e-4)
 
 
-def test_it_is_biot_and_savart_summed_over_the_two_coils() -> None:
+def test_the_field_is_that_of_biot_and_savart_summed_over_two_loops() -> None:
     """The field is the sum of mu0 I R^2 / (2 (R^2 + z^2)^1.5) for two loops at z = R / 2."""
     mu, radius = 1.25663706127e-6, 0.3  # value of CODATA 2022
     loop = mu * radius**2 / (2.0 * (radius**2 + (radius / 2.0) ** 2) ** 1.5)

@@ -15,7 +15,7 @@ from tests.support.flights import demo_config, demo_world, fly
 HERE = "tests.sim_hal.worlds.spinning_world"
 
 
-def test_a_third_partys_world_is_flown_and_its_motion_reaches_estimate_and_truth(tmp_path: Path) -> None:
+def test_a_world_of_a_third_party_is_flown_and_its_motion_reaches_estimate_and_truth(tmp_path: Path) -> None:
     section = configuration.replace(demo_world(), world=f"{HERE}:make")
     run = fly(demo_config(4.0, camera=False), tmp_path, section=section)
     seconds = run["truth"]["time_ns"] * 1e-9
@@ -36,7 +36,7 @@ def test_a_third_partys_world_is_flown_and_its_motion_reaches_estimate_and_truth
         ("os:system", "whose function `system` failed: TypeError"),
     ],
 )
-def test_a_world_that_is_not_there_is_one_clear_line(name: str, complaint: str, tmp_path: Path) -> None:
+def test_a_missing_world_is_reported_in_one_line(name: str, complaint: str, tmp_path: Path) -> None:
     section = configuration.replace(demo_world(), world=name)
     with pytest.raises(ConfigError, match=complaint) as caught:
         fly(demo_config(1.0, camera=False), tmp_path, section=section)
