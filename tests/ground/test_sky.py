@@ -97,7 +97,7 @@ def test_astropy_finds_the_stars_where_they_are(seed: int) -> None:
     assert np.abs(frame.all_world2pix(radec, 0) - place).max() < 0.01
 
 
-def test_a_lens_told_without_its_distortion_is_noticed() -> None:
+def test_a_header_without_the_distortion_has_errors_of_more_than_a_pixel() -> None:
     """Without the SIP polynomials of the distortion, the errors at the corners are several px."""
     sky = _sky(1)
     plain = wcs.WCS(fits.Header.fromstring(header_text(sky)))

@@ -130,7 +130,7 @@ def claimed(result: ScanResult) -> int:
     return sum(LAYOUTS[name].length * count for name, count in result.counts.items())
 
 
-def test_nothing_gives_nothing() -> None:
+def test_an_empty_log_has_no_packets() -> None:
     result = scan(b"")
     assert result.counts == {}
     assert result.intact
@@ -147,7 +147,7 @@ def test_an_undamaged_log_is_intact() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.binary(max_size=200), st.binary(max_size=200), st.binary(max_size=200))
-def test_garbage_around_packets_costs_none_of_them(before: bytes, between: bytes, after: bytes) -> None:
+def test_garbage_around_packets_loses_none_of_them(before: bytes, between: bytes, after: bytes) -> None:
     first, second = timing_packets(2)
     result = scan(before + first + between + second + after)
     assert cycles(result) == [0, 1]
@@ -201,7 +201,7 @@ def test_sequence_gaps_are_counted_across_the_wrap() -> None:
     assert scan(b"".join(kept)).missing["cycle_timing"] == 8
 
 
-def test_a_packet_of_another_version_is_stepped_over_and_counted() -> None:
+def test_a_packet_of_another_version_is_skipped_and_counted() -> None:
     first, second = timing_packets(2)
     other = bytearray(first[:-2] + b"one field more")
     other[4:6] = (len(other) + 2 - 7).to_bytes(2, "big")
@@ -214,7 +214,7 @@ def test_a_packet_of_another_version_is_stepped_over_and_counted() -> None:
 
 
 @pytest.mark.parametrize("byte", [0, 1, 2], ids=["version bits", "apid", "sequence"])
-def test_a_header_that_is_not_ours_is_not_believed_even_with_a_good_crc(byte: int) -> None:
+def test_a_foreign_header_is_refused_even_with_a_valid_crc(byte: int) -> None:
     packet = bytearray(timing_packets(1)[0][:-2])
     if byte == 0:
         packet[0] |= 0x20
@@ -450,7 +450,7 @@ def test_without_pyarrow_the_cure_is_reported(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("form", ["parquet", "sqlite"])
-def test_no_format_is_written_where_nothing_can_be(tmp_path: Path, form: str) -> None:
+def test_a_path_that_cannot_be_written_is_refused_by_each_format(tmp_path: Path, form: str) -> None:
     run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UsageError, match=f"{form} cannot be written"):

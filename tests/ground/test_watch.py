@@ -194,7 +194,7 @@ def test_a_file_is_not_called_a_missing_folder(growing: Path) -> None:
         assert f"is not a folder: give a run's folder, such as {growing}" in done.stderr
 
 
-def test_a_log_that_stands_still_is_left_after_the_patience_with_status_1(growing: Path) -> None:
+def test_a_watch_of_a_log_that_does_not_grow_ends_after_its_patience_with_status_1(growing: Path) -> None:
     done = command("watch", growing, "--patience", "0.2")
     assert done.returncode == 1
     assert "the log has no stop event" in done.stderr
@@ -222,7 +222,7 @@ def watcher(growing: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_what_comes_while_a_flight_is_watched_is_shown_and_its_end_ends_it(
+def test_new_packets_are_shown_and_the_end_of_the_flight_ends_the_watch(
     watcher: subprocess.Popen[str], growing: Path
 ) -> None:
     end(growing)
@@ -367,7 +367,9 @@ def test_an_event_that_is_older_than_a_shown_event_is_shown_too(
     assert [line.split(": ")[1] for line in lines if "imu-silent" in line] == ["at 5.7", "at 2.3"]
 
 
-def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_watch_ends_if_the_flight_no_longer_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
     listener.will_say(answer(True), answer(True), b"x")

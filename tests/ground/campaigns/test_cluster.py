@@ -99,7 +99,7 @@ def test_a_cluster_without_the_checkout_survives_a_workers_death_and_a_lost_sche
     assert fly_here(TOY, 1, 3)[0]["value"] == results(part)["0"]["value"]
 
 
-def test_no_scheduler_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_scheduler_is_reported_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ground.campaigns.cluster.CONNECT_S", 0.3)
     with pytest.raises(UsageError, match=r"--dask tcp://127.0.0.1:9: no scheduler answers there"):
         fly(TOY, 1, 3, tmp_path, dask="tcp://127.0.0.1:9")

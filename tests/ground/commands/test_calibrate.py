@@ -42,7 +42,7 @@ def calibrated(pictures: list[Path]) -> tuple[dict[str, Any], Path]:
     return json.loads(done.stdout), out
 
 
-def test_the_lens_found_is_the_one_that_took_the_pictures(
+def test_the_calibration_finds_the_lens_of_the_simulated_camera(
     pictures: list[Path], calibrated: tuple[dict[str, Any], Path]
 ) -> None:
     """The calibration finds the lens of the simulated camera, which has no distortion and a centred axis.
@@ -63,7 +63,9 @@ def test_the_lens_found_is_the_one_that_took_the_pictures(
     assert sum(line.startswith("optical axis:") for line in lines) == 1
 
 
-def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path], tmp_path: Path) -> None:
+def test_undetermined_parameters_of_the_lens_are_named_and_not_written(
+    pictures: list[Path], tmp_path: Path
+) -> None:
     """Parameters that the stars do not determine are named and not written.
 
     The image covers only the central 7 deg, where a distortion is not measurable.
@@ -197,7 +199,7 @@ def _within(error: np.ndarray[Any, Any], covariance: list[list[float]]) -> bool:
     return bool(error @ np.linalg.solve(np.array(covariance), error) < 25.0)
 
 
-def test_the_stars_are_solved_where_they_are(samples: dict[str, Any]) -> None:
+def test_the_sample_of_stars_is_solved_to_a_hundredth_of_a_degree(samples: dict[str, Any]) -> None:
     found, truth = _tried(samples, "solve"), samples["truth"]["stars.png"]
     assert found["right_ascension_deg"] == pytest.approx(truth["right_ascension_deg"], abs=0.01)
     assert found["declination_deg"] == pytest.approx(truth["declination_deg"], abs=0.01)
@@ -224,7 +226,7 @@ def test_the_night_skies_calibrate_the_camera(samples: dict[str, Any]) -> None:
     assert found["focal_length"] == pytest.approx(focal_length, rel=1e-4)
 
 
-def test_every_picture_has_its_truth_and_a_place_that_cannot_be_is_refused(
+def test_every_sample_has_its_truth_and_a_folder_that_cannot_be_made_is_refused(
     samples: dict[str, Any], tmp_path: Path
 ) -> None:
     assert {Path(path).name for path in samples["files"]} == set(samples["truth"])

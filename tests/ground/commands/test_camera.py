@@ -169,7 +169,7 @@ def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:
         ("{driver: aravis}", 8, "`camera.device.name` is missing"),
     ],
 )
-def test_a_camera_that_makes_no_sense_is_refused(
+def test_an_impossible_camera_section_is_refused(
     tmp_path: Path, device: str, bits: int, message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message) as caught:

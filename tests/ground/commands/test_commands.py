@@ -48,7 +48,7 @@ def test_the_program_shows_its_help() -> None:
 
 
 @pytest.mark.parametrize("words", [["run"], ["report"], ["export"], ["plan"]])
-def test_help_is_everywhere(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_a_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     status, output, _ = obeyed(capsys, *words, "--help")
     assert status == 0
     assert "usage: knightcube" in output
@@ -246,7 +246,7 @@ def test_a_flight_ends_with_a_summary_of_the_loop_itself(
     assert "run-" in lines["log"]
 
 
-def test_mission_time_is_the_loop_s_where_the_log_stops(
+def test_the_mission_time_is_that_of_the_loop_although_the_log_ends_earlier(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["run", str(DEMO), "--duration", "6", "--out", str(tmp_path / "a"), "--json"]

@@ -29,7 +29,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("ending", ["| true", ">&-", ">&- 2>&-", "<&- >&- 2>&-", "2>&1 | true"])
-def test_a_reader_that_is_gone_does_not_count_as_a_failure(ending: str, run_folder: Path) -> None:
+def test_a_closed_pipe_does_not_count_as_a_failure(ending: str, run_folder: Path) -> None:
     done = shell(f"FLIGHT report {run_folder} --no-figures {ending}")
     assert (done.returncode, done.stderr) == (0, "")
 

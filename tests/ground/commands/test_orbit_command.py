@@ -93,7 +93,7 @@ def test_a_short_arc_is_said_to_be_one(
     assert not (tmp_path / "none").exists()
 
 
-def test_what_lacks_is_said() -> None:
+def test_a_run_without_positions_or_objects_is_refused_with_the_reason() -> None:
     run, _ = tracked(240.0)
     run["track"]["place"] = np.nan
     (found,) = orbits_of(run)  # type: ignore[arg-type]

@@ -56,7 +56,7 @@ def test_a_goal_is_pointed_at_and_its_roll_is_kept(
     assert abs(float(quarter[0] @ second)) < 2e-3
 
 
-def test_a_place_beneath_is_seen_straight_down() -> None:
+def test_a_place_below_the_satellite_has_the_attitude_of_nadir() -> None:
     longitude, latitude, _ = geodetic(celestial_to_terrestrial(JULIAN_DATE + 300.0 / 86_400.0) @ (7e6 * UP))
     place = [f"{math.degrees(float(angle)):.6f}" for angle in (latitude, longitude)]
     for roll in ([], ["--roll", "0"]):

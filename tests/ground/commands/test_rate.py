@@ -47,9 +47,7 @@ def picture(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("method", ["likelihood", "harris"])
-def test_a_prior_that_says_about_which_way_gives_the_rate_with_its_sign(
-    scene: Scene, picture: Path, method: str
-) -> None:
+def test_an_approximate_prior_gives_the_rate_with_its_sign(scene: Scene, picture: Path, method: str) -> None:
     prior = [f"{1.3 * component:.4f}" for component in scene.rate]
     done = command(
         "rate", picture, "--fov", FOV, "--exposure", "0.2", "--method", method, "--json", "--prior", *prior
@@ -233,7 +231,7 @@ def test_slow_rates_have_an_uncertainty_of_two_digits(picture: Path) -> None:
     assert "+- 0.0000 " not in line
 
 
-def test_a_shutter_that_nobody_described_widens_the_claim_and_the_command_asks_for_it(picture: Path) -> None:
+def test_an_unspecified_shutter_increases_the_uncertainty_and_the_command_asks_for_it(picture: Path) -> None:
     usual = "--fov", FOV, "--exposure", "0.2"
 
     def sigma(*more: str) -> float:

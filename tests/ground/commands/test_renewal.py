@@ -146,7 +146,7 @@ def test_elements_are_signed_as_the_command_elements_prints_them(signing: Path, 
         ("catalogue", None, [], "there is no such file"),
     ],
 )
-def test_what_the_board_would_refuse_is_not_signed(
+def test_artefacts_that_the_board_would_refuse_are_not_signed(
     signing: Path, tmp_path: Path, kind: str, text: str | None, options: list[str], words: str
 ) -> None:
     path = tmp_path / "artefact"

@@ -101,7 +101,7 @@ def test_samples_replace_no_file(tmp_path: Path) -> None:
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"mine"]
 
 
-def test_a_command_to_nobody_ran_and_failed(tmp_path: Path) -> None:
+def test_a_command_without_a_receiver_ends_with_status_1(tmp_path: Path) -> None:
     done = command("command", "--to", tmp_path / "none", "ping")
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "no flight listens there" in done.stderr

@@ -56,7 +56,9 @@ def satellite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Satel
     ends.close()
 
 
-def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite: Satellite) -> None:
+def test_the_console_requests_telemetry_once_and_returns_what_the_flight_records(
+    satellite: Satellite,
+) -> None:
     ends, feed = satellite.ends, satellite.feed
     ends.record(ends.mode_packet(Mode.HOLD, "ready"))
     came = [feed.new() for _ in range(4)]
@@ -161,7 +163,9 @@ def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite:
     assert satellite.ends.stages(int(str(answer["counter"])))[0] == "accepted"
 
 
-def test_without_an_answer_it_says_so(satellite: Satellite, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_answer_is_reported_after_its_timeout(
+    satellite: Satellite, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(commanding, "_ANSWER_S", 0.05)
     with pytest.raises(KnightCubeError, match=r"no answer over the link within 0\.05 s"):
         satellite.feed.send(CommandPacker().pack(ChangeMode(Mode.SAFE), 7))

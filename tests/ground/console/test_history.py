@@ -107,7 +107,7 @@ def test_a_replay_shows_at_each_time_what_was_live_then(history: History, run: R
     "message",
     ["", "[]", "null", '{"at": NaN, "speed": 1}', '{"at": 1, "speed": -1}', '{"at": 1, "speed": 1e9}', "{}"],
 )
-def test_a_cursor_takes_no_nonsense(message: str) -> None:
+def test_a_cursor_ignores_invalid_messages(message: str) -> None:
     cursor = PageCursor()
     assert not cursor.obey(message, 0.0)
     assert cursor.live

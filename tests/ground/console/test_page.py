@@ -178,7 +178,7 @@ def test_a_page_that_is_connected_again_stays_live(folder: Path) -> None:
         assert page.text("#light").startswith("no telemetry for")
 
 
-def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:
+def test_another_page_can_neither_frame_the_console_nor_read_its_data(folder: Path) -> None:
     """A page on another port can neither embed the console nor read its data, even in an authorised browser.
 
     The console and the other page have the same host, so the browser sends the cookies of the console.
@@ -199,7 +199,7 @@ def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Pa
         assert own.evaluate("fetch('/api/table').then((answer) => answer.status)") == 200
 
 
-def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_over(
+def test_the_page_shows_the_end_of_a_log_a_past_instant_and_the_state_of_the_telemetry(
     page: Page, folder: Path
 ) -> None:
     page.wait("document.getElementById('light').textContent.startsWith('no telemetry for')")
@@ -256,7 +256,7 @@ def test_each_size_and_theme_fits_shows_the_commands_and_has_no_violation(
     shown.page.close()
 
 
-def test_the_form_offers_what_a_satellite_obeys_and_refuses_before_sending(
+def test_the_form_offers_the_commands_of_a_satellite_and_refuses_wrong_values_before_sending(
     satellite: Page,
 ) -> None:
     offered = satellite.page.locator("#which option").all_inner_texts()

@@ -197,7 +197,7 @@ def test_the_table_has_every_field_and_every_command(folder: Path) -> None:
         ("packet=imu&field=rate&from=0&to=1&points=-3", "points = '-3'"),
     ],
 )
-def test_a_wrong_question_is_answered_in_words(folder: Path, query: str, complaint: str) -> None:
+def test_a_wrong_request_is_answered_with_a_reason(folder: Path, query: str, complaint: str) -> None:
     status, answer = get(folder, f"/api/series?{query}")
     assert status == 400
     assert complaint in answer["error"]
@@ -213,7 +213,7 @@ def test_a_table_that_would_be_too_long_is_refused(folder: Path, monkeypatch: py
     assert get(folder, query)[0] == 200, "a plot shows minima and maxima"
 
 
-def test_the_reader_is_pushed_the_newest_and_then_a_moment_of_the_past(folder: Path) -> None:
+def test_the_server_pushes_the_newest_state_and_then_a_requested_past_state(folder: Path) -> None:
     async def ask(client: TestClient[Any, Any]) -> tuple[Any, Any]:
         async with client.ws_connect("/api/live", origin=own(client)) as line:
             newest = await line.receive_json()
@@ -273,7 +273,7 @@ def test_a_frame_that_was_not_kept_is_null_and_has_no_picture(folder: Path) -> N
     assert get(folder, "/api/frame?sequence=x")[0] == 400
 
 
-def test_what_is_shown_live_is_whole(folder: Path) -> None:
+def test_the_live_state_is_shown_only_when_it_is_complete(folder: Path) -> None:
     """The live state is shown only when all packets of an instant have arrived.
 
     Packets of one instant may arrive in two updates. Until the second update, the state of the previous
@@ -380,7 +380,7 @@ def test_an_inertial_goal_needs_four_numbers(numbers: Any, complaint: str) -> No
         CommandForms(None).text("point", given)
 
 
-def test_a_satellite_points_by_named_numbers_and_refuses_what_only_a_testbed_obeys() -> None:
+def test_a_satellite_points_by_named_numbers_and_refuses_commands_of_a_testbed() -> None:
     forms = CommandForms(None, TELECOMMANDS)
     forms.body = "orbit"
     table = {command["name"]: command for command in forms.table()}

@@ -51,7 +51,7 @@ def test_within_the_drawn_worlds_the_body_stays_within_half_and_the_current_with
         assert 0.15 < np.sin(0.5 * np.max(np.abs(record.angle))) < 0.5
 
 
-def test_a_body_far_livelier_than_believed_is_caught_before_the_bound() -> None:
+def test_a_body_with_three_times_the_assumed_acceleration_stays_below_the_bound() -> None:
     """The feedback keeps a body with three times the assumed acceleration below the largest permitted q2.
 
     Without feedback, the pulses would reach q2 = 0.52.
@@ -67,13 +67,13 @@ def test_a_body_without_a_thread_does_not_drift_away_in_the_swing() -> None:
     assert np.sin(0.5 * np.max(np.abs(record.angle))) < 0.5
 
 
-def test_a_coil_connected_the_other_way_ends_in_no_current_for_good() -> None:
+def test_a_reversed_coil_gets_no_current_after_a_minute() -> None:
     record = fly_bare(replace(USUAL, dipole=-USUAL.dipole), 80.0)
     assert np.any(record.current[: round(50.0 / PERIOD)])
     assert not np.any(record.current[round(61.0 / PERIOD) :])
 
 
-def test_it_gives_up_only_when_the_body_does_not_come_to_rest() -> None:
+def test_the_excitation_gives_up_only_if_the_body_does_not_come_to_rest() -> None:
     lost = controller()
     for _ in range(round(61.0 / PERIOD)):
         lost.command(REST, 0.3, 0.0)
@@ -85,7 +85,7 @@ def test_it_gives_up_only_when_the_body_does_not_come_to_rest() -> None:
     assert not found.gave_up
 
 
-def test_after_a_loss_of_the_estimate_it_brings_the_body_to_rest_before_it_moves_it_again() -> None:
+def test_after_a_loss_of_the_estimate_the_body_is_brought_to_rest_before_it_is_moved_again() -> None:
     made = controller()
     while made.command(REST, 0.0, 0.0).current == 0.0:
         pass

@@ -165,7 +165,7 @@ def test_a_flight_without_current_or_with_next_to_none_is_refused() -> None:
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid value:RuntimeWarning")
 @pytest.mark.parametrize(("value", "times"), [(1e300, 1), (1e160, 100), (40.0, 100)])
-def test_rates_that_nothing_explains_are_refused_however_wild(value: float, times: int) -> None:
+def test_rates_that_no_constants_explain_are_refused(value: float, times: int) -> None:
     record = fly_bare(USUAL, 20.0)
     rate = record.rate.copy()
     rate[100 : 100 + times] = value * np.random.default_rng(2).standard_normal(times)
@@ -253,7 +253,7 @@ def test_with_the_truth_the_innovations_are_white_and_of_unit_variance(identifie
         assert np.all(np.abs(lag_one) < 4.0 / count**0.5)
 
 
-def test_a_wild_sample_is_gone_over_and_costs_nothing_after_it() -> None:
+def test_a_sample_beyond_the_gate_is_skipped_without_an_effect_on_later_samples() -> None:
     record = noiseless(TRUE, 6.0)
     spoilt = replace(record, angle=record.angle + 1.0 * (np.arange(len(record.time)) == 100))
     passed = innovations(spoilt, TRUE, QUIET, gate=30.0)
@@ -367,7 +367,7 @@ def test_without_a_magnetometer_the_field_is_as_uncertain_as_believed_and_says_s
     assert "magnetometer" not in blind.sources()["field"]
 
 
-def test_the_share_of_the_prior_is_how_much_the_answer_follows_it(identified: list[Identified]) -> None:
+def test_the_weight_of_the_prior_is_the_sensitivity_of_the_result_to_it(identified: list[Identified]) -> None:
     """If the prior changes by 1 %, the result changes by 1 % times the stated weight of the prior."""
     world, _, made = identified[0]
     before = scaled(made, PRIOR, world.field)
@@ -390,7 +390,7 @@ def test_the_fragment_takes_the_place_of_the_plant_section(identified: list[Iden
     assert section.thread_stiffness == pytest.approx(plant.stiffness.value, rel=1e-5)
 
 
-def test_a_thread_that_comes_out_less_than_zero_is_none(identified: list[Identified]) -> None:
+def test_a_negative_stiffness_is_set_to_zero(identified: list[Identified]) -> None:
     _, _, made = identified[0]
     loose = replace(made, constants=replace(made.constants, torsion=-1e-7))
     plant = scaled(loose, PRIOR, None)

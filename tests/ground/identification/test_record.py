@@ -57,7 +57,7 @@ def altered(
     return replace(run, flight=replace(run.flight, packets=packets))
 
 
-def test_the_truth_is_not_looked_at(short: Run) -> None:
+def test_the_record_does_not_depend_on_the_truth_log(short: Run) -> None:
     empty: ScanResult = replace(short.truth, packets={n: a[:0] for n, a in short.truth.packets.items()})
     with_truth, without = recorded(short), recorded(replace(short, truth=empty))
     assert len(short["truth"])

@@ -46,7 +46,7 @@ def test_a_byte_that_no_token_has_is_refused_at_once(data: bytes) -> None:
         list(CommandStream(TOKEN).packets(data))
 
 
-def test_how_much_of_a_token_is_right_is_not_disclosed() -> None:
+def test_the_number_of_correct_characters_of_a_token_is_not_disclosed() -> None:
     """A wrong token is refused only when its line is complete, whichever of its characters is wrong."""
     for right in range(len(TOKEN)):
         wrong = TOKEN[:right] + ("1" if TOKEN[right] == "0" else "0") + TOKEN[right + 1 :]

@@ -212,7 +212,7 @@ def test_strangers_do_not_keep_a_ground_station_out(
     assert open_still(known)
 
 
-def test_the_file_with_the_token_is_its_users_alone_and_goes_with_the_gateway(tmp_path: Path) -> None:
+def test_the_token_file_is_private_to_its_user_and_deleted_with_the_gateway(tmp_path: Path) -> None:
     path = token_path(tmp_path, 5013)
     path.write_text("of a gateway that was killed\n")
     path.chmod(0o644)
@@ -270,7 +270,7 @@ def opened(tmp_path: Path) -> Iterator[Opened]:
                 process.wait(PATIENCE_S)
 
 
-def test_the_command_obeys_whoever_has_read_its_file_and_nobody_else(opened: Opened) -> None:
+def test_the_gateway_obeys_only_clients_that_have_read_the_token_file(opened: Opened) -> None:
     with socket.create_connection(("127.0.0.1", opened.port), PATIENCE_S) as stranger:
         head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9000\r\n\r\n"
         skipped = 7 + int.from_bytes(head[4:6], "big")  # length that a packet reader would take from the text

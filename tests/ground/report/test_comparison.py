@@ -111,7 +111,7 @@ def test_every_result_of_a_satellite_is_compared() -> None:
     assert "control slots skipped by the loop" not in figures, "the log has no control packets"
 
 
-def test_what_was_configured_otherwise_is_listed_by_its_key(pair: tuple[Path, Path]) -> None:
+def test_different_configuration_values_are_listed_by_their_keys(pair: tuple[Path, Path]) -> None:
     facts = json.loads(command("report", *pair, "--json").stdout)
     assert facts["configuration"] == [
         {"key": "guidance.horizon", "a": 10.0, "b": 13.0},
@@ -135,7 +135,7 @@ def test_as_text_the_runs_stand_beside_each_other(pair: tuple[Path, Path]) -> No
     assert "note: B: no truth log: judged on the estimate" in done.stdout
 
 
-def test_a_run_beside_itself_differs_in_nothing(pair: tuple[Path, Path]) -> None:
+def test_a_run_compared_with_itself_has_no_differences(pair: tuple[Path, Path]) -> None:
     summary = summarise(read_run(pair[0]))
     compared = compare(summary, summary)
     assert compared["configuration"] == []

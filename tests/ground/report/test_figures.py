@@ -56,7 +56,7 @@ def test_detumbling_without_a_valid_gyro_rate_is_drawn_until_the_last_rate_of_th
     ],
     ids=["full", "cut short", "hardware, bare"],
 )
-def test_every_picture_that_the_run_has_something_for_is_drawn(
+def test_every_picture_for_which_the_run_has_data_is_drawn(
     tmp_path: Path, recipe: Recipe, expected: list[str]
 ) -> None:
     files = draw(read_run(make_run(tmp_path / "run", recipe)), tmp_path / "pictures")
@@ -115,7 +115,7 @@ def test_one_late_cycle_of_thousands_does_not_flatten_the_distribution() -> None
     np.testing.assert_allclose(np.asarray(line.get_ydata(), float), 1.0 - np.arange(4000) / 4000)
 
 
-def test_the_lateness_of_lock_step_is_none_and_said() -> None:
+def test_the_legend_states_that_lock_step_has_no_lateness() -> None:
     ax = Figure().subplots()
     panels.exceedance(ax, {"lateness": np.zeros(9), "execution": np.full(9, 2.0e-3)}, "Control cycles")
     labels = ax.get_legend_handles_labels()[1]

@@ -185,7 +185,7 @@ def test_the_last_ten_minutes_of_each_light_are_judged() -> None:
     assert found["shadow"] == pytest.approx(0.2)
 
 
-def test_without_an_estimate_nothing_is_said() -> None:
+def test_without_an_estimate_the_errors_of_the_dipole_are_unknown() -> None:
     assert all(math.isnan(share) for share in dipole_errors(dipole_flight(known=False)).values())
 
 
@@ -307,7 +307,7 @@ def test_the_sun_in_its_cone_leaves_no_unobstructed_instant() -> None:
     assert math.isnan(found["share"])
 
 
-def test_without_a_truth_log_nothing_is_said() -> None:
+def test_without_a_truth_log_the_star_camera_is_not_judged() -> None:
     run = cast(dict[str, PacketArray], flight([21.0]))
     run["truth"] = run["truth"][:0]
     assert star_camera(cast(Run, run), config()) is None

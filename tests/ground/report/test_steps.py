@@ -71,7 +71,7 @@ def test_the_steady_state_is_the_largest_error_of_the_last_30_s_in_degrees_of_th
     assert response(TIME, q2, STEP).steady_state_deg == pytest.approx(1.25, abs=1e-9)
 
 
-def test_what_comes_after_the_next_command_does_not_count() -> None:
+def test_motion_after_the_next_command_does_not_count() -> None:
     q2 = np.where(TIME < 200.0, -0.2, 0.5)
     found = response(TIME, q2, STEP)
     assert found.steady_state_deg == 0.0

@@ -34,7 +34,7 @@ FIRST = "1 25544U 98067A   25320.50000000  .00010000  00000-0  18000-3 0  9990"
 SECOND = "2 25544  51.6400 200.0000 0005000 100.0000 260.0000 15.50000000539990"
 
 
-def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
+def test_the_sun_agrees_with_the_almanac_and_is_displaced_by_aberration() -> None:
     """The Sun direction agrees with an almanac of 42" accuracy, and includes the aberration of 5.2".
 
     The almanac is the simulator's. The satellite's own velocity of 7.6 km/s causes the aberration.
@@ -75,7 +75,7 @@ def test_the_field_in_orbit_and_on_the_ground_are_one_field() -> None:
         magnetic_field(datetime(2031, 1, 1, tzinfo=UTC), (7e6, 0.0, 0.0))
 
 
-def test_the_earth_hides_the_sun_behind_it_and_not_before_it() -> None:
+def test_the_earth_hides_a_sun_behind_it_and_not_in_front_of_it() -> None:
     towards = sun_direction(TIME)
     side = np.cross(towards, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)

@@ -62,7 +62,7 @@ def test_attitude_matrix_is_eulers_formula(axis: FloatArray, angle: float) -> No
     assert _close(quaternion.attitude_matrix(q), expected)
 
 
-def test_a_turn_about_z_carries_the_frame_with_it() -> None:
+def test_a_positive_rotation_about_z_moves_the_x_axis_of_the_body_to_y() -> None:
     """A rotation of +90 deg about z moves the body's x axis to the reference's y axis.
 
     After the rotation, the reference's y axis is (1, 0, 0) in body axes.

@@ -25,14 +25,14 @@ def unit(q: Quaternion) -> Quaternion:
 
 
 @given(quaternions, quaternions)
-def test_composition_and_inverse_are_the_arrays_ones(p: Quaternion, q: Quaternion) -> None:
+def test_composition_and_inverse_equal_those_of_the_array_form(p: Quaternion, q: Quaternion) -> None:
     p, q = unit(p), unit(q)
     expected = quaternion.multiply(np.array(p), quaternion.conjugate(np.array(q)))
     np.testing.assert_allclose(quaternion.compose(p, quaternion.inverse(q)), expected, atol=1e-15)
 
 
 @given(vectors)
-def test_the_exponential_is_the_arrays_one_and_the_logarithm_undoes_it(v: Vector) -> None:
+def test_the_exponential_equals_that_of_the_array_form_and_the_logarithm_inverts_it(v: Vector) -> None:
     q = quaternion.exponential(*v)
     np.testing.assert_allclose(q, quaternion.from_rotation_vector(np.array(v)), atol=1e-15)
     np.testing.assert_allclose(
@@ -48,7 +48,7 @@ def test_small_turns_lose_no_digits(angle: float) -> None:
 
 
 @given(quaternions, vectors)
-def test_the_matrix_turns_vectors_as_the_arrays_one_does(q: Quaternion, v: Vector) -> None:
+def test_the_matrix_rotates_vectors_like_that_of_the_array_form(q: Quaternion, v: Vector) -> None:
     q = unit(q)
     expected = quaternion.attitude_matrix(np.array(q)) @ np.array(v)
     np.testing.assert_allclose(quaternion.times(quaternion.matrix(q), v), expected, atol=1e-14)
@@ -61,7 +61,7 @@ def test_the_skew_matrix_is_the_cross_product(a: Vector, b: Vector) -> None:
 
 
 @given(quaternions, st.floats(-3.1, 3.1))
-def test_the_twist_is_what_is_left_about_y(q: Quaternion, angle: float) -> None:
+def test_the_twist_equals_that_of_the_array_form(q: Quaternion, angle: float) -> None:
     q = unit(q)
     if math.hypot(q[1], q[3]) > 0.1:
         expected = quaternion.angle_about_axis_y(np.array(q))

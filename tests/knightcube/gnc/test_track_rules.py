@@ -212,7 +212,7 @@ def test_a_prediction_moves_on_a_straight_line_and_spreads() -> None:
     np.testing.assert_allclose(state.acceleration, [2.0 * 0.01 * 0.02, 0.0, 0.0])
 
 
-def test_the_tides_pull_apart_along_the_vertical_and_together_across() -> None:
+def test_the_gravity_gradient_separates_objects_vertically_and_joins_them_horizontally() -> None:
     position = np.array([0.0, 7e6, 0.0])
     gradient = tides(position)
     strength = 3.986004418e14 / 7e6**3

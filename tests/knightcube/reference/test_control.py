@@ -89,7 +89,7 @@ def test_a_small_step_is_the_response_of_three_equal_poles() -> None:
     np.testing.assert_allclose(rows[:, 1], expected, atol=0.03 * size)
 
 
-def test_taking_over_at_rest_asks_for_no_current() -> None:
+def test_the_start_of_the_controller_at_rest_commands_no_current() -> None:
     command = placed(0.8).command(PathSample(0.4, 0.0, 0.0), 0.4, 0.0)
     assert command.current == pytest.approx(0.0, abs=1e-12)
     first = placed(0.8).command(PathSample(0.5, 0.0, 0.0), 0.4, 0.0)

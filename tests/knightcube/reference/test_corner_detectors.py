@@ -66,7 +66,7 @@ def test_a_patch_computed_by_hand() -> None:
     assert interpixel_response(patch, 4)[1, 1] == pytest.approx(2.0 / 29.0, rel=1e-12)
 
 
-def test_where_no_direction_between_is_lower_the_simple_response_stands() -> None:
+def test_the_simple_response_is_used_if_no_intermediate_direction_is_lower() -> None:
     """If no direction between the neighbours gives a lower value, the simple response is returned.
 
     The pixels 1 (right), 3 (left), 1 (below) and 1 (above) around 5 give B1 = B2 = 4, which is not negative.
@@ -86,7 +86,7 @@ def test_eight_neighbours_by_hand() -> None:
     assert interpixel_response(patch, 8)[1, 1] == 0.0
 
 
-def test_with_four_neighbours_it_is_the_corrected_equations() -> None:
+def test_the_response_with_four_neighbours_follows_the_corrected_equations() -> None:
     rng = np.random.default_rng(61)
     for patch in rng.normal(size=(300, 3, 3)):
         expected = _by_the_corrected_equations(patch)
@@ -105,7 +105,7 @@ def test_the_printed_b1_would_not_be_the_least_change() -> None:
 
 
 @pytest.mark.parametrize("neighbours", [4, 8])
-def test_it_is_the_least_over_all_directions(neighbours: int) -> None:
+def test_the_response_is_the_minimum_over_all_directions(neighbours: int) -> None:
     rng = np.random.default_rng(62)
     for patch in rng.normal(size=(100, 3, 3)):
         found = interpixel_response(patch, neighbours)[1, 1]
@@ -114,7 +114,7 @@ def test_it_is_the_least_over_all_directions(neighbours: int) -> None:
 
 
 @pytest.mark.parametrize("neighbours", [4, 8])
-def test_edges_and_flat_parts_answer_nothing_and_corners_do(neighbours: int) -> None:
+def test_edges_and_flat_parts_have_no_response_and_corners_have_one(neighbours: int) -> None:
     image = np.zeros((40, 40))
     image[20:, 20:] = 1.0
     response = trajkovic_response(image, neighbours, 0.05, 0.05)

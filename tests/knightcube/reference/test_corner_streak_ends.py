@@ -99,7 +99,7 @@ def test_a_wrong_direction_of_time_leaves_the_attitude_at_mid_exposure_and_turns
     assert back.rate == pytest.approx(-found.rate, rel=1e-3, abs=1e-6)
 
 
-def test_a_prior_tells_where_to_look() -> None:
+def test_the_stars_are_identified_by_tracking_near_a_prior_attitude() -> None:
     frame = _frame(1)
     near = multiply(from_rotation_vector(np.array([2e-4, 1e-4, -3e-4])), frame.attitude)
     solution, _ = _solve(_streaks(frame), AttitudePrior(near, 3e-4))

@@ -253,7 +253,7 @@ def test_the_result_is_the_same_each_time_and_travels_between_processes() -> Non
     assert passed(first).status is StreakStatus.RATE
 
 
-def test_nonsense_is_refused_with_its_value() -> None:
+def test_invalid_arguments_are_refused_with_their_value() -> None:
     frame = np.zeros((512, 512), dtype=np.uint16)
     settings = StreakSettings()
     with pytest.raises(KnightCubeError, match="shape"):
@@ -406,7 +406,9 @@ EXPOSURE = 0.2
         (30, 30, 2, "minimum-eigenvalue"),
     ],
 )
-def test_no_rate_comes_of_it(theta: int, percent: int, run: int, detector: DetectorName) -> None:
+def test_very_long_streaks_give_no_rate_by_a_corner_detector(
+    theta: int, percent: int, run: int, detector: DetectorName
+) -> None:
     camera = StarCameraModel(field_of_view=FIELD)
     generator = np.random.default_rng((99, theta, percent, run))
     scene = slew(generator, float(np.deg2rad(theta)), percent / 100.0, EXPOSURE, model=camera)

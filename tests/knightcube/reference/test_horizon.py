@@ -139,7 +139,7 @@ def test_cameras_that_look_the_same_way_are_refused() -> None:
         graphic_nadir((CAMERAS[0], CAMERAS[0]), (circle, circle), ALTITUDE)
 
 
-def test_nadir_is_carried_on_by_the_rotation_of_a_sight() -> None:
+def test_nadir_is_propagated_by_the_shortest_rotation_of_a_line_of_sight() -> None:
     """Nadir is propagated exactly by the shortest rotation of a line of sight, as equation (6) states.
 
     The axis of the shortest rotation is normal to the line of sight.

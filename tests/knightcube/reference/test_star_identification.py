@@ -109,7 +109,7 @@ def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None
 
 
 @pytest.mark.parametrize("name", CLASSICAL)
-def test_false_and_missing_stars_are_survived(name: str) -> None:
+def test_lists_with_false_and_missing_stars_are_identified(name: str) -> None:
     """With two false stars and a tenth missing, at most one list is refused, and no result is wrong."""
     answers = [
         (METHODS[name].identify(d.field(), _sky()), d) for d in _drawn(_kind(false_stars=2, lost=0.1), 2)
@@ -121,7 +121,7 @@ def test_false_and_missing_stars_are_survived(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CLASSICAL)
-def test_half_a_pixel_of_noise_is_survived(name: str) -> None:
+def test_lists_with_half_a_pixel_of_noise_are_identified(name: str) -> None:
     """With half a pixel of noise, stars are identified although a pair has many possible partners."""
     lists = _drawn(_kind(noise_px=0.5, false_stars=2, lost=0.1), 3)
     answers = [METHODS[name].identify(drawn.field(), _sky()) for drawn in lists]

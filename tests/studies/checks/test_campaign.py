@@ -61,14 +61,14 @@ TOY = Campaign("toy", "adds draws", cases, draw, summarise, 6)
 
 
 @pytest.mark.slow
-def test_on_many_cores_it_gives_what_it_gives_on_one(tmp_path: Path) -> None:
+def test_results_on_many_cores_equal_those_on_one(tmp_path: Path) -> None:
     expected = sum(result["value"] for result in fly_here(TOY, 6, 3))
     assert fly(TOY, 6, 3, tmp_path, workers=2).facts == {"total": pytest.approx(expected), "runs": 6}
     assert (tmp_path / "summary.txt").read_text().startswith("total")
 
 
 @pytest.mark.slow
-def test_broken_off_it_goes_on_and_runs_nothing_twice(tmp_path: Path) -> None:
+def test_an_interrupted_campaign_resumes_and_runs_no_case_twice(tmp_path: Path) -> None:
     whole = fly(TOY, 6, 3, tmp_path / "whole", workers=1).facts
     fly(TOY, 6, 3, tmp_path / "part", workers=1)
     log = tmp_path / "part" / "results.jsonl"
@@ -80,7 +80,7 @@ def test_broken_off_it_goes_on_and_runs_nothing_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_part_of_the_cases_gives_what_these_give_in_the_whole(tmp_path: Path) -> None:
+def test_selected_cases_have_the_results_of_the_whole_campaign(tmp_path: Path) -> None:
     whole = fly_here(TOY, 12, 3)
     found = fly(TOY, 12, 3, tmp_path, workers=1, only="1")  # selects cases 1, 10 and 11
     total = whole[1]["value"] + whole[10]["value"] + whole[11]["value"]

@@ -17,17 +17,17 @@ def least(momentum: list[float], field: FloatArray, left: float = 0.0) -> float:
     return least_time(np.array(momentum), field, STEP, REACH, left)
 
 
-def test_across_a_field_that_stands_the_torque_is_all_there_is() -> None:
+def test_across_a_constant_field_the_bound_is_momentum_divided_by_torque() -> None:
     torque = REACH * STRENGTH
     assert least([3e-4, 4e-4, 0.0], STILL) == pytest.approx(5e-4 / torque, rel=1e-3)
     assert least([3e-4, 4e-4, 0.0], STILL, left=1e-4) == pytest.approx(4e-4 / torque, rel=1e-3)
 
 
-def test_along_a_field_that_stands_no_time_suffices() -> None:
+def test_along_a_constant_field_no_time_is_sufficient() -> None:
     assert least([0.0, 0.0, 1e-4], STILL) == pytest.approx(STEP * 400, rel=0.01)
 
 
-def test_what_lies_along_a_field_that_turns_waits_for_the_turn() -> None:
+def test_momentum_along_a_rotating_field_waits_for_the_rotation() -> None:
     """The field rotates in a plane, and the momentum is along the initial field.
 
     Of all directions, the one that is ahead of the momentum by half of the field's rotation gives the largest

@@ -58,7 +58,7 @@ def _answer(scene: Scene, error: float, sigma: float) -> MotionResult:
         (0.0, 0.001, "right"),
     ],
 )
-def test_wrong_is_far_from_the_truth_and_far_beyond_its_own_sigma(
+def test_an_answer_is_wrong_if_it_is_far_from_the_truth_and_far_beyond_its_sigma(
     scene: Scene, error: float, sigma: float, verdict: str
 ) -> None:
     found = failures._judge(_answer(scene, error, sigma), scene, still=False)

@@ -16,7 +16,7 @@ from tests.studies.campaigns import campaign, faults_kill
 from tests.studies.campaigns.faults_kill import KILLS, Board, cases, summarise
 
 
-def test_boards_come_to_the_kills_that_are_asked() -> None:
+def test_the_requested_kills_are_divided_into_cases() -> None:
     assert [case.parameters["kills"] for case in cases(2 * KILLS + 3, seed=1)] == [KILLS, KILLS, 3]
 
 

@@ -79,7 +79,7 @@ def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.usefixtures("brief")
-def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any) -> None:
+def test_a_loop_that_steers_without_measurements_is_detected(tmp_path: Any) -> None:
     """The log of a flight with a silent unit is changed as if the loop had continued.
 
     Both results of the evaluation must show the fault.

@@ -12,7 +12,7 @@ from tests.studies.campaigns import detumble, orbit_pointing
 CASE = {"craft": "knightcube", "orbit": "sso"}
 
 
-def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> None:
+def test_a_tumbling_knightcube_stops_and_the_table_states_the_time(tmp_path: Path) -> None:
     result = detumble.run(Case("a", (20_261_123, 0), {**CASE, "law": "attitude", "speed": 0.014}))
     assert not result["lost"]
     assert result["seconds"] < 400.0

@@ -38,7 +38,7 @@ def test_the_list_of_a_start_has_every_call_with_every_error_and_flies_those_of_
     assert start.in_turn(listed, 2) != ordered
 
 
-def test_a_start_that_never_flew_is_counted_and_named() -> None:
+def test_a_start_without_a_flight_is_counted_and_named() -> None:
     flew = {"flies": True, "restarts": 0, "waited": True, "status": None, "said": "", "took_s": 2.0}
     faults = [flew | {"fault": "read 1: EIO", "begun": True}]
     faults += [flew | {"fault": "openat 3: EACCES", "begun": False, "flies": False, "status": 2}]

@@ -18,12 +18,12 @@ def test_nothing_is_obeyed_twice_and_no_counter_used_twice(tmp_path: Path) -> No
     assert (found.obeyed_twice, found.counters_twice) == (0, 0)
 
 
-def test_a_link_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_that_stores_nothing_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Vault, "advance", lambda *_: 2)
     assert measure(tmp_path, 12, seed=3).obeyed_twice > 0
 
 
-def test_a_sender_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sender_that_stores_nothing_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_keys(tmp_path / "keys")
     monkeypatch.setattr("tests.studies.bench.link_kills.make_keys", lambda _: None)
     monkeypatch.setattr(Vault, "write", lambda *_: 2)
@@ -36,7 +36,7 @@ def test_no_scheduled_command_comes_twice_and_a_kill_costs_one_at_most(tmp_path:
     assert 0 < found.never <= found.kills
 
 
-def test_a_schedule_that_keeps_what_it_hands_over_is_found_out(
+def test_a_schedule_that_keeps_executed_entries_is_detected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Timetable, "remove", Timetable.forget)

@@ -117,7 +117,7 @@ def test_an_axis_5_px_off_is_within_what_is_claimed_unless_the_lens_is_called_ex
 
 
 @pytest.mark.slow
-def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rate() -> None:
+def test_an_unspecified_distortion_is_fitted_and_hardly_changes_the_rate() -> None:
     """The distortion is 1 % at the corner.
 
     A correction after the fit alone would leave a rate error of up to 1.5 %.
@@ -131,7 +131,7 @@ def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rat
 
 
 @pytest.mark.slow
-def test_an_elongated_point_spread_that_nobody_described_is_refused_on_short_streaks() -> None:
+def test_an_unspecified_elongated_point_spread_is_refused_on_short_streaks() -> None:
     """A body that vibrates fast along one axis causes the same streaks with other end points."""
     result = mismatch.run(_case("ellipse 1:2 turned", 0))
     assert result["nees"] is None

@@ -53,7 +53,7 @@ def test_a_receiver_that_repeats_its_fix_is_reported_and_the_body_points_on(tmp_
     assert found["log_intact"]
 
 
-def test_a_stuck_magnetometer_ends_the_braking_and_current_in_spite_of_it_is_found_out(
+def test_a_stuck_magnetometer_ends_detumbling_and_a_current_in_spite_of_it_is_detected(
     tmp_path: Path,
 ) -> None:
     run, kind = flown("magnetometer: stuck", "detumble", tmp_path), CATALOGUE["magnetometer: stuck"]
@@ -85,7 +85,7 @@ def test_the_campaign_meets_every_fault_in_every_mode() -> None:
     assert len(met) == len(drawn)
 
 
-def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
+def test_elements_of_a_week_ago_have_an_error_within_their_sigma() -> None:
     config = config_for("point")
     assert config.elements is not None
     known, old = TwoLineElements(*config.elements), TwoLineElements(*old_elements())
@@ -117,7 +117,7 @@ def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     assert found["beyond_s"] == 0.0
 
 
-def test_braking_goes_on_with_a_unit_that_restarted_at_another_phase(
+def test_detumbling_continues_although_the_unit_restarted_at_another_phase(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In flight 0 of seed 4, the unit's samples came a millisecond before the commands.

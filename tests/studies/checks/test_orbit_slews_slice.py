@@ -33,7 +33,7 @@ def test_a_body_that_was_held_at_one_attitude_knows_enough_of_the_air_to_slew() 
     assert slew["heat"] <= 1.3 * slew["optimum"]
 
 
-def test_what_torques_do_that_are_learned_on_the_way_is_gone_at_the_end() -> None:
+def test_the_effect_of_torques_estimated_during_a_slew_is_removed_at_its_end() -> None:
     """The second slew of seed 8 of the 3U rotates by 45 deg in 938 s at 420 km.
 
     Without an end cost it would end 0.73 deg from the target.

@@ -17,7 +17,7 @@ def _flown(row: str, runs: int) -> list[dict[str, object]]:
     return [streaked_run(Case(key, (SEED, n), {"row": row, "trail": length})) for key, n, length in cells]
 
 
-def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path) -> None:
+def test_an_unspecified_rolling_shutter_is_in_the_claim(tmp_path: Path) -> None:
     """If the covariance ignored the unknown shutter, errors would reach 7 sigma, or 0.4 px, not 0.05 px."""
     own = summarise(_flown("rolling 30 us, unstated", 2), tmp_path).facts["all"]
     assert own["attitudes"] == own["frames"] == 6
@@ -25,7 +25,7 @@ def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path)
     assert own["off"] < 0.03
 
 
-def test_a_shutter_that_is_described_costs_nothing(tmp_path: Path) -> None:
+def test_a_specified_shutter_does_not_increase_the_claim(tmp_path: Path) -> None:
     """On the same frames, the claimed uncertainty is larger if the line time is not known.
 
     The two fits of a frame find slightly different widths of the streaks, which also change the claim.

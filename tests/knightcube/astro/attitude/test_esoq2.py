@@ -48,7 +48,7 @@ def _by_singular_values(observed: FloatArray, reference: FloatArray, sigma: Floa
 
 @pytest.mark.parametrize("n", [2, 3, 10, 50])
 @pytest.mark.parametrize("half_field", [None, _NARROW])
-def test_it_is_the_solution_by_singular_values_to_a_tenth_of_a_nanoradian(
+def test_esoq2_is_the_solution_by_singular_values_to_a_tenth_of_a_nanoradian(
     n: int, half_field: float | None
 ) -> None:
     rng = np.random.default_rng([41, n])
@@ -70,7 +70,7 @@ def test_directions_that_share_no_attitude_still_give_the_optimum() -> None:
         assert angle_between(found.quaternion, _by_singular_values(observed, reference, sigma)) < 1e-10
 
 
-def test_it_is_the_solution_of_scipy() -> None:
+def test_esoq2_is_the_solution_of_scipy() -> None:
     rng = np.random.default_rng(43)
     for _ in range(20):
         sigma = 1e-4 * rng.uniform(0.3, 3.0, 8)

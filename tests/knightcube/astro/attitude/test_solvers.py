@@ -151,7 +151,7 @@ def test_the_default_is_scipys_solution() -> None:
         assert fix.loss == pytest.approx(0.5 * root_loss**2, rel=1e-3)
 
 
-def test_two_close_stars_are_settled_to_the_digits_that_their_directions_have() -> None:
+def test_two_close_stars_give_the_attitude_to_the_accuracy_of_their_directions() -> None:
     """For two close stars, the attitude is as accurate as the directions of the stars.
 
     The profile matrix B alone gives the rotation about stars 1e-4 rad apart only to 1e-8 rad. A closed form
@@ -189,7 +189,7 @@ def test_errors_are_as_large_as_the_covariance_says(name: str, n: int, half_fiel
 
 
 @pytest.mark.parametrize("name", ["olae", "triad"])
-def test_what_is_not_optimal_is_off_the_optimum_by_the_difference_of_the_covariances(name: str) -> None:
+def test_solvers_that_are_not_optimal_differ_from_the_optimum_as_their_covariances_state(name: str) -> None:
     """Solvers that are not optimal differ from the optimum as the difference of the covariances states.
 
     An efficient estimate is uncorrelated with its difference from any other estimate, so the variances
@@ -248,7 +248,7 @@ def test_directions_that_share_no_attitude_give_the_least_loss_or_none(name: str
 
 
 @pytest.mark.parametrize("name", _ALL)
-def test_a_field_seen_backwards_has_no_attitude(name: str) -> None:
+def test_a_mirrored_field_has_no_attitude(name: str) -> None:
     """A mirrored field has no attitude.
 
     If all three axes are measured reversed, a rotation by 180 deg about any axis fits equally well.
@@ -325,7 +325,7 @@ def _wahba(starts: FloatArray, ends: FloatArray, weights: FloatArray) -> FloatAr
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
 
-def test_it_agrees_with_an_svd_solution_of_wahbas_problem_far_below_the_noise() -> None:
+def test_the_rotation_agrees_with_an_svd_solution_of_wahbas_problem_far_below_the_noise() -> None:
     rng = np.random.default_rng(2)
     sigma = 0.2 / _PINHOLE.focal_length
     starts = _directions(25, 3)

@@ -80,7 +80,7 @@ def test_errors_are_as_large_as_the_covariance_says(way: str) -> None:
     assert low < total < high
 
 
-def test_a_field_that_its_bias_drowns_gives_no_direction() -> None:
+def test_a_field_as_small_as_its_bias_gives_no_direction() -> None:
     with pytest.raises(AttitudeError, match="too weak to give a direction"):
         field_observation(np.full(3, 1e-6), np.full(3, 1e-6), 1e-11 * np.eye(3))
 

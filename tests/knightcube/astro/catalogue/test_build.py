@@ -63,7 +63,7 @@ def test_stars_without_a_position_are_left_out() -> None:
     assert len(build.select(source)["hip"]) == build.PUBLISHED_COUNTS[8.5] + len(build.ADDED) - 5
 
 
-def test_a_star_that_would_stand_twice_is_refused() -> None:
+def test_a_star_that_occurs_twice_is_refused() -> None:
     source = _source()
     source["hip"][0] = build.ADDED[0].hip
     with pytest.raises(UsageError, match="remove these stars from ADDED"):

@@ -83,7 +83,7 @@ def test_61_cygni_moves_as_measured() -> None:
     assert np.degrees(np.arctan2(mu_east, mu_north)) == pytest.approx(51.9, abs=0.1)
 
 
-def test_94_aquarii_b_stands_13_6_arcseconds_from_a() -> None:
+def test_94_aquarii_b_is_13_6_arcseconds_from_a() -> None:
     a, b = _index(115126), _index(115125)
     assert _arcseconds(STARS.direction[a], STARS.direction[b]) == pytest.approx(13.6, abs=0.2)
 
@@ -92,7 +92,7 @@ def test_barnards_star_is_too_faint() -> None:
     assert 87937 not in STARS.hip
 
 
-def test_stars_are_sorted_by_magnitude_and_stand_once() -> None:
+def test_stars_are_sorted_by_magnitude_and_occur_once() -> None:
     assert np.all(np.diff(STARS.magnitude) >= 0.0)
     assert len(np.unique(STARS.hip)) == len(STARS)
     assert STARS.hip[0] == 32349

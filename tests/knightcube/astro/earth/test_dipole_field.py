@@ -10,7 +10,7 @@ from knightcube.astro.earth.orbit_knowledge import OrbitState
 STATE = OrbitState(2_461_120.0, np.array([6.878e6, 0.0, 0.0]), np.array([0.0, -988.0, 7548.0]), 10.0)
 
 
-def test_it_is_the_model_s_field_at_first_and_within_thirty_degrees_for_a_quarter_of_a_revolution() -> None:
+def test_the_dipole_field_stays_within_thirty_degrees_of_the_model_for_a_quarter_revolution() -> None:
     times = np.arange(0.0, 1_500.0, 100.0)
     ahead = predict(STATE, 1_600.0)
     whole = ahead.field_at(times)

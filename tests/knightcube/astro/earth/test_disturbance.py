@@ -34,7 +34,7 @@ SPEED, DENSITY = 7_600.0, 1e-12
 
 
 @pytest.mark.parametrize("name", ["knightcube", "cubesat_3u"])
-def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> None:
+def test_coefficients_fitted_at_ten_attitudes_predict_the_torque_at_others(name: str) -> None:
     """Torque coefficients that are fitted at ten attitudes predict the drag torque at 190 other attitudes.
 
     Without the projected areas, the errors are more than twice as large.

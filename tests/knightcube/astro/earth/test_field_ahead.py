@@ -29,7 +29,7 @@ def state_after(seconds: float) -> OrbitState:
     return OrbitState(JD + seconds / DAY, WHOLE.position_at(at)[0], WHOLE.velocity_at(at)[0], 10.0)
 
 
-def test_call_by_call_the_whole_model_reaches_farther_and_the_dipole_goes_on_from_there() -> None:
+def test_each_call_extends_the_full_model_and_the_dipole_field_continues_it() -> None:
     ahead = FieldAhead()
     first = apart(ahead.along(STATE, TIMES), 0.0)
     near = ephemeris.NODE_STEP * ephemeris.NODES_PER_CALL
@@ -43,7 +43,7 @@ def test_call_by_call_the_whole_model_reaches_farther_and_the_dipole_goes_on_fro
     np.testing.assert_allclose(strength, 1.0, atol=5e-3)
 
 
-def test_an_orbit_that_is_known_otherwise_begins_again() -> None:
+def test_a_changed_orbit_restarts_the_prediction() -> None:
     ahead, elsewhere = FieldAhead(), state_after(600.0)
     ahead.along(OrbitState(JD, elsewhere.position, elsewhere.velocity, 10.0), TIMES)
     assert apart(ahead.along(STATE, TIMES), 0.0)[0] < 1e-3

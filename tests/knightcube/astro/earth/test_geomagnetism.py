@@ -37,7 +37,7 @@ def julian_date(year: float) -> float:
 
 
 @pytest.mark.parametrize("row", NOAA)
-def test_the_field_on_board_is_the_one_that_was_published(row: tuple[float, ...]) -> None:
+def test_the_field_of_the_flight_software_is_the_published_one(row: tuple[float, ...]) -> None:
     """The field of the flight software equals NOAA's values to 0.06 nT, half the last digit plus rounding."""
     year, height, latitude, longitude, *published = row
     found = believed.field_on_ground_axes(year, np.radians(latitude), np.radians(longitude), 1e3 * height)
@@ -67,7 +67,7 @@ def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tup
     np.testing.assert_allclose(1e9 * found, published, atol=60.0)
 
 
-def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
+def test_in_orbit_both_models_agree_to_nanoteslas() -> None:
     """At 400 km, 2025 to 2029.9, both models agree within 40 nT and 0.15 deg, and to 10 nT on average."""
     rng = np.random.default_rng(5)
     away = rng.standard_normal((60, 3))
@@ -98,7 +98,7 @@ def test_the_true_field_has_no_sources_and_no_currents() -> None:
     assert np.abs(slope - slope.T).max() < 1e-4 * size
 
 
-def test_many_places_give_what_each_gives_alone_and_the_poles_are_finite() -> None:
+def test_many_places_have_the_fields_of_each_alone_and_the_poles_are_finite() -> None:
     places = np.array([[0.0, 0.0, 6.8e6], [1.0, 0.0, 6.8e6], [0.0, 0.0, -6.8e6], [6.8e6, 1e5, 0.0]])
     together = true.magnetic_field_on_ground(DATE, places)
     for place, found in zip(places, together, strict=True):

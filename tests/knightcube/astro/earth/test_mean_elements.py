@@ -50,7 +50,7 @@ def test_an_orbit_with_oblateness_is_fitted_to_a_kilometre_over_a_day(orbit: Orb
     assert fit_elements(DATE + times / 86_400.0, positions).residuals.max() < 2e3
 
 
-def test_a_short_arc_of_fixes_with_velocities_tells_how_far_it_can_be_trusted() -> None:
+def test_elements_of_a_short_arc_state_their_error_a_day_later() -> None:
     """A day later, elements from ten minutes of fixes have errors of at most a few stated deviations."""
     known, rng = TwoLineElements(*LINES), np.random.default_rng(4)
     dates = DATE + np.arange(0.0, 600.0, 10.0) / 86_400.0

@@ -193,7 +193,7 @@ def test_a_text_without_elements_is_refused(text: str) -> None:
     ],
 )
 @pytest.mark.skipif(not INPUTS.is_dir(), reason="the inputs of ../shared/data/inputs are missing")
-def test_the_element_sets_of_the_reports_are_refused(name: str, complaint: str) -> None:
+def test_reported_invalid_element_sets_are_refused(name: str, complaint: str) -> None:
     with pytest.raises(UsageError) as caught:
         read_elements((INPUTS / f"{name}.txt").read_text(encoding="ascii"))
     assert complaint in str(caught.value)

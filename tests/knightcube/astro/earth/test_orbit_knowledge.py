@@ -61,7 +61,7 @@ def test_the_ground_turns_once_in_a_sidereal_day() -> None:
     np.testing.assert_allclose(rate, (0.0, 0.0, ROTATION_RATE), atol=1e-9)
 
 
-def test_many_dates_give_what_each_gives_alone() -> None:
+def test_many_dates_have_the_results_of_each_alone() -> None:
     dates = DATE + np.array([0.0, 0.3, 100.0])
     for make in (celestial_to_terrestrial, mean_equator_to_celestial):
         for date, found in zip(dates, make(dates), strict=True):
@@ -85,7 +85,7 @@ def fix_of(state: FloatArray, date: float, **spread: float) -> GpsFix:
     return GpsFix(date, ground, turn @ state[3:] - np.cross([0.0, 0.0, ROTATION_RATE], ground), **spread)
 
 
-def test_a_fix_carried_on_is_where_another_integrator_has_the_satellite() -> None:
+def test_a_propagated_fix_agrees_with_another_integrator() -> None:
     """A fix that is propagated for 20 minutes agrees with another integrator to 20 m and 0.02 m/s.
 
     The other integrator is the Dormand-Prince integrator of sim_hal.

@@ -36,7 +36,7 @@ def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
     assert sunlit_share(_behind(depth, penumbra + 200.0), SUN) == 1.0
 
 
-def test_the_umbra_ends_where_hipparchus_had_it() -> None:
+def test_the_umbra_ends_1_38_million_km_behind_the_earth() -> None:
     """The umbra ends 1.38 million km behind the Earth.
 
     Farther away, the visible part of the Sun is a ring, whose area is the difference of both discs.

@@ -37,7 +37,7 @@ def test_equal_coils_along_the_body_axes_are_scaled_exactly() -> None:
 
 
 @given(st.integers(0, 10_000), st.just(3))
-def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_nothing(
+def test_every_dipole_within_the_limits_is_feasible_and_the_limits_enclose_the_largest_volume(
     seed: int, count: int
 ) -> None:
     generator = np.random.default_rng(seed)
@@ -203,7 +203,7 @@ def test_three_coils_make_the_torque_across_the_field_with_the_least_dipole() ->
     assert found.share == pytest.approx(1.0)
 
 
-def test_of_a_torque_along_the_field_nothing_is_made() -> None:
+def test_no_part_of_a_torque_along_the_field_is_made() -> None:
     found = allocate(1e-2 * FIELD, FIELD, COILS, AMPLE)
     assert found.torque == pytest.approx(np.zeros(3), abs=1e-18)
     assert found.share == pytest.approx(0.0, abs=1e-9)
@@ -248,7 +248,7 @@ def test_a_torque_that_would_take_all_the_current_is_discarded(sine: float, kept
     assert (float(np.abs(found.currents).max()) > 0.0) is kept
 
 
-def test_only_the_free_axis_is_turned() -> None:
+def test_only_the_torque_about_the_free_axis_is_made() -> None:
     free = np.array([False, True, False])
     found = allocate(np.array([1e-6, 2e-6, -5e-6]), FIELD, COILS, AMPLE, free=free)
     assert found.torque == pytest.approx([0.0, 2e-6, 0.0], abs=1e-18)

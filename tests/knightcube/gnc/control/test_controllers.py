@@ -71,7 +71,7 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
     assert largest_error(rows, size, 5.0) < 0.03
 
 
-def test_the_thesis_tracker_overshoots_there() -> None:
+def test_the_thesis_tracker_overshoots_a_sudden_step() -> None:
     """The thesis's tracker overshoots a step of 0.7 rad, because it needs a planned path.
 
     For a step, the tracker begins to brake so late that the coil's torque cannot stop the body in time.
@@ -84,7 +84,7 @@ KINDS = {"lq": LqTracker, "thesis": LqTracker, "pid": PidController, "adaptive":
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_name_means_its_controller(name: str) -> None:
+def test_each_name_gives_its_controller(name: str) -> None:
     controller = controller_of(Control(tracker=name), BELIEVED, 0.025, Identification())  # type: ignore[arg-type]  # any of KINDS
     assert isinstance(controller, KINDS[name])
     rng = np.random.default_rng(2)

@@ -124,7 +124,7 @@ def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> No
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 2.0, 5.0, 10.0])
-def test_a_fast_body_is_braked_not_pushed(speed: float) -> None:
+def test_a_fast_body_is_damped_and_not_accelerated(speed: float) -> None:
     """A body of up to 10 rad/s is damped, because the field is extrapolated between windows.
 
     In the axes of a body at 10 rad/s, the field rotates by 2.5 rad between two windows.

@@ -369,7 +369,7 @@ def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
     assert np.all(np.isfinite(stuck.costate))
 
 
-def test_what_the_rest_allows_is_not_waited_for() -> None:
+def test_momentum_below_the_permitted_remainder_is_not_planned_for() -> None:
     """A momentum below the permitted remainder is not planned for, so the plan is shorter.
 
     A tenth of the momentum is along the slowly rotating field, and the other nine tenths are removed faster.
@@ -381,7 +381,7 @@ def test_what_the_rest_allows_is_not_waited_for() -> None:
     assert allowed.horizon < 0.6 * exact.horizon
 
 
-def test_the_field_ahead_begins_as_it_is_measured() -> None:
+def test_the_predicted_field_begins_with_the_measured_field() -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
         ahead = rng.standard_normal((9, 3))

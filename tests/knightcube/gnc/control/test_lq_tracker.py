@@ -146,7 +146,9 @@ def test_saturation_is_explicit() -> None:
 
 @settings(deadline=None)
 @given(st.floats(1.01, math.pi - 0.01), st.sampled_from([-1.0, 1.0]))
-def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float, sign: float) -> None:
+def test_beyond_the_largest_error_the_command_stays_constant_and_keeps_its_sign(
+    size: float, sign: float
+) -> None:
     """For errors beyond 1 rad, the command stays at its value for 1 rad and keeps its sign.
 
     The sine of the error decreases beyond 90 deg.
@@ -160,7 +162,7 @@ def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float,
     assert math.copysign(1.0, command.demanded) == sign
 
 
-def test_the_error_is_taken_the_short_way_round() -> None:
+def test_the_error_is_that_of_the_shorter_rotation() -> None:
     command = LqTracker(STRONG, *WEIGHTS).command(PathSample(3.0, 0.0, 0.0), -3.0, 0.0)
     assert command.error == pytest.approx(6.0 - 2.0 * math.pi)
 

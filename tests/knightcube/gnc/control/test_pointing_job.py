@@ -80,7 +80,7 @@ def test_flown_under_torques_and_a_dipole_it_ends_in_its_target_and_stays(table:
     assert max(off[arrived : arrived + 30]) < 1.0
 
 
-def test_what_torques_not_known_at_the_begin_have_done_is_led_back_by_the_end(
+def test_the_effect_of_initially_unknown_torques_is_removed_by_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     believed, ends = -9.0 * SIZE, []

@@ -76,7 +76,7 @@ def fly(
     return np.degrees(turns)
 
 
-def test_it_holds_nadir_and_torques_known_ahead_cost_less_than_half_the_error(law: PointingLaw) -> None:
+def test_the_law_holds_nadir_and_known_torques_reduce_the_error_below_0_6(law: PointingLaw) -> None:
     known = fly(law, np.zeros(3), SIZE, RESIDUAL, 3000.0)[100:]
     unknown = fly(law, np.zeros(3), np.zeros(SIZES), RESIDUAL, 3000.0)[100:]
     error = [float(np.sqrt(np.mean(np.sum(turns**2, axis=1)))) for turns in (known, unknown)]
@@ -84,7 +84,7 @@ def test_it_holds_nadir_and_torques_known_ahead_cost_less_than_half_the_error(la
     assert error[0] < 0.6 * error[1]
 
 
-def test_ten_degrees_of_error_are_taken_out_within_half_a_revolution(law: PointingLaw) -> None:
+def test_ten_degrees_of_error_are_removed_within_half_a_revolution(law: PointingLaw) -> None:
     turns = fly(law, np.radians([8.0, -5.0, 4.0]), SIZE, RESIDUAL, 2800.0)
     assert np.linalg.norm(turns[-30:], axis=1).max() < 2.0
     assert np.linalg.norm(turns, axis=1).max() < 30.0
@@ -199,7 +199,7 @@ def seen(astray: PathRecovery, off: float, speed: float, now: float) -> tuple[fl
     return astray.since, astray.ready
 
 
-def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
+def test_far_from_its_path_a_body_is_damped_until_it_is_slow() -> None:
     astray = PathRecovery()
     assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
     assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)

@@ -78,14 +78,14 @@ def off_axis(motion: PlannedMotion) -> FloatArray:
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def test_a_cheap_turn_about_the_axis_takes_torques_along_the_field_from_the_goal() -> None:
+def test_a_small_cost_of_roll_keeps_the_pointing_axis_closer_to_the_target() -> None:
     found = [course(expected(0.3 * SIZES), weights) for weights in (CHEAP, DEAR)]
     rms = [float(np.sqrt(np.mean(off_axis(motion) ** 2))) for motion in found if motion is not None]
     assert rms[0] < 0.5
     assert rms[1] > 4.0 * rms[0]
 
 
-def test_its_dipoles_alone_fly_it(rolling: PlannedMotion) -> None:
+def test_the_dipoles_of_the_path_alone_move_the_body_along_it(rolling: PlannedMotion) -> None:
     """The dipoles of the path alone move a simulated body along the path for twenty minutes.
 
     The equations of motion are integrated in steps of 1 s.
@@ -122,7 +122,7 @@ def test_no_other_motion_near_it_costs_less(rolling: PlannedMotion) -> None:
     assert np.degrees(angle_between(again, rolling.quaternion[later:])).max() < 0.5
 
 
-def test_more_dipole_than_there_is_and_more_rate_than_allowed_are_refused() -> None:
+def test_paths_beyond_the_limits_of_dipole_and_rate_are_refused() -> None:
     assert course(expected(limit=1e-6), CHEAP) is None
     assert course(expected(), CHEAP, fastest=1e-3) is None
 
@@ -163,7 +163,7 @@ def test_the_accelerations_are_those_of_one_instant(rolling: PlannedMotion) -> N
         np.testing.assert_allclose(found[k], one, atol=1e-15)
 
 
-def test_a_begin_off_the_law_is_led_into_it() -> None:
+def test_a_path_from_an_attitude_off_the_law_leads_to_the_law() -> None:
     ahead = expected()
     q = multiply(from_rotation_vector(np.radians([6.0, -4.0, 5.0])), ahead.wanted.quaternion[0])
     begun = ahead.wanted.until(KEPT + 1)
@@ -175,7 +175,7 @@ def test_a_begin_off_the_law_is_led_into_it() -> None:
 
 
 @pytest.mark.parametrize("roll", [60.0, -100.0])
-def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: float) -> None:
+def test_a_path_from_an_attitude_far_about_the_axis_is_feasible(roll: float) -> None:
     """From an attitude far off about the axis, a feasible motion with errors below 25 deg is found.
 
     Full steps with the derivative of the continuous motion would cause errors of 40 deg, or fail.
@@ -218,7 +218,7 @@ def test_the_derivative_of_a_step_is_exact(rolling: PlannedMotion) -> None:
             np.testing.assert_allclose(slope[:, part], wanted[:, part], atol=1e-5 * largest)
 
 
-def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
+def test_a_diverging_motion_gives_no_result_and_no_warning() -> None:
     """A motion that diverges gives no result and no warning.
 
     With the gains of this test, torques along the field accelerate the body more with each step.

@@ -61,7 +61,7 @@ def test_a_sun_is_forgotten_after_the_longest_eclipse() -> None:
     assert propagated.direction is None
 
 
-def test_while_nobody_carries_it_no_bias_is_learned_and_an_old_direction_is_not_taken_up() -> None:
+def test_while_the_direction_is_not_propagated_no_bias_is_estimated() -> None:
     """While the direction is not propagated, no bias is estimated, and an old direction is not used.
 
     In modes other than SAFE, the solar strings are read, but the direction is not propagated.
@@ -76,7 +76,7 @@ def test_while_nobody_carries_it_no_bias_is_learned_and_an_old_direction_is_not_
     assert propagated.direction is None
 
 
-def test_a_sun_far_from_the_carried_one_replaces_it_and_shows_no_bias() -> None:
+def test_a_sun_far_from_the_propagated_one_replaces_it_and_shows_no_bias() -> None:
     propagated = PropagatedSun()
     propagated.measure(0, SUN)
     propagated.propagate(SECOND_NS, np.eye(3))

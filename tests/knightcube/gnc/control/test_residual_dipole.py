@@ -34,11 +34,11 @@ def test_the_dipole_is_learned_beside_coils_that_are_a_hundred_times_stronger() 
         assert np.linalg.norm(learned(coils, DIPOLE, 5e-3) - DIPOLE) < 0.25 * np.linalg.norm(DIPOLE)
 
 
-def test_nothing_is_learned_of_a_body_without_one() -> None:
+def test_no_dipole_is_estimated_for_a_body_without_one() -> None:
     assert np.linalg.norm(learned(np.zeros(3), np.zeros(3), 5e-3)) < 2e-4
 
 
-def test_no_dipole_beyond_the_bound_is_believed_and_a_gap_begins_again() -> None:
+def test_no_estimated_dipole_exceeds_the_bound_and_a_gap_restarts_the_estimate() -> None:
     assert np.abs(learned(np.zeros(3), 20.0 * DIPOLE, 5e-3)).max() <= 5e-3
     observer = ResidualDipole(np.diag(INERTIA), 5e-3)
     field = np.array([0.0, 0.0, 3e-5])

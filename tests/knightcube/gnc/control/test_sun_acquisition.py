@@ -62,7 +62,7 @@ def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[Float
     return off, speed
 
 
-def test_it_turns_to_the_sun_from_behind() -> None:
+def test_the_body_turns_to_a_sun_behind_it() -> None:
     sun = np.array([0.6, 0.3, -0.74])
     off, speed = fly(sun / np.linalg.norm(sun), np.radians([0.3, -0.2, 0.4]), 700.0)
     assert off[0] > 130.0
@@ -70,13 +70,13 @@ def test_it_turns_to_the_sun_from_behind() -> None:
     assert speed.max() < 1.0, "slower than what is braked"
 
 
-def test_without_a_sun_it_is_held_still() -> None:
+def test_without_a_sun_the_body_is_damped() -> None:
     _, speed = fly(None, np.radians([0.3, -0.2, 0.4]), 300.0)
     assert speed[-1] < 0.8 * speed[0], "what lies along the field stays until the field has turned"
     assert np.all(np.diff(speed) < 0.02)
 
 
-def test_a_sun_that_is_no_longer_seen_is_carried_on_by_the_gyro_and_then_forgotten() -> None:
+def test_a_sun_that_is_no_longer_measured_is_propagated_by_the_gyro_and_then_forgotten() -> None:
     law, rate = seeker(), np.array([0.0, 0.002, 0.0])
     law.update_sun(0, Z)
     for second in range(1, int(MEMORY) + 1):

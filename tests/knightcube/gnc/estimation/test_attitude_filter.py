@@ -127,7 +127,7 @@ def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> N
     assert np.all(np.abs(np.array(last.parameters) - flight.parameters) < 3.0 * sigma)
 
 
-def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
+def test_the_current_that_holds_the_body_does_not_depend_on_the_assumed_plant() -> None:
     """Due to the estimated disturbance, the current that holds the body is the same for any assumed plant."""
     flight = fly(5, 400, True)
     filter_ = begin(flight, True)
@@ -146,7 +146,7 @@ def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out(
     assert own.covariance[1, 1] == last.covariance[4, 4]
 
 
-def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
+def test_the_filter_of_a_suspended_body_ignores_motion_about_other_axes() -> None:
     """The filter of a suspended body ignores the measured motion about the other axes, such as a swing."""
     flight = fly(6, 60, True)
     filter_ = begin(flight, True)
@@ -283,7 +283,7 @@ def test_a_camera_that_is_wrong_for_ever_restarts_nothing() -> None:
     assert (filter_.refused, filter_.restarts) == (60, 0)
 
 
-def test_a_measurement_older_than_all_it_remembers_is_late_and_not_wrong() -> None:
+def test_a_measurement_older_than_the_history_is_late_and_not_an_outlier() -> None:
     flight = fly(12, 20, False)
     filter_ = AttitudeFilter(FREE, SETTINGS)
     filter_.start(*flight.samples[10])
@@ -307,7 +307,7 @@ def test_at_the_start_the_rate_is_only_as_good_as_the_gyros_bias() -> None:
     assert covariance[3, 3] == pytest.approx(SETTINGS.bias_start**2 + RATE_SIGMA**2)
 
 
-def test_the_past_is_remembered_and_what_lies_before_is_unknown() -> None:
+def test_past_estimates_are_stored_and_earlier_ones_are_unknown() -> None:
     flight = fly(13, 60, False)
     filter_, half_way = begin(flight, False), begin(flight, False)
     follow(filter_, flight)

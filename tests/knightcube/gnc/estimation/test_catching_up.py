@@ -62,7 +62,7 @@ def _frame(rate: float = RATE) -> list[Measurement]:
 
 
 @pytest.mark.parametrize("at_a_time", [1, 7, 16])
-def test_the_estimate_is_that_of_measurements_put_in_at_once(at_a_time: int) -> None:
+def test_the_estimate_equals_that_of_measurements_applied_at_once(at_a_time: int) -> None:
     at_once, in_turn = _begun(), _begun()
     for measurement in _frame():
         assert at_once.measure(measurement)
@@ -80,7 +80,7 @@ def test_the_estimate_is_that_of_measurements_put_in_at_once(at_a_time: int) -> 
     assert np.allclose(one.covariance, other.covariance, rtol=1e-9, atol=1e-20)
 
 
-def test_until_it_is_done_the_estimate_is_that_without_the_late_ones() -> None:
+def test_until_late_measurements_are_applied_the_estimate_is_that_without_them() -> None:
     plain, in_turn = _begun(), _begun()
     in_turn.measure_late(_frame(), lambda used: pytest.fail(f"reported {used} too early"))
     in_turn.catch_up(10)
@@ -88,7 +88,7 @@ def test_until_it_is_done_the_estimate_is_that_without_the_late_ones() -> None:
     assert np.array_equal(plain.at(now_ns).covariance, in_turn.at(now_ns).covariance)
 
 
-def test_a_late_one_that_cannot_be_is_refused_and_costs_nothing() -> None:
+def test_a_late_outlier_is_refused_and_changes_nothing() -> None:
     plain, in_turn = _begun(), _begun()
     reported: list[list[bool]] = []
     mean_rate, _ = _frame(rate=5.0 * RATE)
@@ -100,14 +100,14 @@ def test_a_late_one_that_cannot_be_is_refused_and_costs_nothing() -> None:
     assert np.allclose(plain.at(now_ns).rate, in_turn.at(now_ns).rate, rtol=0.0, atol=1e-12)
 
 
-def test_one_from_before_all_that_is_remembered_is_refused_at_once() -> None:
+def test_a_measurement_from_before_the_history_is_refused_at_once() -> None:
     in_turn = AttitudeFilter(BODY, SETTINGS)
     reported: list[list[bool]] = []
     in_turn.measure_late(_frame(), reported.append)
     assert reported == [[False, False]]
 
 
-def test_a_filter_that_restarts_reports_that_the_late_ones_were_not_used() -> None:
+def test_a_filter_that_restarts_reports_that_late_measurements_were_not_used() -> None:
     in_turn = _begun()
     reported: list[list[bool]] = []
     in_turn.measure_late(_frame(), reported.append)

@@ -59,7 +59,7 @@ MEASUREMENTS: list[tuple[str, Callable[[], Measurement]]] = [
 
 
 @pytest.mark.parametrize(("name", "make"), MEASUREMENTS)
-def test_rows_are_how_the_innovation_answers_to_each_error(
+def test_the_jacobian_rows_are_the_derivatives_of_the_innovation(
     name: str, make: Callable[[], Measurement]
 ) -> None:
     """The Jacobian rows equal minus the central differences of the innovation."""
@@ -76,7 +76,7 @@ def test_rows_are_how_the_innovation_answers_to_each_error(
         np.testing.assert_allclose((down - up) / (2.0 * step), rows[:, column], atol=2e-6 * scale)
 
 
-def test_a_direction_says_nothing_of_the_turn_about_itself() -> None:
+def test_a_direction_has_no_information_about_the_rotation_about_itself() -> None:
     seen = direction(as_array(STATE), off=1e-4)
     found = innovation(STATE, seen, False)
     covariance = np.eye(SIZE)
@@ -88,7 +88,7 @@ def test_a_direction_says_nothing_of_the_turn_about_itself() -> None:
     assert across == pytest.approx(2.0 * SIGMA**2, rel=0.01)
 
 
-def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
+def test_a_variance_along_the_direction_has_no_effect() -> None:
     seen = direction(as_array(STATE), off=0.002)
     wide = replace(seen, covariance=seen.covariance + np.outer(seen.observed, seen.observed))
     covariance = 1e-4 * np.eye(SIZE)

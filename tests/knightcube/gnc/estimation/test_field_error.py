@@ -72,13 +72,13 @@ def flown_with_stars(sigma: float) -> Sky:
 
 
 @pytest.mark.parametrize("sigma", [1e-8, 5e-8, 1.5e-7])
-def test_its_size_is_learned_with_stars(sigma: float) -> None:
+def test_the_size_of_the_field_error_is_estimated_with_stars(sigma: float) -> None:
     sky = flown_with_stars(sigma)
     assert 0.5 * sigma < sky.filter.field_error < 1.6 * sigma + 2.0 * MINIMUM_FIELD_ERROR
     assert sky.filter.refused == 0
 
 
-def test_without_an_attitude_that_is_fine_nothing_is_learned_of_it() -> None:
+def test_without_a_fine_attitude_the_field_error_is_not_estimated() -> None:
     sky = Sky(3e-7, 4)
     sky.filter.start(IDENTITY, np.radians(2.0) ** 2 * np.eye(3), np.zeros(3))
     while sky.filter.knowledge is Knowledge.COARSE and sky.time < 1_000.0:
@@ -97,7 +97,7 @@ def test_a_contradicted_estimate_expects_the_error_of_the_start_again() -> None:
 
 
 @pytest.mark.parametrize("sigma", [1e-8, 5e-8])
-def test_without_stars_the_attitude_is_off_by_what_is_claimed(sigma: float) -> None:
+def test_without_stars_the_attitude_error_agrees_with_its_covariance(sigma: float) -> None:
     """After 1,000 s without stars, the attitude error agrees with its covariance.
 
     The body has five intervals without stars, each after 300 s with star attitudes.

@@ -90,7 +90,7 @@ def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() ->
     assert along @ spread @ along > 100.0 * (across @ spread @ across)
 
 
-def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
+def test_the_estimate_from_a_false_gyro_is_discarded_when_the_gyro_measures_correctly() -> None:
     """The estimate of a false gyro is discarded when the gyro measures correctly again.
 
     The body is at rest in a constant field, so only the gyro measures a rotation about the field.
@@ -114,7 +114,7 @@ def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
     assert missed() < 16.3
 
 
-def test_one_spiked_sample_is_refused_and_a_change_of_the_world_begins_again() -> None:
+def test_one_outlier_is_refused_and_repeated_contradictions_restart_the_filter() -> None:
     found, last = follow(np.radians([3.0, -4.0, 5.0]), INERTIA, 30.0)
     before = found.rate
     assert not found.measure(found.field + 1e-5)

@@ -89,7 +89,7 @@ def test_the_claim_is_honest_over_independent_flights() -> None:
     assert 3.0 < np.mean(nees) < 16.0, "nine errors, four flights: 99.9 % of a chi-square of 36 over 4"
 
 
-def test_it_learns_the_residual_dipole_and_says_how_well() -> None:
+def test_the_residual_dipole_is_estimated_within_its_uncertainty() -> None:
     found, _, _ = fly(400, 1)
     missing = found.residual_dipole(0.0) - RESIDUAL
     sigma = np.sqrt(np.diag(found.covariance)[DIPOLE])
@@ -183,7 +183,7 @@ def test_the_stars_separate_the_magnetometer_s_bias_from_the_attitude() -> None:
     np.testing.assert_allclose(found._constants[MAGNET], bias, atol=2e-8)
 
 
-def test_a_new_start_keeps_what_was_learned_of_the_slow_states() -> None:
+def test_a_new_start_keeps_the_estimates_of_the_slow_states() -> None:
     found, q, w = fly(120, 2)
     dipole, sigma = found.residual_dipole(0.0), np.diag(found.covariance)[DIPOLE]
     found.start(q, STAR**2 * np.eye(3), w + BIAS)

@@ -256,7 +256,7 @@ def test_coils_that_vary_over_tens_of_seconds_are_in_the_claim(
     assert nees[1] > (3.0 if every >= 20 else 2.0)
 
 
-def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> None:
+def test_a_contradicted_estimate_has_the_prior_variances_again() -> None:
     craft = Craft(np.zeros(3), np.zeros(3), 2)
     found = started(craft, FreeFilterSettings())
     fly(craft, found, 40, np.zeros(3), 0.0)

@@ -45,7 +45,7 @@ def sigmas(flight: Flight, last: Estimate) -> float:
 
 
 @pytest.mark.parametrize("late", [0, 2, 3])
-def test_the_age_is_found_and_made_up_for(late: int) -> None:
+def test_the_age_of_samples_is_estimated_and_corrected(late: int) -> None:
     """After 20 s, the age of the samples is known to 12 ms and within three sigma.
 
     Without a correction, an age of two cycles causes errors of more than ten sigma.
@@ -83,7 +83,7 @@ def test_a_rate_alone_does_not_show_the_age() -> None:
     assert after.covariance[LATENCY, LATENCY] == pytest.approx(before.covariance[LATENCY, LATENCY], rel=1e-12)
 
 
-def test_no_age_is_taken_that_is_none() -> None:
+def test_the_estimated_age_is_between_zero_and_the_longest_latency() -> None:
     """The estimated age is between zero and the longest latency, and zero before the start of the filter."""
     filter_ = AttitudeFilter(SUSPENDED, ESTIMATING)
     assert filter_.latency == 0.0
@@ -92,7 +92,7 @@ def test_no_age_is_taken_that_is_none() -> None:
     assert 0.0 <= early.latency <= LONGEST_LATENCY
 
 
-def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
+def test_a_current_that_changes_within_the_uncertainty_of_the_age_adds_noise() -> None:
     """If a current changes within the uncertainty of the age, the change adds noise to the acceleration.
 
     The noise is half the step of the acceleration per sigma of the age, and zero without a step.

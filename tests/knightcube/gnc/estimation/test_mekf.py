@@ -62,7 +62,7 @@ def difference(a: FilterState, b: FilterState) -> FloatArray:
     return np.concatenate([turn, mine - theirs])
 
 
-def test_the_transition_is_how_errors_grow() -> None:
+def test_the_transition_of_the_errors_equals_central_differences() -> None:
     """The transition of the errors agrees with central differences over one cycle.
 
     The remainder is of third order in the step.

@@ -37,7 +37,9 @@ def acceleration(body: RigidBody, q: Quaternion, rate: Vector, currents: FloatAr
 
 
 @given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-0.15, 0.15))
-def test_suspended_it_accelerates_as_the_single_axis_plant(angle: float, rate: float, amps: float) -> None:
+def test_a_suspended_body_accelerates_like_the_single_axis_plant(
+    angle: float, rate: float, amps: float
+) -> None:
     body = RigidBody(INERTIA, DIPOLE, TESTBED_FIELD, suspended=True, stiffness=1e-5, damping=2e-6)
     plant = SingleAxisPlant(float(INERTIA[1, 1]), DIPOLE * 4.5e-4, 23.0, 0.148, 1e-5, 2e-6)
     x, y, z = acceleration(body, exponential(0.0, angle, 0.0), (0.0, rate, 0.0), np.array([amps, 0.1, 0.0]))
@@ -45,7 +47,7 @@ def test_suspended_it_accelerates_as_the_single_axis_plant(angle: float, rate: f
     assert y == pytest.approx(plant.acceleration(angle, rate, amps), abs=1e-14)
 
 
-def test_free_it_obeys_eulers_equation() -> None:
+def test_a_free_body_obeys_eulers_equation() -> None:
     body = RigidBody(SKEWED, DIPOLE, FIELD)
     field_body = quaternion.attitude_matrix(np.array(Q)) @ FIELD
     torque = np.cross(DIPOLE * CURRENTS, field_body) - np.cross(RATE, SKEWED @ RATE)
@@ -54,7 +56,7 @@ def test_free_it_obeys_eulers_equation() -> None:
 
 
 @pytest.mark.parametrize("suspended", [False, True])
-def test_its_derivatives_are_those_of_its_acceleration(suspended: bool) -> None:
+def test_the_derivatives_of_a_body_are_those_of_its_acceleration(suspended: bool) -> None:
     thread = {"stiffness": 1e-5, "damping": 2e-6} if suspended else {}
     body = RigidBody(SKEWED, DIPOLE, FIELD, suspended, **thread)
     # For a rotation about another axis than the suspension thread, the twist changes at a different rate.
@@ -74,7 +76,7 @@ def test_its_derivatives_are_those_of_its_acceleration(suspended: bool) -> None:
         np.testing.assert_allclose(model.by_current[:, axis], more / step, atol=1e-8)
 
 
-def test_the_thread_pulls_back_in_proportion_to_the_turn_and_to_the_rate() -> None:
+def test_the_torque_of_the_thread_is_proportional_to_rotation_and_rate() -> None:
     body = RigidBody(INERTIA, DIPOLE, TESTBED_FIELD, suspended=True)
     hung, rate = exponential(0.0, 0.4, 0.0), (0.0, 0.5, 0.0)
     model = body.linearise(hung, rate, Parameters(0.01, 0.002), body.torquing(np.zeros(3)), 0.0)
@@ -101,7 +103,7 @@ def test_a_command_may_bring_its_own_field() -> None:
         (INERTIA, {"stiffness": 1e-5}),
     ],
 )
-def test_it_refuses_what_no_body_has(inertia: FloatArray, changes: dict[str, float]) -> None:
+def test_impossible_properties_of_a_body_are_refused(inertia: FloatArray, changes: dict[str, float]) -> None:
     arguments = {"dipole_per_ampere": DIPOLE, "field": TESTBED_FIELD} | changes
     with pytest.raises(UsageError):
         RigidBody(inertia, **arguments)  # type: ignore[arg-type]  # a table of mistakes

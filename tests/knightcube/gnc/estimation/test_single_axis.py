@@ -32,7 +32,7 @@ def run(filter_: SingleAxisFilter, commands: list[float], measurements: list[Mea
         filter_.command(cycle * PERIOD, command)
 
 
-def test_its_errors_are_as_large_as_its_covariance_says() -> None:
+def test_the_errors_agree_with_the_covariance() -> None:
     """The NEES of angle and rate, summed over 40 runs, is in the 99.9 % band of chi-square(80)."""
     rng = np.random.default_rng(7)
     nees = []
@@ -46,7 +46,7 @@ def test_its_errors_are_as_large_as_its_covariance_says() -> None:
     assert 44.8 < sum(nees) < 124.8
 
 
-def test_it_is_better_than_its_measurements() -> None:
+def test_the_estimate_is_better_than_its_measurements() -> None:
     rng = np.random.default_rng(8)
     errors = []
     for _ in range(20):
@@ -119,7 +119,7 @@ def test_a_late_measurement_inside_an_exposure_does_not_lose_the_exposure() -> N
     assert (a.angle, a.rate) == pytest.approx((b.angle, b.rate), abs=1e-13)
 
 
-def test_a_measurement_older_than_all_it_remembers_is_not_used() -> None:
+def test_a_measurement_older_than_the_history_is_not_used() -> None:
     filter_ = SingleAxisFilter(PLANT, SETTINGS)
     filter_.start(Measurement(10**9, ANGLE, 0.1, 1e-6), Measurement(10**9, RATE, 0.0, 1e-8))
     assert not filter_.measure(Measurement(10**9 - 1, RATE, 0.5, 1e-12))
@@ -158,7 +158,7 @@ def test_an_angle_that_wraps_round_is_a_small_innovation() -> None:
     assert filter_.measure(Measurement(PERIOD, ANGLE, -math.pi + 0.001, 1e-6))
 
 
-def test_the_past_is_remembered_and_what_lies_before_is_unknown() -> None:
+def test_past_estimates_are_stored_and_earlier_ones_are_unknown() -> None:
     _, commands, measurements = simulate(np.random.default_rng(10), 60)
     filter_ = SingleAxisFilter(PLANT, SETTINGS)
     run(filter_, commands, measurements)

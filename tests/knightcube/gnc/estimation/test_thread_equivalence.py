@@ -81,13 +81,13 @@ def largest_difference(driven: bool) -> tuple[float, float]:
     return apart[0], apart[1]
 
 
-def test_adrift_the_two_filters_agree_to_rounding() -> None:
+def test_without_currents_the_two_filters_agree_to_rounding() -> None:
     states, covariances = largest_difference(driven=False)
     assert states < 1e-9
     assert covariances < 1e-12
 
 
-def test_driven_they_differ_by_what_the_single_axis_leaves_out() -> None:
+def test_with_driven_coils_the_filters_differ_by_terms_that_the_single_axis_filter_omits() -> None:
     """With driven coils, the covariances of the three-axis and the single-axis filter differ by 0.5 %.
 
     The single-axis filter ignores in its covariance that the torque changes with the angle.

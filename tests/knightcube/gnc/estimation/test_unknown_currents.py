@@ -60,7 +60,7 @@ def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
 
 
 @pytest.mark.parametrize("reported", [True, False])
-def test_reported_or_not_the_filter_refuses_nothing_and_stays_consistent(
+def test_with_unknown_currents_the_filter_refuses_nothing_and_stays_consistent(
     flown: Flight, reported: bool
 ) -> None:
     filter_ = filtered(flown, reported)

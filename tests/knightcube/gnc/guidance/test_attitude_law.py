@@ -49,7 +49,7 @@ def test_nadir_along_the_flight_turns_once_an_orbit_about_the_pitch_axis() -> No
     np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-9)
 
 
-def test_rate_and_acceleration_carry_the_attitude_on() -> None:
+def test_rate_and_acceleration_predict_the_attitude() -> None:
     """Rate and acceleration of a law predict its attitude over a short time.
 
     A ground target passes at 3 km/s or more, so its rate and acceleration change continuously.

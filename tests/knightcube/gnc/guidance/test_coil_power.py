@@ -40,7 +40,7 @@ def test_each_coil_has_its_own_resistance() -> None:
 
 
 @pytest.mark.parametrize("current", [(0.0, 0.0, 0.0), (0.05, 0.0, 0.0), (-0.05, 0.1, -0.02)])
-def test_it_is_the_charge_that_the_simulated_bridges_take_from_their_supply(
+def test_the_power_is_that_which_the_simulated_bridges_take_from_their_supply(
     current: tuple[float, float, float],
 ) -> None:
     """The power agrees with the power of the simulated circuit.

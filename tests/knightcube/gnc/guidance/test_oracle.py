@@ -28,7 +28,7 @@ def test_the_oracle_reproduces_the_closed_form_of_a_small_slew() -> None:
     assert found.energy == pytest.approx(23.0 * 12.0 * (angle / gain) ** 2 / horizon**3, rel=1e-4)
 
 
-def test_the_oracle_keeps_the_limit_and_finds_nothing_where_there_is_nothing() -> None:
+def test_the_oracle_keeps_the_limit_and_finds_no_path_below_the_shortest_time() -> None:
     for known in known_optima()[:4]:
         found = solve(known.problem.slew(1.02 * known.shortest))
         assert found is not None

@@ -75,7 +75,7 @@ SLOPE = st.floats(-0.1, 0.1)
 
 
 @given(Q2, SLOPE, Q2, SLOPE, st.floats(1.0, 60.0))
-def test_the_prey_joins_both_states(
+def test_the_prey_path_joins_both_states(
     start: float, slope: float, end: float, end_slope: float, horizon: float
 ) -> None:
     prey = CubicPrey.between(start, slope, end, end_slope, horizon)

@@ -38,7 +38,7 @@ def guidance(good: StepPlan) -> PathGuidance:
     return guidance
 
 
-def test_before_any_plan_there_is_nothing_to_fly(good: StepPlan) -> None:
+def test_before_the_first_plan_no_path_is_followed(good: StepPlan) -> None:
     guidance = PathGuidance(KNIGHTCUBE, RULES)
     assert guidance.sample(0) is None
     assert guidance.state(0) == GuidanceState.NONE
@@ -98,7 +98,7 @@ def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) 
     assert "limit is 0.148 A" in refused(guidance, hasty, 101, 101, START, 0.0)
 
 
-def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
+def test_the_current_is_checked_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
     """A path is refused if its current exceeds the limit between the nodes.
 
     A ripple of Chebyshev degree 40 is too fine for 24 nodes. The current of the ripple is almost zero at most

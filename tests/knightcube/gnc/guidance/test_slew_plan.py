@@ -97,7 +97,7 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
     assert around.energy > free.energy
 
 
-def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> None:
+def test_a_slew_is_led_around_cones_that_every_path_without_limits_crosses() -> None:
     """A slew is led around the cones, although every path without limits passes through a cone.
 
     The slew is case 0 of `bench orbit_slews --cones --seed 43`.
@@ -110,7 +110,7 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 
 
 @pytest.mark.parametrize(("seed", "case"), [(43, 18), (43, 40), (44, 44)])
-def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
+def test_slews_are_planned_although_all_initial_guesses_cross_cones(seed: int, case: int) -> None:
     """Slews are planned although all initial guesses by rotations about the field pass through cones.
 
     In the first two of the three slews, all rotations about the field pass through cones.
@@ -185,7 +185,7 @@ def test_a_slew_may_last_three_times_the_requested_duration_unless_a_longest_one
     assert ephemeris.times[-1] >= first + longest
 
 
-def test_a_refusal_says_what_the_ends_lie_in() -> None:
+def test_a_refusal_names_the_cone_in_which_the_ends_lie() -> None:
     case = problem("E-cube-3u-sso-y90-300")
     task = task_of(case, 20.0, longest=60.0, nodes=8)
     axis = np.array([1.0, 0.0, 0.0])

@@ -215,7 +215,7 @@ def test_gradients_are_exact(horizon: float) -> None:
         )
 
 
-def test_the_same_question_has_the_same_answer_bit_for_bit() -> None:
+def test_equal_problems_have_equal_plans_bit_for_bit() -> None:
     first, second = THESIS.planned(), THESIS.planned()
     assert first.path == second.path
     assert first.energy == second.energy
@@ -229,7 +229,7 @@ def test_a_plan_survives_the_way_to_another_process() -> None:
     np.testing.assert_array_equal(copy.nu, found.nu)
 
 
-def test_staying_where_one_is_costs_nothing() -> None:
+def test_a_plan_to_the_present_state_has_no_energy() -> None:
     """If the start is the target, the plan has no energy and is optimal.
 
     NLopt may end this trivial problem with the status for rounding errors.
@@ -299,7 +299,7 @@ def test_an_optimiser_that_gives_no_path_is_an_error_and_no_plan(
         ((0.3, 0.0, -0.3, 0.0, 1e-3), {}, "no path"),
     ],
 )
-def test_what_cannot_be_planned_is_refused_with_its_reason(
+def test_impossible_problems_are_refused_with_the_reason(
     arguments: tuple[float, float, float, float, float], options: dict[str, float], reason: str
 ) -> None:
     with pytest.raises(PlanningError, match=reason):
@@ -368,7 +368,7 @@ def test_a_horizon_just_long_enough_is_kept_or_stretched_by_less_than_a_percent(
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1e-3, 2e-2), st.floats(2e-5, 2e-3))
-def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price: float) -> None:
+def test_a_cost_of_time_gives_the_horizon_of_the_closed_form(angle: float, price: float) -> None:
     """A cost per time gives the duration at which the closed form of the total cost is minimal.
 
     With cos(theta) = 1, the minimum energy is 12 R (a/g)^2 / T^3. At the optimum duration, the energy
@@ -382,7 +382,7 @@ def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price
     assert found.status is PlanStatus.OPTIMAL
 
 
-def test_no_horizon_nearby_is_better_at_the_price() -> None:
+def test_no_other_horizon_has_a_smaller_total_cost() -> None:
     """No other duration has a smaller sum of energy and time cost, by the collocation oracle."""
     price = 0.2
     for problem, _ in feasible_problems(10, seed=3):
@@ -395,7 +395,7 @@ def test_no_horizon_nearby_is_better_at_the_price() -> None:
                 assert total <= 1.001 * (other.energy + price * factor * found.horizon)
 
 
-def test_the_dearer_the_time_the_shorter_the_horizon_down_to_the_shortest() -> None:
+def test_a_larger_cost_of_time_shortens_the_horizon_down_to_the_shortest() -> None:
     horizons = [THESIS.planned(time_cost=price).horizon for price in (0.01, 0.1, 1.0, 100.0)]
     assert horizons == sorted(horizons, reverse=True)
     shortest = shortest_time(THESIS.slew(1.0))
@@ -403,7 +403,7 @@ def test_the_dearer_the_time_the_shorter_the_horizon_down_to_the_shortest() -> N
 
 
 @pytest.mark.parametrize("price", [0.0, -1.0, math.nan, math.inf])
-def test_an_impossible_price_is_refused(price: float) -> None:
+def test_an_impossible_cost_of_time_is_refused(price: float) -> None:
     with pytest.raises(PlanningError, match="time_cost"):
         THESIS.planned(time_cost=price)
 

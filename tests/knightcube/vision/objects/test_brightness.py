@@ -54,7 +54,7 @@ def test_equations_that_are_not_positive_definite_are_refused() -> None:
     assert brightness._non_negative.loop_form(normal, np.ones(2))[-1] == brightness._NOT_DEFINITE
 
 
-def testbrightnesses_are_those_of_non_negative_least_squares() -> None:
+def test_brightnesses_are_those_of_non_negative_least_squares() -> None:
     draw = np.random.default_rng(3)
     images = draw.uniform(0.0, 1.0, (4, 50)) * np.array([1.0, 30.0, 0.1, 5.0])[:, None]
     data = np.array([40.0, 2.0, 0.0, 3.0]) @ images - 30.0 * images[2] + draw.normal(size=50)

@@ -389,7 +389,7 @@ def test_a_bright_star_whose_core_is_saturated_is_not_reported_as_an_object() ->
     assert report.objects == ()
 
 
-def test_a_piece_of_a_faint_star_is_not_reported_as_an_object() -> None:
+def test_a_segment_of_a_faint_star_is_not_reported_as_an_object() -> None:
     """A segment of a faint star is not reported as an object.
 
     At the segmentation threshold, a streak breaks into segments that together have the flux of the star.

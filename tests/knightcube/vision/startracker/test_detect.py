@@ -71,7 +71,7 @@ def test_saturated_stars_are_flagged_and_fitted_on_their_wings() -> None:
     assert np.sqrt(np.mean((found.points[detection] - places[star]) ** 2)) < 0.01
 
 
-def test_the_bench_s_bound_is_that_of_the_streak_s_room_at_length_zero() -> None:
+def test_the_bound_of_a_point_is_that_of_a_streak_of_length_zero() -> None:
     camera = StarCameraModel(bits=16, full_well=1e6)
     place, electrons = np.array([500.3, 480.8]), 5000.0
     floor = camera.read_noise**2 + camera.dark_current * 0.2 + 1.0 / 12.0
@@ -211,7 +211,7 @@ def test_a_saturated_moon_is_not_detected_as_a_star() -> None:
     assert not np.any(np.linalg.norm(found.points - [300.0, 250.0], axis=1) < 25.0)
 
 
-def test_a_plain_frame_shows_nothing() -> None:
+def test_frames_without_stars_have_hardly_any_detections() -> None:
     false = sum(len(detect(counts(sky(np.random.default_rng([seed, 1])))).stars()) for seed in range(20))
     assert false <= 3
     assert len(detect(np.full((200, 200), 7, dtype=np.uint8))) == 0

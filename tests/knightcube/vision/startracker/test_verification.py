@@ -43,7 +43,7 @@ def _chance(observed: int, spread: float) -> Chance:
     return Chance(observed, spread, 1.0, 0.0, 1, 3, 0.0)
 
 
-def test_the_bound_is_not_below_what_strewn_stars_show() -> None:
+def test_the_bound_is_not_below_the_frequency_of_matches_of_random_stars() -> None:
     """Random star sets match no more often than the bound states.
 
     Sky and image are random sets of ten stars in a unit square, each in a random order of brightness. All
