@@ -331,7 +331,7 @@ def test_elements_replace_one_value_of_the_present_configuration(board: RenewedB
 
 
 def test_a_damaged_configuration_is_not_accepted_with_new_elements(board: RenewedBoard) -> None:
-    """The new configuration would contain the damaged value, and have a valid checksum."""
+    """If it were accepted, the new configuration would have the damaged value and a valid checksum."""
     board.config.write_text(board.config.read_text().replace("duration: ", "duration: 1"))
     path = board.place / "elements.txt"
     path.write_text("\n".join(ELEMENTS) + "\n")
@@ -413,7 +413,7 @@ def test_a_request_after_a_new_key_may_have_the_name_of_an_earlier_request(board
 
 
 def test_a_refused_bundle_leaves_no_files(board: RenewedBoard) -> None:
-    """A bundle that fills the disk would otherwise prevent that its refusal is stored."""
+    """If its files remained, a bundle that fills the disk would prevent the storage of its refusal."""
     bundle = board.bundle("configuration", board.changed("second"), 1)
     bundle.write_bytes(bundle.read_bytes()[:-100])
     request = board.activate(bundle)

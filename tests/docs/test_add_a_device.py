@@ -142,7 +142,7 @@ def test_a_value_that_the_device_does_not_accept_is_refused(
 def test_a_mistake_in_the_code_of_a_driver_is_named_with_its_line(
     folder: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, problem: str, status: int
 ) -> None:
-    """With the error of a wrong configuration, a transient fault of a device would end a service."""
+    """Errors of `open` have status 1, because a transient fault of a device must not end a service."""
     text = (folder / "ina226.py").read_text(encoding="utf-8")
     assert old in text
     (folder / "ina226.py").write_text(text.replace(old, new), encoding="utf-8")

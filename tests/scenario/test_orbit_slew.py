@@ -147,7 +147,7 @@ def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Pat
 def test_the_coils_only_remove_energy_while_the_body_is_damped(crippled: Run) -> None:
     """While a body is damped, its coils only remove energy.
 
-    Before the restart of the flight, star fixes were also available along the path.
+    Along its path, before it is damped, they also add energy.
     """
     lost = at(crippled, "astray")[0]
     around, truth = crippled["orbit_truth"], crippled["truth"]

@@ -1,4 +1,4 @@
-"""Tests with GPS fixes that have wrong contents and valid checksums."""
+"""Tests with random answers of PWM chip, current monitor and solar cells, and with damaged GPS fixes."""
 
 from __future__ import annotations
 

@@ -1,20 +1,19 @@
 """The star tracker on photographs and on simulated frames.
 
 The photographs are in a folder with a file `truth.json`, which gives right ascension and declination of the
-image's centre and the horizontal field of view in degrees. Each photograph is solved with the field known to
-5 %, and also with an unknown field if it is 10 to 30 deg wide. The photographs with a ratio of 4 to 3 and a
-field of at least 10 deg are also solved after a reduction to 646 x 486 pixels (`reduced`), with the field
-known. The simulated frames have the simulator's
-camera with a field of 12 deg known to 0.1 deg and an exposure of 0.1 s. The axis of rotation is 30 to 90 deg
-off the boresight, or perpendicular to it. `over bound` is the rms error across the boresight divided by the
-Cramer-Rao bound of the star positions; `bound` is the same ratio for the magnitude of the rate. Identified
-stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths of streaks. Times
-are processor times of one core. For photographs, the time is the median of some passes after a first pass
-that is not counted, for all programs. The other star identification
-programs extract the stars themselves, with their default filters and without filters. `ratios` compares the
-time of each photograph with known field with that of each other program: the median of the ratios for each
-frame size. `dim frames` are frames of a calibrated camera with such short exposures that few stars are
-detected.
+image's centre and the horizontal field of view in degrees. Each photograph is solved with its field of view
+known to 5 %, and a photograph of a field of 10 to 30 deg also with an unknown field. The photographs with a
+ratio of 4 to 3 and a field of at least 10 deg are also solved after a reduction to 646 x 486 pixels
+(`reduced`), with the field known. The simulated frames have the simulator's camera with a field of 12 deg
+known to 0.1 deg and an exposure of 0.1 s. The angle of the axis of rotation from the boresight is random
+between 30 and 90 deg, or 90 deg in the rows with `across`. `over bound` is the rms error across the boresight
+divided by the Cramer-Rao bound of the star positions; `bound` is the same ratio for the magnitude of the
+rate. Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths
+of streaks. Times are processor times of one core. For photographs, the time is the median of some passes
+after a first pass that is not counted, for all programs. The other star identification programs extract the
+stars themselves, with their default filters and without filters. `ratios` compares the time of each
+photograph with known field with that of each other program: the median of the ratios for each frame size.
+`dim frames` are frames of a calibrated camera with such short exposures that few stars are detected.
 """
 
 from __future__ import annotations

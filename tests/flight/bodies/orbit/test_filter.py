@@ -646,7 +646,7 @@ def test_another_magnetometer_begins_without_the_learned_bias(renewed: bool) -> 
 def test_the_dipoles_stay_unknown_while_the_driver_of_the_coils_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Meanwhile the time of the last acknowledged command does not change, and later steps begin after it."""
+    """The time of the last acknowledged command is constant, and all steps in the failure begin later."""
     flown = Flown(pulses=True)
     flown.fly(2.0)
     failed_ns, command = flown.time_ns, flown.filter.command

@@ -451,7 +451,7 @@ def test_frames_that_were_protected_are_sent_before_the_counters_end() -> None:
 
 
 def test_telemetry_returns_at_the_rate_of_the_line_after_a_time_without_keys() -> None:
-    """Lets 1200 bytes/s of reports wait for a minute, and then reads one second of frames of 128 bytes."""
+    """After a minute without keys, frames of 128 bytes are sent at 1200 bytes/s, not faster."""
     keys: list[str] = []
 
     def seal(header: bytes, data: bytes) -> bytes:

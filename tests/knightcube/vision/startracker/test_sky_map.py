@@ -135,7 +135,7 @@ def test_the_compiled_lens_errors_equal_those_in_numpy() -> None:
 def test_a_direction_far_outside_the_image_has_no_pixel() -> None:
     """A star beside the camera appears nowhere in the image of a lens with a large distortion.
 
-    The inversion of the lens errors diverges for these stars, and gave pixels inside the image.
+    The inversion of the lens errors diverges for these stars, and can return pixels inside the image.
     """
     camera = Pinhole.from_field_of_view(1024, 768, np.radians(12.0))
     bend = 2.0 * usual_bend(camera) ** -0.5 * np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])

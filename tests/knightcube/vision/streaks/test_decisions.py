@@ -192,7 +192,7 @@ def test_a_prior_rate_decides_on_the_sign_of_the_rotation() -> None:
 def test_the_error_of_the_motion_from_navigation_is_in_the_covariance(
     monkeypatch: pytest.MonkeyPatch, delay: float
 ) -> None:
-    """A motion that follows the navigation filter states its course, unless the pixels contradict it."""
+    """The result contains the course from navigation, unless the pixels contradict this course."""
     turn = np.array([0.1, 0.0, 0.0])
     course = Course(np.stack([turn, 0.0 * turn, turn]), 1e-4)
     camera = replace(_problem(), shutter=Shutter(delay, 70.0), course=_MOTION)

@@ -69,9 +69,10 @@ def test_the_rate_is_within_what_its_covariance_and_the_bound_allow(theta: float
 
 
 def test_streaks_without_both_ends_in_the_frame_give_no_rate() -> None:
-    """Streaks that cross the whole frame do not show their length, which the fit takes from the frame.
+    """Streaks that cross the whole frame do not show their length.
 
-    This rate was two thirds of the true rate, with an error of 55 standard deviations.
+    A fit with the length within the frame gives two thirds of the true rate, an error of 55 standard
+    deviations.
     """
     scene = real_sky(9012, 1.5, 750.0, 0.2, replace(CAMERA, columns=500, rows=500))
     found = _estimated(scene)
