@@ -292,20 +292,20 @@ install_units() {
 }
 
 # Store the configuration that was accepted on the ground. It is the last version to which the command-loss timer
-# returns.
+# returns. If `$1` is `release`, this is done before the new release is made current. The trial of a renewal is ended,
+# because the automatic return at its end would replace the installed release or configuration.
 keep_accepted() {
-    [ ! -x "$prefix/bin/renewal.py" ] || [ -n "$dry" ] ||
-        python3 -I -S "$prefix/bin/renewal.py" --root "${root:-/}" --accepted
+    [ -n "$dry" ] || python3 -I -S "$deploy/renewal.py" --root "${root:-/}" --accepted "$1"
 }
 
 install_all() {
     make_user
     build_release
     install_settings
+    keep_accepted release
     switch_release
     install_units
     link_venv
-    keep_accepted
     install_rules
     install_modules
     reload
@@ -318,7 +318,7 @@ accept_settings() {
     flown=$settings/flight.yaml
     release=$prefix/current
     install_settings
-    keep_accepted
+    keep_accepted configuration
     reload
     say_next accepted
 }

@@ -19,7 +19,6 @@ import argparse
 import dataclasses
 import fcntl
 import hashlib
-import itertools
 import json
 import os
 import re
@@ -31,7 +30,6 @@ import time
 import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -171,10 +169,13 @@ def decoded(data: bytes) -> Any:
 
 def state_of(values: dict[str, Any]) -> State:
     """Return the state from the values of a record. Raises one of `_DAMAGED` for invalid values."""
-    state = State(**{**values, "trial": None})
-    if values["trial"] is not None:
-        state.trial = Trial(**values["trial"])
-    return state
+    trial = values["trial"] and Trial(**_known(Trial, values["trial"]))
+    return State(**{**_known(State, values), "trial": trial})
+
+
+def _known(shape: type, values: dict[str, Any]) -> dict[str, Any]:
+    """Return `values` without the attributes that only a later version of the class `shape` has."""
+    return {name: value for name, value in values.items() if name in shape.__annotations__}
 
 
 def open_beneath(folder: Path, parts: Sequence[str], most: int) -> BinaryIO:
@@ -235,6 +236,7 @@ class Board:
         link: state folder of the link.
         own: state folder of this program.
         kept: folder of the stored copies of configurations and catalogues.
+        configuration: path of the configuration that the flight reads.
     """
 
     def __init__(self, root: Path) -> None:
@@ -245,10 +247,7 @@ class Board:
         self.link = root / "var/lib/knightcube-link"
         self.own = root / "var/lib/knightcube-renewal"
         self.kept = self.own / "kept"
-
-    def configuration(self) -> Path:
-        """Return the path of the configuration that the flight reads."""
-        return self._settings / CONFIGURATION
+        self.configuration = self._settings / CONFIGURATION
 
     def roots(self) -> list[Path]:
         """Return the paths of the existing copies of the first root metadata."""
@@ -261,7 +260,7 @@ class Board:
         return {
             **{f"{unit}.conf": self._units / f"{unit}.service.d/board.conf" for unit in units},
             f"{CONFIGURATION}.sha256": self._settings / f"{CONFIGURATION}.sha256",
-            CONFIGURATION: self.configuration(),
+            CONFIGURATION: self.configuration,
         }
 
     def keep(self, name: str, folder: Path | None = None) -> str:
@@ -406,8 +405,7 @@ class Renewal:
     def __init__(self, board: Board, clock: Callable[[], float], boot: str) -> None:
         """Read the state of `board`. `clock` returns the time (s) since boot; `boot` identifies the boot."""
         self._board, self._clock, now = board, clock, clock()
-        self._state = self._read()
-        state = self._state
+        self._state = state = self._read()
         self._elapsed = now - state.at if state.boot == boot and now >= state.at else now
         state.boot, state.at = boot, now
         self._contact = self._read_contact()
@@ -480,6 +478,19 @@ class Renewal:
         self._age_note()
         self._save()
 
+    def accept(self, what: str) -> None:
+        """Store the accepted configuration, and end a trial or return that would undo what was installed."""
+        state, trial, ended = self._state, self._state.trial, self._state.returning[3:5]
+        if not self._board.keep(GROUND):
+            raise OSError(f"{self._board.configuration} cannot be read")
+        if trial is not None and what in {"release", trial.what}:
+            state.trial, ended = None, [trial.request, "activate"]
+            state.previous = trial.old if trial.what == "configuration" else state.previous
+        if ended:
+            self._report(ended[0], "failed", ended[1], "install.sh was run: its version stays")
+            state.returning = []
+            self._save()
+
     def _next_request(self) -> str:
         """Delete the executed requests, and return the name of the first other request, or an empty text.
 
@@ -513,13 +524,11 @@ class Renewal:
                 raise Refused(f"the board or the renewal program stopped {MOST_TRIES} times during it")
             if word == "restart":
                 self._restart(name, str(request["part"]))
-            elif kind not in KINDS:
-                raise Refused("the request is damaged")
-            elif word == "activate":
+            elif kind in KINDS and word == "activate":
                 self._activate(name, kind, request)
-            elif word == "confirm":
+            elif kind in KINDS and word == "confirm":
                 self._confirm(name, kind)
-            elif word == "withdraw":
+            elif kind in KINDS and word == "withdraw":
                 self._withdraw(name, kind)
             else:
                 raise Refused("the request is damaged")
@@ -602,11 +611,11 @@ class Renewal:
         kept = "/" / board.kept.relative_to(board.root)
         # One copy of the root metadata and one release may be damaged, so all combinations are tried.
         releases = filter(None, (board.release("current"), board.release("previous")))
-        for release, root in itertools.product(releases, board.roots()):
+        for release, root in ((release, root) for release in releases for root in board.roots()):
             for left in ("unpacked", "set", "source"):
                 shutil.rmtree(staging / left, ignore_errors=True)
             words = [program, board.own / "trusted", root, staging / "bundle", kind, staging]
-            words += [board.configuration(), kept, utc]
+            words += [board.configuration, kept, utc]
             done = board.run([board.python(release), "-I", "-B", *words], 600.0)
             if done.returncode == 0:
                 return dict(json.loads(done.stdout))
@@ -615,10 +624,9 @@ class Renewal:
 
     def _confirm(self, name: str, kind: str) -> None:
         """End the trial and keep the new version. Raises Refused if it cannot be confirmed."""
-        state, trial = self._state, self._state.trial
+        state, trial, board = self._state, self._state.trial, self._board
         if trial is None or trial.stage != "fly" or trial.kind != kind:
             raise Refused(f"no {kind} is on trial")
-        board = self._board
         if board.active(SAFE) or not (board.active(FLIGHT) and board.active(LINK)):
             raise Refused("flight or link is not running: confirm the trial when both run")
         if other := self._other_release(trial):
@@ -697,7 +705,7 @@ class Renewal:
             raise Refused((done.stderr.strip().splitlines() or ["the build failed"])[-1])
         name = done.stdout.split()[-1]
         dropin = Path(__file__).resolve().with_name("board_dropin.py")
-        checked = board.run([board.python(name), "-I", "-B", dropin, board.configuration()], 120.0)
+        checked = board.run([board.python(name), "-I", "-B", dropin, board.configuration], 120.0)
         if checked.returncode != 0:
             raise Refused(f"the release refuses the present configuration: {checked.stderr.strip()[-60:]}")
         return name
@@ -728,8 +736,7 @@ class Renewal:
             if trial.before:
                 board.point("previous", trial.before)
         text = f"{trial.kind} {trial.version}: {trial.problem}; {end}"
-        self._note(text)
-        state.trial = None
+        state.trial, state.note, state.note_s = None, text, 0.0
         self._report(trial.request, "failed", "activate", text)
         if trial.what == "configuration" or trial.new:  # no restart is necessary if the release was not built
             board.restart()  # if killed before the state is stored, this step is repeated
@@ -799,7 +806,7 @@ class Renewal:
             return
         else:
             self._report(request, "completed", word, text)
-            self._note(text)
+            state.note, state.note_s = text, 0.0
         state.returning = []
 
     def _count_silence(self) -> None:
@@ -826,10 +833,6 @@ class Renewal:
             # If this step has no version to return to, the timer's next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
-    def _note(self, text: str) -> None:
-        """Store a text that the flight reports as an event at its next start."""
-        self._state.note, self._state.note_s = text, 0.0
-
     def _age_note(self) -> None:
         """Delete the note for the flight once the flight has been active long enough to report it."""
         state = self._state
@@ -848,7 +851,7 @@ class Renewal:
                     (path / "manifest").unlink(missing_ok=True)
                     shutil.rmtree(path)
             texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
-            named = b"".join(path.read_bytes() for path in (*texts, board.configuration()) if path.is_file())
+            named = b"".join(path.read_bytes() for path in (*texts, board.configuration) if path.is_file())
             for path in board.kept.iterdir():
                 if path.name.startswith("index-"):
                     if path.name.encode() not in named:
@@ -866,12 +869,10 @@ def boot_id() -> str:
 
 def main(words: Sequence[str]) -> int:
     """Execute one run, and return the exit status."""
-    parser = argparse.ArgumentParser(
-        description="Execute one step of the renewal of software or files in orbit (docs/fly/renewal.md)."
-    )
+    parser = argparse.ArgumentParser(description="Execute one step of the renewal (docs/fly/renewal.md).")
     parser.add_argument("--root", type=Path, default=Path("/"), help="folder of the board's files")
     parser.add_argument("--now", type=float, help="time since boot (s) to assume, for tests")
-    parser.add_argument("--accepted", action="store_true", help="store the accepted configuration")
+    parser.add_argument("--accepted", choices=("configuration", "release"), help="what install.sh installs")
     parser.add_argument("--restart", action="store_true", help="restart the services as requested by a run")
     options = parser.parse_args(words)
     board = Board(options.root)
@@ -881,15 +882,13 @@ def main(words: Sequence[str]) -> int:
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
         except OSError:
             return 0  # an earlier run is still building a release
-        clock = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
         try:
             if options.restart:
                 board.restart_parts()
-            elif options.accepted:
-                if not board.keep(GROUND):
-                    raise OSError(f"{board.configuration()} cannot be read")
             else:
-                Renewal(board, clock if options.now is None else lambda: options.now, boot_id()).step()
+                now, clock = options.now, time.CLOCK_BOOTTIME
+                one = Renewal(board, lambda: time.clock_gettime(clock) if now is None else now, boot_id())
+                one.accept(options.accepted) if options.accepted else one.step()
         except OSError as error:
             sys.stderr.write(f"renewal: {error}\n")
             return 1

@@ -568,6 +568,46 @@ def test_the_state_survives_damage_to_one_of_its_copies(board: RenewedBoard, cop
     assert board.flown() == (before if len(copies) == 1 else "second"), "without any record the trial is lost"
 
 
+@pytest.mark.parametrize("part", ["state", "trial"])
+def test_a_record_of_a_later_version_keeps_the_trial(board: RenewedBoard, part: str) -> None:
+    """An earlier version of the program ignores the values that it does not know."""
+    before = board.flown()
+    activated(board)
+    for path in board.own.glob("state.?"):
+        values = decoded(path.read_bytes())
+        (values if part == "state" else values["trial"])["later"] = [1]
+        path.write_bytes(encoded(values))
+    board.step(4000.0)
+    assert board.flown() == before
+
+
+def test_an_accepted_configuration_is_not_replaced_at_the_end_of_a_trial(board: RenewedBoard) -> None:
+    before, request = board.flown(), activated(board)
+    board.run("--accepted", "configuration")
+    board.step(4000.0)
+    assert board.flown() == "second"
+    assert board.reports(request)[-1] == ("failed", "install.sh was run: its version stays")
+    board.request("withdraw")
+    board.step()
+    assert board.flown() == before, "the configuration before the trial is kept for the ground"
+
+
+@pytest.mark.parametrize(("accepted", "stays"), [("release", "third"), ("configuration", "first")])
+def test_a_trial_is_ended_by_an_installation_but_not_by_an_accepted_configuration(
+    board: RenewedBoard, accepted: str, stays: str
+) -> None:
+    board.files.install("first")
+    board.activate(board.bundle("release", board.source("second"), 1), "release")
+    board.step()
+    assert board.release() == "second"
+    if accepted == "release":
+        board.files.install("third")
+    else:
+        board.run("--accepted", accepted)
+    board.step(4000.0)
+    assert board.release() == stays
+
+
 def test_one_failed_read_loses_no_state(board: RenewedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
     before = board.flown()
     activated(board)
