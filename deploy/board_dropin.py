@@ -32,8 +32,8 @@ SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
 """Driver classes of pluggable devices: serial lines, video devices, and no class for I2C buses."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 """Driver classes of the devices, by section of the configuration."""
-_PLAIN = re.compile(r"[A-Za-z0-9_./:+,@=-]+")
-"""Paths without a line break or another character that has a meaning in a unit file."""
+_PLAIN = re.compile(r"(?!.*/\.\.(/|$))/[A-Za-z0-9_./:+,@=-]+")
+"""Absolute paths without `..`, a line break or another character that has a meaning in a unit file."""
 
 
 def dropin(config: Config) -> str:
@@ -63,7 +63,7 @@ def link_dropin(config: Config, root: Path = Path("/")) -> str:
     link = config.link
     if link is None:
         return ""
-    lines = ["[Service]", f"ReadWritePaths=-{plain(str(Path(link.keys).absolute()))}"]
+    lines = ["[Service]", f"ReadWritePaths=-{plain(link.keys)}"]
     if peers := peer_networks(link):
         lines += _network(peers)
     if link.serial is not None:
@@ -78,19 +78,20 @@ def _line(device: str, root: Path) -> list[str]:
 
     If the serial line is built into the board, the service gets a private /dev that contains only this line.
     A pluggable or missing device may appear later as a new device file, which a private /dev would not
-    contain.
+    contain. BindPaths would split a path with a colon into two paths.
     """
-    opened = allowed(device, SERIAL, root)
-    return opened if len(opened) > 1 else [*opened, "PrivateDevices=yes", f"BindPaths={device}"]
+    opened, private = allowed(device, SERIAL, root), ["PrivateDevices=yes", f"BindPaths={device}"]
+    return opened if len(opened) > 1 or ":" in device else [*opened, *private]
 
 
 def plain(path: str) -> str:
     """Return a path of the configuration, which root writes to a unit file.
 
-    Raises UsageError for a path with a character that could change the meaning of the unit file.
+    Raises UsageError for a relative path, and for a path that could change the meaning of the unit file.
     """
     if not _PLAIN.fullmatch(path):
-        raise UsageError(f"{path!r}: a path of a board consists of letters, digits and _ . / : + , @ = -")
+        form = "absolute, has no `..`, and consists of letters, digits and _ . / : + , @ = -"
+        raise UsageError(f"{path!r}: a path of a board is {form}")
     return path
 
 

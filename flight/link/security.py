@@ -341,8 +341,9 @@ def _id_of(key: bytes) -> bytes:
     return hashlib.sha256(b"knightcube " + key).digest()[:_ID_BYTES]
 
 
-WINDOW = 65_536
-"""Largest accepted gap between the counter of a command frame and the lowest unused counter."""
+WINDOW = 2**40
+"""Largest accepted gap between the counter of a command frame and the lowest unused counter. A ground that
+sends 1000 frames per second to a satellite that receives none exceeds this gap after 34 years."""
 
 NEXT = "next"
 """Suffix of the name under which the next key of an SPI is stored during a key change."""

@@ -139,6 +139,9 @@ def test_the_unit_has_the_writes_that_switch_drv8830_bridges_off(tmp_path: Path)
         ("commands", "socket", "/run/%n"),
         ("link", "keys", "/keys\nUser=root"),
         ("link", "serial", {"device": "/dev/ttyS0\n"}),
+        ("link", "serial", {"device": "/dev/../dev/ttyS0"}),
+        ("link", "keys", "keys/satellite"),
+        ("commands", "socket", "run/.."),
         ("coils", "bus", "/dev/i2c-1\n"),
         ("inertial_unit", "device", "/dev/imu\nUser=root"),
     ],
@@ -155,4 +158,4 @@ def test_no_path_of_a_configuration_adds_a_setting_to_a_unit(
     tree[section][key] = value
     changed.write_text(yaml.safe_dump(tree), encoding="utf-8")
     assert board_dropin.main([str(changed), str(tmp_path)]) == 2
-    assert "a path of a board consists of" in capsys.readouterr().err
+    assert "a path of a board is absolute, has no `..`, and consists of" in capsys.readouterr().err

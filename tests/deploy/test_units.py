@@ -317,6 +317,16 @@ def test_the_link_sees_only_its_line_unless_the_device_of_the_line_is_pluggable(
     assert "DeviceAllow=/dev/null rw\nPrivateDevices=yes\nBindPaths=/dev/null\n" in soldered
 
 
+def test_a_serial_line_whose_name_has_a_colon_is_not_bound_as_two_paths(tmp_path: Path) -> None:
+    line = tmp_path / "pci-0000:00:1e.0"
+    line.symlink_to("/dev/null")
+    made = changed_testbed(tmp_path, commands="{socket: /run/x}", link=LINK.replace("/dev/null", f"'{line}'"))
+    text = link_dropin(made, board(tmp_path, "pci0000:00/0000:00:1e.0/tty/ttyS4"))
+    assert f"DeviceAllow={line} rw\n" in text
+    assert "BindPaths" not in text
+    assert "PrivateDevices" not in text, "a private /dev without the line has no radio"
+
+
 def test_absent_devices_are_permitted_by_their_possible_classes(tmp_path: Path) -> None:
     text = dropin(changed_testbed(tmp_path, camera=CAMERA))
     for name in ("ttyUSB", "ttyACM", "video4linux"):

@@ -75,6 +75,8 @@ MOST_RECEIVED = 256 << 20
 """Maximum total size (bytes) of all received files."""
 LISTING = "listing.json"
 _PORTION = 1 << 20
+MOST_WAITING = 16
+"""Maximum numbers of files that wait for their check, and of requests that wait for the renewal program."""
 
 
 class Filing:
@@ -171,6 +173,10 @@ class Filing:
         """
         try:
             path = self._received(use.name)
+            if len(self._checks) >= MOST_WAITING:
+                raise FileError(f"{MOST_WAITING} files wait for their check: send the command again later")
+            if path.stat().st_size > self._store.room():
+                raise FileError("the disk has no room for the selected copy: delete files")
         except (FileError, OSError) as error:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
         self._checks.append((done, self._choosing(path, use.name, use.sum, then)))
@@ -247,13 +253,17 @@ class Filing:
         folder = self._folder / "chosen" / kind
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         beside = folder.with_name(f"{kind}~")
-        with path.open("rb") as file, beside.open("wb") as copy:
-            while data := file.read(_PORTION):
-                digest.update(data)
-                copy.write(data)
-                yield None
-            copy.flush()
-            os.fsync(copy.fileno())
+        try:
+            with path.open("rb") as file, beside.open("wb") as copy:
+                while data := file.read(_PORTION):
+                    digest.update(data)
+                    copy.write(data)
+                    yield None
+                copy.flush()
+                os.fsync(copy.fileno())
+        except OSError:
+            beside.unlink(missing_ok=True)
+            raise
         if digest.digest() != wanted:
             beside.unlink()
             yield f"{name}: its SHA-256 is {digest.hexdigest()}"
@@ -350,6 +360,9 @@ class Renewal:
             values["kind"] = KINDS[directive.kind]
         with suppress(OSError, FileError):
             self._folder.mkdir(mode=0o700, exist_ok=True)
+            # The other files of the folder are `contact`, `reported` and remains of interrupted writes.
+            if sum(other[-1:].isdigit() for other in os.listdir(self._folder)) >= MOST_WAITING:
+                return f"{MOST_WAITING} requests wait for the renewal program, which executes one every 10 s"
             write_whole(self._folder / name, encoded(values))  # the program never reads an incomplete request
             return ""
         return "the request could not be stored"

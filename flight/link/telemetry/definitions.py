@@ -696,7 +696,7 @@ LINK = _packet(
     counter("refused_lost", "frames refused because both copies of the counter of their SPI are lost"),
     counter("refused_mac", "frames refused because of a wrong MAC, for example a forgery or an old key"),
     counter("refused_repeated", "frames refused because their counter was used before"),
-    counter("refused_beyond", "frames refused because their counter is 65,536 or more ahead"),
+    counter("refused_beyond", "frames refused because their counter is 2^40 or more ahead"),
     counter("refused_unstored", "frames refused because their counter could not be stored"),
     counter(
         "refused_command", "accepted frames without a command, without an answer, or refused by the flight"

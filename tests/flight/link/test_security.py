@@ -128,12 +128,24 @@ def test_a_frame_is_accepted_once_and_forged_frames_are_refused_with_their_cause
     assert entrance.admitted == 2
 
 
-def test_the_window_reaches_65536_ahead(sky: Vault, ground: Vault) -> None:
+def test_a_satellite_that_received_nothing_for_years_accepts_the_next_command(
+    sky: Vault, ground: Vault
+) -> None:
+    """A month of the fastest frames on a serial line, or decades of the gateway's pings, are lost."""
+    skip(ground, 30 * 86_400 * 1000)
+    assert gate(sky).admit(Ground(ground).frame(b"command")).spi == 1
+
+
+def test_the_window_is_limited_and_the_reserve_sets_a_key_beyond_it(sky: Vault, ground: Vault) -> None:
     entrance = gate(sky)
     skip(ground, WINDOW - 1)
     assert entrance.admit(Ground(ground).frame(b"last of the window")).counter == WINDOW - 1
     skip(ground, WINDOW)
     assert cause(entrance, Ground(ground).frame(b"one too far")) is Refusal.BEYOND
+    assert entrance.admit(Ground(ground, 2).frame(b"by the reserve")).spi == 2
+    assert entrance.replace_key(1, 2, bytes(32))
+    ground.write(sky.read(1) or pytest.fail("it was written"))
+    assert entrance.admit(Ground(ground).frame(b"new")).counter == 0
 
 
 def skip(at: Vault, count: int) -> None:

@@ -13,10 +13,12 @@ import pytest
 
 from flight.link import events
 from flight.link.events import Mode
+from flight.link.files.store import Store
 from flight.link.process import filing
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
-from flight.link.process.filing import Renewal, decoded, encoded
+from flight.link.process.filing import MOST_WAITING, Renewal, decoded, encoded
+from flight.link.security import Vault
 from flight.link.telemetry.definitions import EVENT, FIX
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
@@ -162,6 +164,52 @@ def test_confirmation_and_withdrawal_are_requests(ends: Ends) -> None:
         {"do": "confirm", "kind": "release"},
         {"do": "withdraw", "kind": "elements"},
     ]
+
+
+def test_requests_that_nobody_executes_do_not_fill_the_disk(ends: Ends) -> None:
+    for _ in range(MOST_WAITING + 1):
+        ends.ask(Confirm(0))
+        ends.turn(1.0)
+    found = stages(ends, "confirm")
+    assert [stage for stage, _ in found if stage != "accepted"] == ["started"] * MOST_WAITING + ["failed"]
+    assert "16 requests wait for the renewal program" in found[-1][1]
+    assert len(ends.requests()) == MOST_WAITING
+    (ends.place / "keys/renewal" / next(iter(ends.requests()))).unlink()
+    ends.ask(Confirm(0))
+    ends.turn(1.0)
+    assert stages(ends, "confirm")[-1][0] == "started"
+
+
+def test_checks_of_bundles_are_limited_in_number_and_by_the_disk(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directive = put(ends)
+    for _ in range(MOST_WAITING + 1):
+        ends.ask(directive)
+    ends.turn(2.0)
+    failures = [text for stage, text in stages(ends, "activate") if stage == "failed"]
+    assert failures == ["16 files wait for their check: send the command again later"]
+    monkeypatch.setattr(Store, "room", lambda _: len(DATA) - 1)
+    ends.ask(directive)
+    ends.turn(2.0)
+    assert stages(ends, "activate")[-1] == (
+        "failed", "the disk has no room for the selected copy: delete files"
+    )  # fmt: skip
+
+
+def test_a_copy_for_a_check_that_fails_leaves_no_file(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    directive = put(ends)
+
+    def fail(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "fsync", fail)
+        broken.setattr(Vault, "advance", lambda *_: 2)
+        ends.ask(directive)
+        ends.turn(1.0)
+    assert "No space left" in stages(ends, "activate")[-1][1]
+    assert not list((ends.place / "keys/files/chosen").glob("*~"))
 
 
 def test_a_board_without_the_privileged_program_refuses(ends: Ends) -> None:
