@@ -29,7 +29,7 @@ import tarfile
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Self
 
 import yaml
 from tuf.api.exceptions import DownloadError, DownloadHTTPError, RepositoryError
@@ -45,6 +45,12 @@ from knightcube.errors import UsageError
 
 LARGEST_METADATA, LARGEST_TARGET, MOST_MEMBERS = 1 << 19, 1 << 28, 300
 """Maximum sizes (bytes) of a metadata file and of an artefact, and maximum number of files in a bundle."""
+LARGEST = {"configuration": 1 << 20, "elements": 1 << 16}
+"""Maximum sizes (bytes) of the artefacts that are read as a whole; for other kinds `LARGEST_TARGET`."""
+MOST_SOURCES = 20_000
+"""Maximum number of files and folders in the sources of a release."""
+MOST_MEMORY = 1 << 27
+"""Maximum memory (bytes) for unpacking a bundle. The xz preset 9 needs 65 MiB."""
 _METADATA = re.compile(r"metadata/(\d{1,6}\.root|timestamp|snapshot|targets)\.json")
 _VALUES = {"elements": ("elements",), "catalogue": ("camera", "star_tracker", "index")}
 """Key path of the configuration value that an artefact replaces, by the kind of the artefact."""
@@ -62,26 +68,67 @@ class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may 
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         try:
-            data = (self._folder / url).read_bytes()
+            file = (self._folder / url).open("rb")
         except OSError as error:
             raise DownloadHTTPError(f"{url} is not in the bundle", 404) from error
-        return iter([data])
+        with file:
+            while data := file.read(1 << 20):
+                yield data
+
+
+class _Content:
+    """Reader of an xz file, which raises LZMAError if the file needs more memory than `MOST_MEMORY`."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._decoder = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=MOST_MEMORY)
+
+    def read(self, size: int) -> bytes:
+        """Return the next `size` bytes, or fewer at the end. Raises EOFError if the file is incomplete."""
+        data = b""
+        while len(data) < size and not self._decoder.eof:
+            packed = self._file.read(1 << 16) if self._decoder.needs_input else b""
+            if self._decoder.needs_input and not packed:
+                raise EOFError("its end is missing")
+            data += self._decoder.decompress(packed, size - len(data))
+        return data
+
+
+class _Member(tarfile.TarInfo):
+    """Header of a file. Other headers are refused before tarfile reads their values, of any length."""
+
+    @classmethod
+    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
+        """Return the header in a block of the archive."""
+        member = super().frombuf(buf, encoding, errors)
+        if member.type not in {tarfile.REGTYPE, tarfile.AREGTYPE}:
+            raise Refused(f"the bundle contains {member.name!r}, which is not a file")
+        return member
 
 
 def unpack(bundle: Path, kind: str, folder: Path) -> None:
-    """Unpack the metadata and the artefact of a bundle into a folder. Raises Refused for unexpected files."""
+    """Unpack the metadata and the artefact of a bundle into a folder.
+
+    Raises Refused for unexpected, repeated or too large files.
+    """
     (folder / "metadata").mkdir(parents=True)
     (folder / "targets").mkdir()
     try:
-        with tarfile.open(bundle, "r|xz") as archive:
+        with (
+            bundle.open("rb") as packed,
+            tarfile.open(fileobj=_Content(packed), mode="r|", tarinfo=_Member) as archive,
+        ):
             for number, member in enumerate(archive):
-                largest = LARGEST_METADATA if _METADATA.fullmatch(member.name) else LARGEST_TARGET
-                known = largest == LARGEST_METADATA or member.name == f"targets/{kind}"
-                if number >= MOST_MEMBERS or not known or not member.isreg() or member.size > largest:
+                path, metadata = folder / member.name, _METADATA.fullmatch(member.name)
+                known = metadata or member.name == f"targets/{kind}"
+                if number >= MOST_MEMBERS or not known or path.exists():
                     raise Refused(f"the bundle contains {member.name!r}, which is not part of a {kind}")
+                largest = LARGEST_METADATA if metadata else LARGEST.get(kind, LARGEST_TARGET)
+                if member.size > largest:
+                    raise Refused(f"{member.name} has {member.size} bytes: at most {largest} are permitted")
                 content = archive.extractfile(member)
                 assert content is not None
-                with (folder / member.name).open("wb") as file:
+                with path.open("wb") as file:
                     while data := content.read(1 << 20):
                         file.write(data)
     except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
@@ -89,20 +136,23 @@ def unpack(bundle: Path, kind: str, folder: Path) -> None:
 
 
 def unpack_sources(archive: Path, folder: Path) -> None:
-    """Unpack the regular files and folders of a release.
+    """Unpack the regular files and folders of a release, a tar archive without compression.
 
-    Raises Refused for members of any other type, and OSError.
+    The unpacked files are at most as large as the archive, because sparse files are refused. Raises Refused
+    for sparse files, members of any other type, and too many members, and OSError.
     """
     folder.mkdir()
     try:
-        with tarfile.open(archive, "r:*") as files:
-            for member in files:
+        with tarfile.open(archive, "r:") as files:
+            for number, member in enumerate(files):
+                if number >= MOST_SOURCES:
+                    raise Refused(f"the release contains more than {MOST_SOURCES} files and folders")
                 path = folder / member.name
                 if member.name.startswith("/") or ".." in Path(member.name).parts:
                     raise Refused(f"the release contains {member.name!r}")
                 if member.isdir():
                     path.mkdir(parents=True, exist_ok=True)
-                elif member.isreg():
+                elif member.isreg() and not member.issparse():
                     path.parent.mkdir(parents=True, exist_ok=True)
                     content = files.extractfile(member)
                     assert content is not None

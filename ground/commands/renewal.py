@@ -25,6 +25,7 @@ from flight.link.files.store import locked, make_lasting
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import KINDS, Activate, Confirm, Directive, Withdraw
+from flight.link.process.filing import LARGEST_UP
 from flight.link.security import COMMAND_SPIS
 from flight.loop.state import LinuxFiles, replace_file
 from flight.schema.document import read_document, read_text
@@ -44,6 +45,7 @@ _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
 _LAST_VERSION = 10**12 - 1
 """Highest version that is signed: 12 digits, enough for a date with hours and minutes."""
 _TARGETS = tuple(f"targets/{kind}" for kind in KINDS)  # names of the artefacts in a bundle
+_LARGEST = 1 << 28  # size (bytes) of the largest artefact that deploy/open_bundle.py unpacks
 _TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0
 """Default times (s) to wait for the privileged part, which runs every 10 s, and for a release to be built."""
 
@@ -223,7 +225,11 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
     }
     bundle: Path = options.out / f"{kind}-{options.version}.renewal"
     unnamed = bundle.with_name(f"{bundle.name}.part")
-    replace_file(LinuxFiles(), unnamed, _bundle({**files, **new}, kind, data))
+    packed = _bundle({**files, **new}, kind, data)
+    if len(data) > _LARGEST or len(packed) > LARGEST_UP:
+        problem = f"at most {_LARGEST} bytes, {LARGEST_UP} in a bundle, are accepted on board: remove files"
+        raise UsageError(f"{kind}: has {len(data)} bytes, {len(packed)} in a bundle: {problem}")
+    replace_file(LinuxFiles(), unnamed, packed)
     for name, content in new.items():
         replace_file(LinuxFiles(), folder / "metadata" / name, content)
     unnamed.replace(bundle)
@@ -335,7 +341,7 @@ def _release_version(kind: str, source: Path) -> int:
 
 
 def _packed(source: Path) -> bytes:
-    """Return the sources of a release as a compressed tar archive. Raises UsageError."""
+    """Return the sources of a release as a tar archive. Raises UsageError."""
     if not (source / "deploy/build_release.py").is_file():
         raise UsageError(f"{source}: is not the folder of this software's sources")
 

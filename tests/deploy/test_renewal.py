@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import shutil
 import subprocess
@@ -772,6 +773,65 @@ def test_a_copy_that_cannot_be_stored_leaves_the_earlier_copy(
         place.keep("ground")
     assert before is not None
     assert place.stored("ground") == before
+
+
+def _bundle_of(path: Path, *names: str, size: int = 0, **headers: str) -> Path:
+    """Write an unsigned bundle with files of zeros; `headers` are written into extended headers."""
+    with tarfile.open(path, "w:xz") as archive:
+        for name in names:
+            member = tarfile.TarInfo(name)
+            member.size, member.pax_headers = size, headers
+            archive.addfile(member, io.BytesIO(bytes(size)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("names", "size", "headers", "memory", "words"),
+    [
+        (["targets/release"], 1 << 21, {}, 1 << 27, ""),
+        (["targets/release"], (1 << 21) + 1, {}, 1 << 27, "at most 2097152 are permitted"),
+        (["targets/configuration"], (1 << 20) + 1, {}, 1 << 27, "at most 1048576 are permitted"),
+        (["metadata/1.root.json"], (1 << 19) + 1, {}, 1 << 27, "at most 524288 are permitted"),
+        (["targets/release"] * 2, 9, {}, 1 << 27, "contains 'targets/release', which is not part"),
+        (["targets/release"], 9, {"comment": "x" * (1 << 20)}, 1 << 27, "which is not a file"),
+        (["targets/release"], 9, {}, 1 << 22, "the bundle is damaged: Memory usage limit exceeded"),
+    ],
+)
+def test_an_unsigned_bundle_exhausts_neither_memory_nor_disk(
+    names: list[str], size: int, headers: dict[str, str], memory: int, words: str, tmp_path: Path
+) -> None:
+    open_bundle = script("open_bundle")
+    bundle, kind = _bundle_of(tmp_path / "bundle", *names, size=size, **headers), names[0].partition("/")[2]
+    with (
+        patch.multiple(open_bundle, MOST_MEMORY=memory, LARGEST_TARGET=1 << 21),
+        pytest.raises(open_bundle.Refused, match=words) if words else contextlib.nullcontext(),
+    ):
+        open_bundle.unpack(bundle, kind, tmp_path / "unpacked")
+    written = sum(path.stat().st_size for path in tmp_path.rglob("unpacked/*/*"))
+    assert written == (9 if len(names) == 2 else 0 if words else size)
+
+
+def test_sources_are_not_larger_than_their_archive_and_limited_in_number(tmp_path: Path) -> None:
+    open_bundle = script("open_bundle")
+    sparse = tarfile.TarInfo("sparse")
+    sparse.type = tarfile.GNUTYPE_SPARSE
+    for name, members in (("a", [sparse]), ("b", [tarfile.TarInfo(f"file{number}") for number in range(3)])):
+        with tarfile.open(tmp_path / name, "w") as archive:
+            for member in members:
+                archive.addfile(member)
+    with tarfile.open(tmp_path / "c", "w:xz") as archive:
+        archive.addfile(tarfile.TarInfo("file"))
+    with pytest.raises(open_bundle.Refused, match="'sparse', which is neither a file nor a folder"):
+        open_bundle.unpack_sources(tmp_path / "a", tmp_path / "source-a")
+    with patch.object(open_bundle, "MOST_SOURCES", 3):
+        open_bundle.unpack_sources(tmp_path / "b", tmp_path / "source-b")
+    with (
+        patch.object(open_bundle, "MOST_SOURCES", 2),
+        pytest.raises(open_bundle.Refused, match="contains more than 2 files and folders"),
+    ):
+        open_bundle.unpack_sources(tmp_path / "b", tmp_path / "source-c")
+    with pytest.raises(open_bundle.Refused, match="the release is damaged"):
+        open_bundle.unpack_sources(tmp_path / "c", tmp_path / "source-d")
 
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE])

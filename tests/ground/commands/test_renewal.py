@@ -86,6 +86,19 @@ def test_without_a_usable_version_the_option_is_asked_for(
     assert not list(tmp_path.glob("*.renewal"))
 
 
+@pytest.mark.parametrize("limit", ["_LARGEST", "LARGEST_UP"])
+def test_a_release_that_is_too_large_for_the_board_is_not_signed(
+    signing: Path, tmp_path: Path, limit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = _sources(tmp_path / "source", "1.2.3")
+    monkeypatch.setattr(renewal, limit, 1000)
+    done = command("renewal", "sign", signing, "release", source, "--out", tmp_path / "out")
+    assert (done.returncode, "are accepted on board: remove files" in done.stderr) == (2, True), done.stderr
+    monkeypatch.undo()
+    assert list((tmp_path / "out").iterdir()) == []
+    assert not (signing / "metadata/targets.json").exists(), "no version is used up"
+
+
 def test_keys_are_readable_by_their_owner_only_and_never_overwritten(signing: Path) -> None:
     keys = sorted(signing.glob("*.pem"))
     assert [key.name for key in keys] == ["root-1.pem", "root-2.pem", "signing.pem"]
