@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from flight.bodies.testbed.control import about_thread
 from knightcube.astro.arrays import FloatArray
@@ -88,11 +87,10 @@ def test_without_currents_the_two_filters_agree_to_rounding() -> None:
 
 
 def test_with_driven_coils_the_filters_differ_by_terms_that_the_single_axis_filter_omits() -> None:
-    """With driven coils, the covariances of the three-axis and the single-axis filter differ by 0.5 %.
+    """With driven coils, estimates and covariances of the two filters differ by 0.1 to 0.5 % of a sigma.
 
     The single-axis filter ignores in its covariance that the torque changes with the angle.
     """
     states, covariances = largest_difference(driven=True)
-    assert states < 5e-3
-    assert covariances < 5e-3
-    assert states == pytest.approx(2e-3, abs=3e-3)
+    assert 1e-3 < states < 5e-3
+    assert 1e-3 < covariances < 5e-3
