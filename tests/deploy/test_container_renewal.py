@@ -14,34 +14,36 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON),
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def observations(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return container.boot(tmp_path_factory.mktemp("machine"), container.RENEWALS)
 
 
-def test_the_ground_reaches_the_board(seen: dict[str, Any]) -> None:
-    status, printed = seen["ping"]
+def test_the_ground_reaches_the_board(observations: dict[str, Any]) -> None:
+    status, printed = observations["ping"]
     assert status == 0, printed
 
 
 @pytest.mark.parametrize("kind", ["configuration", "release"])
-def test_each_command_of_a_renewal_succeeds(seen: dict[str, Any], kind: str) -> None:
+def test_each_command_of_a_renewal_succeeds(observations: dict[str, Any], kind: str) -> None:
     for step in ("sign", "put", "activate", "confirm"):
-        status, printed = seen[kind]["steps"][step]
+        status, printed = observations[kind]["steps"][step]
         assert status == 0, f"{step}: {printed}"
 
 
-def test_the_new_configuration_is_flown(seen: dict[str, Any]) -> None:
-    assert seen["configuration"]["is_second"]
+def test_the_new_configuration_is_flown(observations: dict[str, Any]) -> None:
+    assert observations["configuration"]["is_second"]
 
 
-def test_flight_and_link_run_the_new_release(seen: dict[str, Any]) -> None:
-    (first, _), flown = seen["first"], seen["release"]["flown"]
+def test_flight_and_link_run_the_new_release(observations: dict[str, Any]) -> None:
+    (first, _), flown = observations["first"], observations["release"]["flown"]
     assert re.fullmatch(r"\d+\.\d+\.\d+\+1", first)
     assert flown == [flown[0]] * 2
     assert flown[0].endswith("+2")
 
 
-def test_a_release_whose_service_does_not_fly_gives_way_to_the_previous_one(seen: dict[str, Any]) -> None:
-    status, printed = seen["broken"]["steps"]["activate"]
-    assert status != 0 or seen["broken"]["steps"]["confirm"][0] != 0, printed
-    assert seen["broken"]["flown"] == seen["release"]["flown"]
+def test_a_release_whose_service_does_not_fly_gives_way_to_the_previous_one(
+    observations: dict[str, Any],
+) -> None:
+    status, printed = observations["broken"]["steps"]["activate"]
+    assert status != 0 or observations["broken"]["steps"]["confirm"][0] != 0, printed
+    assert observations["broken"]["flown"] == observations["release"]["flown"]

@@ -44,7 +44,7 @@ def flown(fault: str, folder: Path, duration: float, initial: str = "testbed-dem
             wishes.append(np.zeros(3))
             zero()
 
-        drive.send, drive.zero = sent, zeroed  # type: ignore[method-assign]  # only listens
+        drive.send, drive.zero = sent, zeroed  # type: ignore[method-assign]  # records and passes the call on
 
     config = demo_config(duration, camera=False)
     config = replace(config, modes=replace(Modes(), initial=initial))

@@ -99,7 +99,7 @@ def test_no_coil_carries_current_a_tenth_of_a_second_after_the_last_usable_readi
         circuit = rigged.lock.hardware.circuit
         for name, begin in begins.items():
             start, end = LOSSES[name]
-            rigged.at(begin, lambda start=start: start(rigged))  # type: ignore[misc]  # the name of now
+            rigged.at(begin, lambda start=start: start(rigged))  # type: ignore[misc]  # a lambda with a default
             for k in range(400):
                 look = carried[name].append
                 rigged.at(begin + 1e-3 * k, lambda look=look: look(np.abs(circuit.currents()).max()))  # type: ignore[misc]

@@ -51,7 +51,7 @@ def test_a_control_task_that_fails_zeroes_the_coils_in_that_cycle_and_flies_on(t
                 raise ZeroDivisionError("a defect")
             return receive()
 
-        port.receive = fail_for_a_second  # type: ignore[method-assign]  # the defect is the test
+        port.receive = fail_for_a_second  # type: ignore[method-assign]  # a replaced method
 
     run = fly(demo_config(6.0, camera=False), tmp_path, prepare)
     assert "task-failed" in event_names(run)

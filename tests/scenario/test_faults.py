@@ -304,7 +304,7 @@ def test_a_stall_of_the_loop_is_counted_once_and_the_flight_continues(tmp_path: 
                 clock.sleep_until_ns(clock.now_ns() + 1_000_000_000)
             return poll()
 
-        camera.poll = stall  # type: ignore[method-assign,assignment]  # the stall is the test
+        camera.poll = stall  # type: ignore[method-assign,assignment]  # a replaced method
 
     run = fly(config_for("testbed-demo", camera=True, duration=6.0), tmp_path, prepare)
     names = event_names(run)

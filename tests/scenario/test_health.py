@@ -46,7 +46,7 @@ def failing(rigged: Rigged, since: float, until: float) -> None:
             raise ZeroDivisionError("a defect")
         return receive()
 
-    host.receive = fail  # type: ignore[method-assign]  # the defect is the test
+    host.receive = fail  # type: ignore[method-assign]  # a replaced method
 
 
 def last(run: Run, field: str) -> float:

@@ -13,7 +13,7 @@ from tests.manual_clock import ManualClock
 SECOND = 1_000_000_000
 
 
-def left(inhibit: SeparationInhibit, folder: Path, seconds: float = 100.0) -> float:
+def remaining_time(inhibit: SeparationInhibit, folder: Path, seconds: float = 100.0) -> float:
     """Return the remaining time (s) of the inhibit, or 0 after its end."""
     try:
         inhibit.check(folder, seconds)
@@ -27,10 +27,10 @@ def test_time_without_power_does_not_count_and_a_restart_begins_nothing_again(tm
     for expected in (70.0, 40.0, 10.0, 0.0):
         inhibit = SeparationInhibit(clock)
         clock.advance(30 * SECOND)
-        assert left(inhibit, tmp_path / "state") == expected
+        assert remaining_time(inhibit, tmp_path / "state") == expected
         clock.advance(500 * SECOND)  # this time is not counted, because the power fails before the next check
     clock = ManualClock()  # a new start, years later
-    assert left(SeparationInhibit(clock), tmp_path / "state") == 0.0
+    assert remaining_time(SeparationInhibit(clock), tmp_path / "state") == 0.0
 
 
 def test_without_an_inhibit_nothing_is_stored(tmp_path: Path) -> None:
@@ -42,12 +42,12 @@ def test_any_damage_of_the_record_begins_the_inhibit_again(tmp_path: Path) -> No
     clock = ManualClock()
     inhibit = SeparationInhibit(clock)
     clock.advance(60 * SECOND)
-    assert left(inhibit, tmp_path) == 40.0
+    assert remaining_time(inhibit, tmp_path) == 40.0
     record = (tmp_path / "powered").read_bytes()
     for position in range(len(record)):
         damaged = record[:position] + bytes([record[position] ^ 1]) + record[position + 1 :]
         (tmp_path / "powered").write_bytes(damaged)
-        assert left(SeparationInhibit(clock), tmp_path) == 100.0
+        assert remaining_time(SeparationInhibit(clock), tmp_path) == 100.0
 
 
 def test_a_disk_that_cannot_be_written_does_not_prolong_a_boot(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_disk_that_cannot_be_written_does_not_prolong_a_boot(tmp_path: Path) -
     inhibit = SeparationInhibit(clock)
     for expected in (50.0, 0.0):
         clock.advance(50 * SECOND)
-        assert left(inhibit, tmp_path / "file" / "state") == expected
+        assert remaining_time(inhibit, tmp_path / "file" / "state") == expected
 
 
 def test_one_failed_read_does_not_begin_the_inhibit_again(
@@ -65,7 +65,7 @@ def test_one_failed_read_does_not_begin_the_inhibit_again(
     clock = ManualClock()
     inhibit = SeparationInhibit(clock)
     clock.advance(60 * SECOND)
-    assert left(inhibit, tmp_path) == 40.0
+    assert remaining_time(inhibit, tmp_path) == 40.0
     read, failures = os.read, [OSError(5, "Input/output error")]
 
     def fail(file: int, size: int) -> bytes:
@@ -74,4 +74,4 @@ def test_one_failed_read_does_not_begin_the_inhibit_again(
         return read(file, size)
 
     monkeypatch.setattr(os, "read", fail)
-    assert left(SeparationInhibit(clock), tmp_path) == 40.0
+    assert remaining_time(SeparationInhibit(clock), tmp_path) == 40.0

@@ -34,7 +34,7 @@ SETTINGS = Health(look_period=5.0, warm_up=20.0, slope_window=100.0)
 
 def sample(seconds: float, **changes: float) -> ResourceSample:
     sound = ResourceSample(round(seconds * 1e9), 0.2 * seconds, 80 * MIB, 150 * MIB, 1e10, 45.0)
-    return replace(sound, **changes)  # type: ignore[arg-type]  # never the time
+    return replace(sound, **changes)  # type: ignore[arg-type]  # the time is not read
 
 
 def watched(samples: list[ResourceSample]) -> tuple[ResourceMonitor, EventRecord]:
@@ -116,7 +116,7 @@ class TwoClocks:
 
 def test_a_step_of_the_wall_clock_is_seen_either_way_and_slow_drift_is_not() -> None:
     clocks = TwoClocks()
-    watch = ClockWatch(clocks)  # type: ignore[arg-type]  # of a clock it asks the time only
+    watch = ClockWatch(clocks)  # type: ignore[arg-type]  # only the time is read
     seen = []
     for k in range(200):
         clocks.go(0.25, drift=2e-4)
@@ -164,7 +164,7 @@ def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_noth
     assert math.isnan(nothing.disk_free)
 
 
-def grown(count: int, window: float = 30.0) -> float:
+def measured_slope(count: int, window: float = 30.0) -> float:
     """Return the measured slope of a memory that grows by 5 kB/s, from `count` samples 5 s apart."""
     monitor = ResourceMonitor(Health(look_period=5.0, warm_up=0.0, slope_window=window))
     for k in range(count):
@@ -173,10 +173,10 @@ def grown(count: int, window: float = 30.0) -> float:
 
 
 def test_a_slope_needs_eight_samples_and_its_window() -> None:
-    assert math.isnan(grown(7))
-    assert grown(8) == pytest.approx(5e3)
-    assert math.isnan(grown(8, 35.1))
-    assert grown(8, 35.0) == pytest.approx(5e3)
+    assert math.isnan(measured_slope(7))
+    assert measured_slope(8) == pytest.approx(5e3)
+    assert math.isnan(measured_slope(8, 35.1))
+    assert measured_slope(8, 35.0) == pytest.approx(5e3)
 
 
 def test_an_hour_of_samples_is_kept() -> None:
@@ -219,7 +219,7 @@ def test_the_share_of_the_processor_is_that_between_two_samples() -> None:
 @pytest.mark.parametrize(("step_ns", "seen"), [(500_000_000, False), (500_000_001, True)])
 def test_a_step_of_more_than_half_a_second_is_reported(step_ns: int, seen: bool) -> None:
     clocks = TwoClocks()
-    watch = ClockWatch(clocks)  # type: ignore[arg-type]  # of a clock it asks the time only
+    watch = ClockWatch(clocks)  # type: ignore[arg-type]  # only the time is read
     assert watch.look() is None
     clocks.wall_ns -= step_ns
     assert (watch.look() is not None) is seen

@@ -170,7 +170,7 @@ def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
         os.kill(old, 0)
 
 
-def hear(runner: ProcessRunner, name: str, change: WorkerChange) -> WorkerNews:
+def first_report(runner: ProcessRunner, name: str, change: WorkerChange) -> WorkerNews:
     """Return the first report of a given change of a worker's state, as the health task receives it."""
     deadline = time.monotonic() + 300.0
     while time.monotonic() < deadline:
@@ -185,10 +185,10 @@ def test_a_worker_that_dies_is_reported_and_replaced_at_work_or_idle(processes: 
     assert processes.submit("die", None)
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("die", "died")
-    assert "status 3" in hear(processes, "die", WorkerChange.DIED).text
+    assert "status 3" in first_report(processes, "die", WorkerChange.DIED).text
     os.kill(started(processes, "double"), signal.SIGKILL)
-    assert "signal 9" in hear(processes, "double", WorkerChange.DIED).text
-    hear(processes, "double", WorkerChange.READY)
+    assert "signal 9" in first_report(processes, "double", WorkerChange.DIED).text
+    first_report(processes, "double", WorkerChange.READY)
     assert processes.collect() == [], "no job was lost"
     assert processes.submit("double", 3)
     assert wait(processes)[0].value == 6
@@ -202,8 +202,8 @@ def test_a_worker_that_is_stopped_is_reported_and_replaced_idle_or_starting(whil
             assert runner.submit("double", 1)
             assert wait(runner)[0].value == 2
         os.kill(stopped, signal.SIGSTOP)
-        assert "stopped by a signal" in hear(runner, "double", WorkerChange.DIED).text
-        hear(runner, "double", WorkerChange.READY)
+        assert "stopped by a signal" in first_report(runner, "double", WorkerChange.DIED).text
+        first_report(runner, "double", WorkerChange.READY)
         assert started(runner, "double") != stopped
 
 
@@ -215,8 +215,8 @@ def test_a_worker_that_cannot_start_takes_no_jobs_and_costs_the_control_thread_n
         begun = time.thread_time()
         assert runner.submit("nowhere", 1)
         assert wait(runner)[0].outcome == "died"
-        assert "status 1" in hear(runner, "nowhere", WorkerChange.DIED).text
-        hear(runner, "nowhere", WorkerChange.DIED)
+        assert "status 1" in first_report(runner, "nowhere", WorkerChange.DIED).text
+        first_report(runner, "nowhere", WorkerChange.DIED)
         assert not runner.submit("nowhere", 2)
         assert time.thread_time() - begun < 0.5, "it polls 200 times a second here, and no more"
 

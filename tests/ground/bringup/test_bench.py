@@ -335,7 +335,9 @@ class Line:
         return [one for one in due if last < one[0] <= now] if self.now == self.rate else []
 
 
-def heard(rate: int, *chunks: tuple[float, bytes], rates: tuple[int, ...] = (9600,)) -> tuple[Any, list[int]]:
+def identified(
+    rate: int, *chunks: tuple[float, bytes], rates: tuple[int, ...] = (9600,)
+) -> tuple[Any, list[int]]:
     """Return the device that sends on a line, and the baud rates that were tried."""
     clock = SimClock()
     line = Line(clock, rate, iter(chunks))
@@ -354,15 +356,15 @@ UBX = b"\xb5\x62\x01\x07"
 
 
 def test_the_kind_of_a_serial_device_is_recognised_at_its_baud_rate() -> None:
-    assert heard(9600, *every(0.05, b"$VNYMR,"))[0] == ("vn100", 9600, 0.0)
-    found, rates = heard(57600, *every(0.05, b"$VNYMR,"), rates=(9600, 38400))
+    assert identified(9600, *every(0.05, b"$VNYMR,"))[0] == ("vn100", 9600, 0.0)
+    found, rates = identified(57600, *every(0.05, b"$VNYMR,"), rates=(9600, 38400))
     assert found == ("vn100", 57600, 0.0)
     assert rates[:2] == [9600, 38400]
     assert len(rates) == len(set(rates)), "no rate is tried twice"
-    assert heard(9600, *every(0.5, UBX))[0] == ("gps", 9600, 0.0)
-    assert heard(9600, *every(0.5, b"$GNGGA"))[0] == ("gps", 9600, 0.0)
-    assert heard(9600, *every(0.5, b"$GPGGA"))[0] == ("gps", 9600, 0.0)
-    nothing, rates = heard(1, rates=(4800,))
+    assert identified(9600, *every(0.5, UBX))[0] == ("gps", 9600, 0.0)
+    assert identified(9600, *every(0.5, b"$GNGGA"))[0] == ("gps", 9600, 0.0)
+    assert identified(9600, *every(0.5, b"$GPGGA"))[0] == ("gps", 9600, 0.0)
+    nothing, rates = identified(1, rates=(4800,))
     assert nothing == ("", 0, 0.0)
     assert rates == [4800, *BAUD_RATES]
 
@@ -381,24 +383,24 @@ def test_a_receiver_that_a_flight_has_configured_may_send_rarely() -> None:
 def test_a_pause_of_five_usual_pauses_is_a_loose_contact() -> None:
     """Lines arrive every 0.05 s; the port is read every 0.02 s."""
     line = build("YMR", 1)
-    loose, _ = heard(9600, *every(0.05, line, (0.4, 0.75)))
+    loose, _ = identified(9600, *every(0.05, line, (0.4, 0.75)))
     assert loose == ("vn100", 9600, pytest.approx(0.4, abs=0.02))
-    assert heard(9600, *every(0.05, line, (0.4, 0.57)))[0] == ("vn100", 9600, 0.0)
+    assert identified(9600, *every(0.05, line, (0.4, 0.57)))[0] == ("vn100", 9600, 0.0)
     few = [*every(0.16, line)[:2], (1.15, line)]
-    assert heard(9600, *few)[0] == ("vn100", 9600, 0.0), "too few pauses"
+    assert identified(9600, *few)[0] == ("vn100", 9600, 0.0), "too few pauses"
 
 
 def test_the_chunks_in_which_a_port_delivers_a_line_are_not_loose_contacts() -> None:
     """The buffer of a UART delivers a line in several chunks, between which the pauses are short."""
     line = build("YMR", 1)
     chunks = [(at + 0.001 * k, line[k : k + 1]) for at, _ in every(0.05, line) for k in range(len(line))]
-    assert heard(9600, *chunks)[0] == ("vn100", 9600, 0.0)
-    loose, _ = heard(9600, *(one for one in chunks if not 0.4 < one[0] < 0.75))
+    assert identified(9600, *chunks)[0] == ("vn100", 9600, 0.0)
+    loose, _ = identified(9600, *(one for one in chunks if not 0.4 < one[0] < 0.75))
     assert loose == ("vn100", 9600, pytest.approx(0.4, abs=0.02))
 
 
 def test_a_baud_rate_that_the_port_refuses_does_not_end_the_search() -> None:
-    found, rates = heard(57600, *every(0.05, b"$VNYMR,"), rates=(REFUSED_RATE,))
+    found, rates = identified(57600, *every(0.05, b"$VNYMR,"), rates=(REFUSED_RATE,))
     assert found == ("vn100", 57600, 0.0)
     assert rates[0] == REFUSED_RATE
 

@@ -51,7 +51,7 @@ def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
     return Tracked(track=track, run=label), true[middle]
 
 
-def spoken(run: Tracked, words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+def orbit_status(run: Tracked, words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(command, "read_run", lambda _: run)
     parser = argparse.ArgumentParser()
     command.configure_orbit(parser)
@@ -62,7 +62,7 @@ def test_the_orbit_is_the_true_one_in_each_form(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, true = tracked(240.0)
-    assert spoken(run, ["--json", "--opm", str(tmp_path)], monkeypatch) == 0
+    assert orbit_status(run, ["--json", "--opm", str(tmp_path)], monkeypatch) == 0
     (facts,) = json.loads(capsys.readouterr().out)["objects"]
     found = np.array(facts["orbit"]["position_m"] + facts["orbit"]["velocity_m_s"])
     covariance = np.array(facts["orbit"]["covariance"])
@@ -88,7 +88,7 @@ def test_a_short_arc_is_said_to_be_one(
 ) -> None:
     run, _ = tracked(60.0)
     run["track"]["measured_sigma"] = 1e-4
-    assert spoken(run, ["--opm", str(tmp_path / "none")], monkeypatch) == 1
+    assert orbit_status(run, ["--opm", str(tmp_path / "none")], monkeypatch) == 1
     assert "no orbit: the arc of 60 s is too short" in capsys.readouterr().out
     assert not (tmp_path / "none").exists()
 

@@ -91,7 +91,7 @@ def test_another_page_of_the_same_browser_gets_nothing(folder: Path, headers: di
         assert get(folder, path, headers)[0] == 403
 
 
-def own(client: TestClient[Any, Any]) -> str:
+def page_origin(client: TestClient[Any, Any]) -> str:
     """Return the origin of the console's page."""
     return str(client.make_url("/").origin())
 
@@ -106,7 +106,7 @@ def test_a_command_and_a_websocket_must_state_the_pages_own_origin(folder: Path,
             assert answer.status == 403
         with pytest.raises(WSServerHandshakeError, match="403"):
             await client.ws_connect("/api/live", origin=origin)
-        async with client.ws_connect("/api/live", origin=own(client)) as line:
+        async with client.ws_connect("/api/live", origin=page_origin(client)) as line:
             assert (await line.receive_json())["live"]
 
     asked(folder, ask, send=lambda packet: pytest.fail("sent"))
@@ -122,7 +122,7 @@ def test_the_address_opens_the_page_for_one_browser_and_then_another_one_is_anno
             async with client.get(path) as answer:
                 assert (answer.status, "open the newest address" in await answer.text()) == (401, True), path
         with pytest.raises(WSServerHandshakeError, match="401"):
-            await client.ws_connect("/api/live", origin=own(client))
+            await client.ws_connect("/api/live", origin=page_origin(client))
         async with client.head(f"/?token={first}") as answer:
             assert answer.status == 401, "a preview of the address does not use the token up"
         async with client.get(f"/?token={first}") as answer:
@@ -151,7 +151,7 @@ def test_every_answer_forbids_frames_bases_and_foreign_forms(
 
     async def ask(client: TestClient[Any, Any]) -> list[tuple[int, str]]:
         found = []
-        headers = {"Origin": own(client)}
+        headers = {"Origin": page_origin(client)}
         for path in ("/", "/page/main.js", "/api/table", "/nowhere", "/api/series", "/page/nowhere.js"):
             async with client.get(path) as answer:
                 found.append((answer.status, answer.headers["Content-Security-Policy"]))
@@ -215,7 +215,7 @@ def test_a_table_that_would_be_too_long_is_refused(folder: Path, monkeypatch: py
 
 def test_the_server_pushes_the_newest_state_and_then_a_requested_past_state(folder: Path) -> None:
     async def ask(client: TestClient[Any, Any]) -> tuple[Any, Any]:
-        async with client.ws_connect("/api/live", origin=own(client)) as line:
+        async with client.ws_connect("/api/live", origin=page_origin(client)) as line:
             newest = await line.receive_json()
             await line.send_json({"at": 2.0, "speed": 0.0})
             while not (past := await line.receive_json())["again"]:
@@ -234,7 +234,7 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
     growing.write_bytes(data[: len(data) // 2])
 
     async def ask(client: TestClient[Any, Any]) -> tuple[float, float]:
-        async with client.ws_connect("/api/live", origin=own(client)) as line:
+        async with client.ws_connect("/api/live", origin=page_origin(client)) as line:
             first = (await line.receive_json())["time"]
             growing.write_bytes(data)
             for _ in range(10):  # the server pushes updates ten times a second
@@ -303,7 +303,7 @@ def test_the_live_state_is_shown_only_when_it_is_complete(folder: Path) -> None:
 
 def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any]:
     async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
-        body, headers = {"command": name, "values": values}, {"Origin": own(client)}
+        body, headers = {"command": name, "values": values}, {"Origin": page_origin(client)}
         async with client.post("/api/command", json=body, headers=headers) as answer:
             return answer.status, await answer.json()
 
@@ -419,7 +419,7 @@ def test_files_are_listed_downloaded_and_uploaded_whole(
     monkeypatch.setattr(RunFiles, "put", put)
 
     async def ask(client: TestClient[Any, Any]) -> Answer:
-        query, headers = {"kind": "elements", "name": "tle.txt"}, {"Origin": own(client)}
+        query, headers = {"kind": "elements", "name": "tle.txt"}, {"Origin": page_origin(client)}
         async with client.post("/api/file", params=query, data=b"1 2", headers=headers) as answer:
             assert await answer.json() == receipt
         async with client.get("/api/file", params={"name": name}) as answer:

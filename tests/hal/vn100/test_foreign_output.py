@@ -34,7 +34,7 @@ def save(bench: BenchLine, sent: bytes, divisor: int = 20) -> None:
     bench.unit.save_foreign_output(sent, divisor, bench.clock.now_ns())
 
 
-def heard_rates(bench: BenchLine) -> list[int]:
+def changed_rates(bench: BenchLine) -> list[int]:
     """Return a list to which each later change of the host's baud rate is appended."""
     rates: list[int] = []
     change = bench.line.host.set_baud_rate
@@ -43,7 +43,7 @@ def heard_rates(bench: BenchLine) -> list[int]:
         rates.append(baud_rate)
         change(baud_rate)
 
-    bench.line.host.set_baud_rate = listen  # type: ignore[method-assign]  # the ear is the test
+    bench.line.host.set_baud_rate = listen  # type: ignore[method-assign]  # records the calls
     return rates
 
 
@@ -73,7 +73,7 @@ def test_the_output_of_the_report_is_recognised_and_set_right_in_flight() -> Non
     bench = bench_line()
     bench.driver.configure()
     bench.run(1.0)
-    rates = heard_rates(bench)
+    rates = changed_rates(bench)
     save(bench, data[:84])
     assert seconds_until_readings(bench) <= 2.5, "one second of it is the start of the unit"
     assert rates == []
@@ -86,7 +86,7 @@ def test_an_unknown_output_after_a_reset_is_set_right_without_baud_hunting(kind:
     bench = bench_line()
     bench.driver.configure()
     bench.run(1.0)
-    rates = heard_rates(bench)
+    rates = changed_rates(bench)
     save(bench, FOREIGN[kind], divisor)
     assert seconds_until_readings(bench) <= 3.0
     assert rates == []
@@ -118,7 +118,7 @@ def test_an_additional_output_is_switched_off_in_flight(kind: str) -> None:
     bench = bench_line()
     bench.driver.configure()
     bench.run(1.0)
-    rates = heard_rates(bench)
+    rates = changed_rates(bench)
     register, *fields = kind.split()
     bench.line.host.send(build("WRG", register, *fields))
     bench.run(0.05)

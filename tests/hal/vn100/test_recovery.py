@@ -153,7 +153,7 @@ def test_a_unit_with_saved_binary_output_is_set_up_again_after_a_reset(bench: Be
 
 def test_a_healthy_unit_gets_no_commands(bench: BenchLine) -> None:
     sent: list[bytes] = []
-    bench.line.host.send = sent.append  # type: ignore[method-assign,assignment]  # the ear is the test
+    bench.line.host.send = sent.append  # type: ignore[method-assign,assignment]  # records the calls
     bench.run(20.0)
     assert sent == []
     assert bench.driver.recoveries == 0
@@ -219,7 +219,7 @@ def test_a_unit_that_refuses_is_asked_again_a_second_later_and_not_at_every_cycl
         asked.append(data)
         send(data)
 
-    bench.line.host.send = listen  # type: ignore[method-assign]  # the ear is the test
+    bench.line.host.send = listen  # type: ignore[method-assign]  # records the calls
     bench.unit.registers.write(75, ("0", "20", "01", "0001"))
     bench.unit._build_streams(bench.clock.now_ns())
     bench.run(5.0)

@@ -75,7 +75,7 @@ def sights() -> dict[str, VectorObservation]:
     return found
 
 
-def off(fix: AttitudeFix) -> FloatArray:
+def attitude_error(fix: AttitudeFix) -> FloatArray:
     """Return the attitude error (3,) as a rotation vector (rad)."""
     return rotation_vector(multiply(attitude(), conjugate(fix.quaternion)))
 
@@ -87,7 +87,7 @@ def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, Vecto
     stated.
     """
     fix = weighted_fit(list(sights.values()))
-    error = off(fix)
+    error = attitude_error(fix)
     assert np.max(np.abs(np.degrees(error))) < 0.15
     # 99.9 % quantile of a chi-square with 3 degrees of freedom.
     assert error @ np.linalg.solve(fix.covariance, error) < 16.3

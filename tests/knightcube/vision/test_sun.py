@@ -323,7 +323,7 @@ MOUNTED = [MountedCamera(WIDE_MODEL.lens, from_rotation_vector(turn)) for turn i
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[EarthScene, Image]:
+def scene_with_sun() -> tuple[EarthScene, Image]:
     """Return a scene and an image in which camera 1 shows the Sun."""
     generator = np.random.default_rng(3)
     scene = random_sun_scene(generator, WIDE_MODEL, margin=40.0)
@@ -340,8 +340,8 @@ def _strings(sun: FloatArray) -> CoarseSun:
     return coarse_sun(np.maximum(strings.normals @ sun, 0.0), strings)
 
 
-def test_only_the_camera_that_the_strings_choose_is_read(seen: tuple[EarthScene, Image]) -> None:
-    scene, frame = seen
+def test_only_the_camera_that_the_strings_choose_is_read(scene_with_sun: tuple[EarthScene, Image]) -> None:
+    scene, frame = scene_with_sun
     sun = _in_body(scene)
     found = sun_of_cameras({0: DARK, 1: frame, 2: DARK}, MOUNTED, _strings(sun), JOINT_SETTINGS)
     assert found.camera == 1
@@ -353,9 +353,9 @@ def test_only_the_camera_that_the_strings_choose_is_read(seen: tuple[EarthScene,
 
 
 def test_the_solar_strings_give_the_direction_if_no_camera_finds_the_sun(
-    seen: tuple[EarthScene, Image],
+    scene_with_sun: tuple[EarthScene, Image],
 ) -> None:
-    sun = _in_body(seen[0])
+    sun = _in_body(scene_with_sun[0])
     found = sun_of_cameras({0: DARK, 1: DARK, 2: DARK}, MOUNTED, _strings(sun), JOINT_SETTINGS)
     assert found.camera is None
     assert found.direction is not None
@@ -367,12 +367,14 @@ def test_the_solar_strings_give_the_direction_if_no_camera_finds_the_sun(
     assert "is below the level of 200" in found.reason
 
 
-def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthScene, Image]) -> None:
+def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(
+    scene_with_sun: tuple[EarthScene, Image],
+) -> None:
     """A reflection far from the strings' Sun direction is not taken as the Sun.
 
     The image with the Sun is from a camera whose field of view only just includes the coarse direction.
     """
-    scene, frame = seen
+    scene, frame = scene_with_sun
     true = MOUNTED[0].in_body(np.array([0.0, np.sin(0.5), np.cos(0.5)]))
     assert float(true @ _in_body(scene, 0)) < np.cos(0.3)
     found = sun_of_cameras({0: frame}, MOUNTED, _strings(true), JOINT_SETTINGS)
@@ -382,12 +384,14 @@ def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthS
     assert float(found.direction @ true) > np.cos(0.1)
 
 
-def test_a_sun_cut_by_the_frames_edge_has_a_larger_covariance(seen: tuple[EarthScene, Image]) -> None:
+def test_a_sun_cut_by_the_frames_edge_has_a_larger_covariance(
+    scene_with_sun: tuple[EarthScene, Image],
+) -> None:
     """The covariance of a Sun that the edge truncates is larger.
 
     The error of a truncated disc is the same in every frame, up to 0.03 deg for a sigma of 0.007 deg.
     """
-    scene, _ = seen
+    scene, _ = scene_with_sun
     turn = shortest_turn(sun_direction(scene), WIDE_MODEL.lens.unit_vectors(np.array([[510.7, 300.0]]))[0])
     cut = replace(scene, attitude=from_matrix(turn @ scene.camera_matrix))
     sun, frame = _in_body(cut), render(WIDE_MODEL, cut, np.random.default_rng(4))
@@ -402,9 +406,9 @@ def test_a_sun_cut_by_the_frames_edge_has_a_larger_covariance(seen: tuple[EarthS
 
 
 def test_all_cameras_are_read_with_uncertain_strings_and_none_in_eclipse(
-    seen: tuple[EarthScene, Image],
+    scene_with_sun: tuple[EarthScene, Image],
 ) -> None:
-    _, frame = seen
+    _, frame = scene_with_sun
     doubt = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="unclear")
     found = sun_of_cameras({0: DARK, 1: frame}, MOUNTED, doubt, JOINT_SETTINGS)
     assert list(found.each) == [0, 1]

@@ -57,12 +57,14 @@ def stored(slow: SlowStates) -> dict[str, Learned]:
     return decode(encode(1, StoredState(learned=learned_of(slow, THEN)))).state.learned
 
 
-def grown(age: float) -> FloatArray:
+def variances_after(age: float) -> FloatArray:
     """Return the variances, after an age (s), of parameters once known to a tenth of their prior sigma."""
-    return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + thinned(age).diagonal())
+    return np.asarray(
+        (0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + air_covariance(age).diagonal()
+    )
 
 
-def thinned(age: float) -> FloatArray:
+def air_covariance(age: float) -> FloatArray:
     """Return the covariance (growth during an age, s) of the torques due to changes of the air density."""
     changed, at = np.zeros_like(PRIOR), slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
     changed[at, at] = age * density_walk(0.5 * START[at])
@@ -74,16 +76,16 @@ def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
         prior, problems = start_from(stored(known()), LAYOUT, CHANGED, THEN + age)
         assert not problems
         assert np.array_equal(prior.values, known().values)
-        assert np.allclose(np.diag(prior.covariance), grown(age), rtol=1e-12)
+        assert np.allclose(np.diag(prior.covariance), variances_after(age), rtol=1e-12)
         at = PARTS[SOURCES]
-        off = prior.covariance[np.ix_(at, at)] - (known().covariance + thinned(age))[np.ix_(at, at)]
+        off = prior.covariance[np.ix_(at, at)] - (known().covariance + air_covariance(age))[np.ix_(at, at)]
         assert np.allclose(off, np.diag(np.diag(off)), atol=1e-20), "dipole and sunlit part stay correlated"
 
 
 def test_a_clock_that_was_set_back_counts_as_a_day() -> None:
     prior, problems = start_from(stored(known()), LAYOUT, CHANGED, THEN - 5.0)
     assert not problems
-    assert np.allclose(np.diag(prior.covariance), grown(UNKNOWN_AGE), rtol=1e-12)
+    assert np.allclose(np.diag(prior.covariance), variances_after(UNKNOWN_AGE), rtol=1e-12)
 
 
 def test_stored_states_without_a_time_or_with_implausible_values_are_not_used() -> None:

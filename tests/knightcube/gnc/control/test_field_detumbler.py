@@ -320,7 +320,7 @@ FIELD_AHEAD = rotating_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022
 """Field (T) that makes two rotations in 95 min, as in a polar orbit."""
 
 
-def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
+def remaining_fraction(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
     """Return the fraction of the momentum that remains if the plan is executed with dipoles at the limit."""
     now = momentum.copy()
     for there in FIELD_AHEAD[: round(horizon / STEP)]:
@@ -354,7 +354,7 @@ def test_the_plan_removes_the_momentum_in_nearly_the_least_time(
 ) -> None:
     momentum = 1e-3 * np.array(direction)
     plan = momentum_plan(momentum, FIELD_AHEAD, TIMES, DIPOLE_LIMIT, REST)
-    assert left(momentum, plan.costate, plan.horizon) < 0.06
+    assert remaining_fraction(momentum, plan.costate, plan.horizon) < 0.06
     least = least_time(momentum, FIELD_AHEAD)
     assert 0.98 * least - STEP <= plan.horizon < 1.02 * least + STEP
 

@@ -194,27 +194,27 @@ def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
         )
 
 
-def seen(astray: PathRecovery, off: float, speed: float, now: float) -> tuple[float | None, bool]:
+def damped_since(astray: PathRecovery, off: float, speed: float, now: float) -> tuple[float | None, bool]:
     astray.update(off, speed, now)
     return astray.since, astray.ready
 
 
 def test_far_from_its_path_a_body_is_damped_until_it_is_slow() -> None:
     astray = PathRecovery()
-    assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
-    assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
+    assert damped_since(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
+    assert damped_since(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
     # The damping continues after the error has become small again.
-    assert seen(astray, 0.0, 2.0 * SLOW, 20.0) == (10.0, False)
-    assert seen(astray, 3.0 * FAR, 0.9 * SLOW, 30.0) == (10.0, True)
+    assert damped_since(astray, 0.0, 2.0 * SLOW, 20.0) == (10.0, False)
+    assert damped_since(astray, 3.0 * FAR, 0.9 * SLOW, 30.0) == (10.0, True)
     astray.planned()
-    assert seen(astray, 0.0, SLOW, 31.0) == (None, False)
+    assert damped_since(astray, 0.0, SLOW, 31.0) == (None, False)
 
 
 def test_a_spin_along_the_field_is_not_waited_for() -> None:
     astray = PathRecovery()
     astray.update(2.0 * FAR, 5.0 * SLOW, 0.0)
-    assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, DAMPING_TIMEOUT - 1.0)[1]
-    assert seen(astray, 2.0 * FAR, 5.0 * SLOW, DAMPING_TIMEOUT + 1.0)[1]
+    assert not damped_since(astray, 2.0 * FAR, 5.0 * SLOW, DAMPING_TIMEOUT - 1.0)[1]
+    assert damped_since(astray, 2.0 * FAR, 5.0 * SLOW, DAMPING_TIMEOUT + 1.0)[1]
 
 
 def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() -> None:

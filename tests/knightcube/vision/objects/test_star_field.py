@@ -26,7 +26,7 @@ def sky(rng: np.random.Generator, density: int = 900) -> FloatArray:
     return np.asarray(stars / np.linalg.norm(stars, axis=1, keepdims=True))
 
 
-def seen(stars: FloatArray, attitude: FloatArray, rng: np.random.Generator) -> FieldPoints:
+def measured_points(stars: FloatArray, attitude: FloatArray, rng: np.random.Generator) -> FieldPoints:
     """Return the star positions in a frame, with errors."""
     directions = stars @ attitude_matrix(attitude).T
     directions = directions[(directions[:, 2] > 0.8) & (np.abs(directions[:, :2]).max(axis=1) < 0.17)]
@@ -50,7 +50,7 @@ def flown(rate: FloatArray, error: float, frames: int) -> list[tuple[FloatArray,
         truth = multiply(from_rotation_vector(number * rate), start)
         path = from_rotation_vector(np.array([0.0, 0.0, 5e-3 * number]))
         moved = attitude_matrix(path) @ track
-        points = seen(np.vstack([stars, moved / np.linalg.norm(moved)]), truth, rng)
+        points = measured_points(np.vstack([stars, moved / np.linalg.norm(moved)]), truth, rng)
         predicted = multiply(from_rotation_vector(error * rng.standard_normal(3)), truth)
         rows.append((truth, field.locate(points, predicted, error), points))
     return rows
@@ -80,14 +80,16 @@ def test_three_frames_without_common_stars_begin_the_field_again() -> None:
     rng = np.random.default_rng(8)
     stars, field = sky(rng, 4000), StarField()
     start = from_rotation_vector(np.array([0.1, 0.2, 0.3]))
-    assert field.locate(seen(stars, start, rng), start, PIXEL).begun
-    assert not field.locate(seen(stars, start, rng), start, PIXEL).begun
+    assert field.locate(measured_points(stars, start, rng), start, PIXEL).begun
+    assert not field.locate(measured_points(stars, start, rng), start, PIXEL).begun
     away = multiply(from_rotation_vector(np.array([0.0, 1.5, 0.0])), start)
-    black, there = seen(stars[:0], start, rng), seen(stars, away, rng)
+    black, there = measured_points(stars[:0], start, rng), measured_points(stars, away, rng)
     assert not field.locate(black, start, PIXEL).begun
     other = field.locate(there, away, PIXEL)
     assert not other.begun
     assert other.is_star.all(), "nothing is reported in a frame that is compared with no other"
-    assert not field.locate(seen(stars, start, rng), start, PIXEL).begun, "the stars are found again"
+    assert not field.locate(measured_points(stars, start, rng), start, PIXEL).begun, (
+        "the stars are found again"
+    )
     begun = [field.locate(one, away, PIXEL).begun for one in (black, there, there, there)]
     assert begun == [False, False, True, False]
