@@ -22,6 +22,7 @@ from flight.schema.devices import driver_of, fitted_devices
 from flight.schema.sections import Config
 from ground.bringup.diagnosis import Finding, Samples
 from hal.drivers.current_monitors import config_for
+from hal.drivers.gps import BAUD_RATES as GPS_BAUD_RATES
 from hal.drivers.vn100 import BAUD_RATES
 from hal.drivers.vn100_protocol import StreamParser
 from hal.interfaces.devices import Frame, FrameSource, ImuReading, InertialUnit, TorqueCoils
@@ -429,8 +430,11 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     rates = tuple(dict.fromkeys([section.baud_rate, *(one.baud_rate for one in serial.values())]))
     period_ns = round((section.period + 0.2) * SECOND_NS) if wanted == "gps" else _LISTEN_NS
     what, rate, pause = talker(rig, section.device, rates, period_ns)
+    rig.wires.serial(section.device, section.baud_rate).set_baud_rate(section.baud_rate)
     found = None
-    if what == wanted and rate != section.baud_rate:
+    # The u-blox driver changes the baud rate of its receiver, for example the factory setting.
+    changed = wanted == "gps" and section.driver == "ublox" and rate in GPS_BAUD_RATES
+    if what == wanted and rate != section.baud_rate and not changed:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"
         cure = f"set `baud_rate: {rate}`, or change that of the device"
         found = Finding(kind, "wrong baud rate", text, cure, setting=("baud_rate", rate))

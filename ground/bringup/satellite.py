@@ -125,7 +125,7 @@ def step_gps(session: Session) -> Outcome:
     section = session.config.gps
     assert section is not None, "the device is open"
     period = _NMEA_PERIOD_S if section.driver == "nmea" else section.period
-    silence = max(_SILENCE_S, 2.0 * period)
+    silence, searches = max(_SILENCE_S, 2.0 * period), False
     session.ask("Place the GPS antenna under an open sky, and leave it there.")
     clock, before, readings = session.rig.clock, receiver.link(), list[GpsReading]()
     begun_ns = clock.now_ns()
@@ -137,7 +137,14 @@ def step_gps(session: Session) -> Outcome:
     while sum(one.valid for one in readings) < _FIXES and seconds() < _FIX_PATIENCE_S:
         session.wait(1.0)
         readings += receiver.poll()
-        if not readings and seconds() > silence and receiver.link().frames == before.frames:
+        link = receiver.link()
+        if seconds() <= silence:
+            # The u-blox driver searches for the baud rate while bytes arrive that it cannot decode.
+            decoded = link.frames + link.sentences > before.frames + before.sentences
+            searches = (
+                section.driver == "ublox" and link.bytes_received > before.bytes_received and not decoded
+            )
+        elif not readings and not searches and link.frames == before.frames:
             break
     link, span = receiver.link(), seconds()
     bad, good = link.bad_checksum - before.bad_checksum, link.frames + link.sentences

@@ -10,8 +10,12 @@ lacks the vertical velocity.
 A u-blox receiver loses its configuration at a power loss. The driver therefore requests NAV-PVT messages at
 the start, and again whenever no NAV-PVT has arrived for three seconds. Receivers with protocol version 27 or
 later (M9, M10, F9) are configured by CFG-VALSET (u-blox F9 interface description, UBX-22008968). Older
-receivers (u-blox 7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version
-in MON-VER. If the receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa.
+receivers (u-blox 7 and 8) are configured by CFG-PRT, CFG-RATE, CFG-MSG and CFG-NAV5. The receiver reports its
+version in MON-VER. If the receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice
+versa. A CFG-VALSET with a key that the receiver does not have is refused as a whole, so only the keys of the
+port in use are sent: UART 1, UART 2 or USB. The receiver reports its port in CFG-PRT; a receiver that does
+not answer, such as an M10, has only UART 1. With the default dynamic model ("portable"), a receiver rejects
+fixes above 12 km or 310 m/s, so the driver selects the model for the highest altitudes and speeds.
 No call blocks. If bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud
 rates. When it finds the receiver, it commands the configured baud rate. Consumer receivers stop working above
 18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
@@ -45,13 +49,25 @@ SYNC = b"\xb5\x62"
 NAV_PVT = 0x01, 0x07
 ACK_NAK, ACK_ACK = (0x05, 0x00), (0x05, 0x01)
 CFG_PRT, CFG_MSG, CFG_RATE, CFG_VALSET = (0x06, 0x00), (0x06, 0x01), (0x06, 0x08), (0x06, 0x8A)
+CFG_NAV5 = 0x06, 0x24
 MON_VER = 0x0A, 0x04
 VALSET_PROTOCOL = 27.0
 """Lowest u-blox protocol version that supports the command CFG-VALSET."""
 NAMES = {CFG_PRT: "CFG-PRT", CFG_MSG: "CFG-MSG", CFG_RATE: "CFG-RATE", CFG_VALSET: "CFG-VALSET"}
-UART1_BAUDRATE, UART1_IN_UBX, UART1_OUT_UBX, UART1_OUT_NMEA = 0x40520001, 0x10730001, 0x10740001, 0x10740002
-RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, PVT_ON_UART1 = 0x30210001, 0x30210002, 0x20210003, 0x20910007
+NAMES[CFG_NAV5] = "CFG-NAV5"
+UART1, UART2, USB = 1, 2, 3
+"""Identifiers of the receiver's ports in CFG-PRT."""
+BAUD_RATE_KEYS = {UART1: 0x40520001, UART2: 0x40530001}
+PORT_KEYS = {
+    UART1: (0x10730001, 0x10740001, 0x10740002, 0x20910007),
+    UART2: (0x10750001, 0x10760001, 0x10760002, 0x20910008),
+    USB: (0x10770001, 0x10780001, 0x10780002, 0x20910009),
+}
+"""Keys of each port for input of UBX, output of UBX, output of NMEA, and the rate of NAV-PVT."""
+RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, DYNAMIC_MODEL = 0x30210001, 0x30210002, 0x20210003, 0x20110021
 """Configuration keys of CFG-VALSET; the first hexadecimal digit of a key determines the size of its value."""
+AIRBORNE_4G = 8
+"""Dynamic model with the highest limits of altitude and speed, for accelerations up to 4 g."""
 OVERHEAD = 8
 PVT_LENGTH, OLD_PVT_LENGTH = 92, 84
 """Payload lengths (bytes) of NAV-PVT: 92 from protocol version 15 on, 84 from the older u-blox 7."""
@@ -280,6 +296,7 @@ class UbloxReceiver:
         self._is_due = False
         self._uses_valset = False
         self._protocol = 0.0
+        self._receiver_port = UART1
         self._refusal = ""
         self._cause = ""
         now_ns = clock.now_ns()
@@ -372,6 +389,9 @@ class UbloxReceiver:
         if kind == MON_VER and (version := _PROTOCOL.search(payload)):
             self._protocol = float(version[1])
             self._use_valset(self._protocol >= VALSET_PROTOCOL)
+        if kind == CFG_PRT and payload and payload[0] in PORT_KEYS:
+            self._is_due = self._is_due or payload[0] != self._receiver_port
+            self._receiver_port = payload[0]
         if kind != NAV_PVT or len(payload) not in {PVT_LENGTH, OLD_PVT_LENGTH}:
             return None
         self._fix_arrival_ns = self._clock.now_ns()
@@ -430,9 +450,8 @@ class UbloxReceiver:
                 self._change_rate(self._others[-1])
         elif decoded_ns > self._rate_ns:
             self._found_rate, self._return_ns = port.baud_rate, now_ns + _RETURN_NS
-            values = b"\x00\x01\x00\x00" + UART1_BAUDRATE.to_bytes(4, "little")
-            rate = self._own_rate.to_bytes(4, "little")
-            port.send(port_set_up(self._own_rate) + frame(CFG_VALSET, values + rate))
+            rate = value_frame({BAUD_RATE_KEYS[UART1]: self._own_rate})
+            port.send(port_set_up(self._own_rate) + rate)
         elif now_ns - self._rate_ns >= self._silence_ns:
             self._change_rate(self._own_rate)
 
@@ -451,35 +470,38 @@ class UbloxReceiver:
         if not (silent or self._is_due or self._requested_ns is None):
             return
         self._requested_ns, self._is_due = now_ns, False
-        request = b"" if self._protocol else frame(MON_VER)
+        request = b"" if self._protocol else frame(CFG_PRT) + frame(MON_VER)
         made = valset if self._uses_valset else legacy_set_up
-        self._port.send(made(self._port.baud_rate, self._period_ns) + request)
+        self._port.send(made(self._port.baud_rate, self._period_ns, self._receiver_port) + request)
 
 
-def legacy_set_up(baud_rate: int, period_ns: int) -> bytes:
-    """Return the frames that configure u-blox 7 and 8: only UBX on UART 1, one NAV-PVT per period (ns)."""
+def legacy_set_up(baud_rate: int, period_ns: int, port: int = UART1) -> bytes:
+    """Return the frames that configure u-blox 7 and 8: only UBX on `port`, one NAV-PVT per period (ns)."""
     rate = (period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # time system GPS
-    return port_set_up(baud_rate) + frame(CFG_RATE, rate) + frame(CFG_MSG, bytes((*NAV_PVT, 1)))
+    model = b"\x01\x00" + bytes((AIRBORNE_4G,)) + bytes(33)  # bit 0 of the mask selects the dynamic model
+    message = frame(CFG_MSG, bytes((*NAV_PVT, 1)))  # applies to the port that receives the command
+    return port_set_up(baud_rate, port) + frame(CFG_RATE, rate) + message + frame(CFG_NAV5, model)
 
 
-def port_set_up(baud_rate: int) -> bytes:
-    """Return the CFG-PRT frame that configures UART 1 as 8N1 with UBX in both directions, without NMEA."""
-    port = b"\x01\x00\x00\x00\xd0\x08\x00\x00" + baud_rate.to_bytes(4, "little") + b"\x01\x00" * 2
-    return frame(CFG_PRT, port + b"\x00" * 4)
+def port_set_up(baud_rate: int, port: int = UART1) -> bytes:
+    """Return the CFG-PRT frame that configures a port with UBX in both directions, without NMEA.
+
+    A UART is configured as 8N1.
+    """
+    mode = b"\xd0\x08\x00\x00" + baud_rate.to_bytes(4, "little") if port in BAUD_RATE_KEYS else bytes(8)
+    return frame(CFG_PRT, bytes((port, 0, 0, 0)) + mode + b"\x01\x00" * 2 + bytes(4))
 
 
-def valset(baud_rate: int, period_ns: int) -> bytes:
-    """Return the frame that configures M9, M10 and F9 in their volatile memory."""
-    values = {
-        UART1_BAUDRATE: baud_rate,
-        UART1_IN_UBX: 1,
-        UART1_OUT_UBX: 1,
-        UART1_OUT_NMEA: 0,
-        RATE_MEASUREMENT: period_ns // 1_000_000,
-        RATE_SOLUTION: 1,
-        RATE_TIME: 1,  # time system GPS
-        PVT_ON_UART1: 1,
-    }
+def valset(baud_rate: int, period_ns: int, port: int = UART1) -> bytes:
+    """Return the frames that configure `port` of M9, M10 and F9 in their volatile memory."""
+    values = dict(zip(PORT_KEYS[port], (1, 1, 0, 1), strict=True))
+    values |= {BAUD_RATE_KEYS[port]: baud_rate} if port in BAUD_RATE_KEYS else {}
+    values |= {RATE_MEASUREMENT: period_ns // 1_000_000, RATE_SOLUTION: 1, RATE_TIME: 1}  # time system GPS
+    return value_frame(values) + value_frame({DYNAMIC_MODEL: AIRBORNE_4G})
+
+
+def value_frame(values: dict[int, int]) -> bytes:
+    """Return the CFG-VALSET frame that sets values, by key, in the volatile memory."""
     packed = (
         key.to_bytes(4, "little") + value.to_bytes(VALUE_SIZES[key >> 28], "little")
         for key, value in values.items()

@@ -1,6 +1,7 @@
 """Emulated GPS receivers on a serial line, with the errors of a receiver in orbit: u-blox and NMEA 0183.
 
 The u-blox receiver starts without a configuration and sends NMEA sentences until a message enables NAV-PVT.
+Without a dynamic model for high speeds it has no fix in orbit.
 Fixes are computed at UTC times that are multiples of the period, and their frames are sent `latency` s later.
 The position error is a random walk (ionosphere, ephemerides) plus white noise, and the velocity error is
 white noise. The NMEA receiver sends its sentences without being configured and ignores commands.
@@ -19,20 +20,26 @@ import numpy as np
 from hal.drivers.gps import (
     ACK_ACK,
     ACK_NAK,
+    AIRBORNE_4G,
+    BAUD_RATE_KEYS,
     CFG_MSG,
+    CFG_NAV5,
     CFG_PRT,
     CFG_RATE,
     CFG_VALSET,
     DATE_AND_TIME,
+    DYNAMIC_MODEL,
     FIX_OK,
     KNOT,
     MON_VER,
     NAV_PVT,
-    PVT_ON_UART1,
+    PORT_KEYS,
     RANGE_ERROR,
     RATE_MEASUREMENT,
+    RATE_SOLUTION,
+    RATE_TIME,
     THREE_DIMENSIONS,
-    UART1_BAUDRATE,
+    UART1,
     UNKNOWN_ACCURACY,
     VALSET_PROTOCOL,
     VALUE_SIZES,
@@ -54,6 +61,8 @@ from sim_hal.clock import NEVER
 from sim_hal.emulators.serial_line import DeviceEnd
 from sim_hal.worlds.world import OrbitingWorld
 
+WITHOUT_PORTS = 34.0
+"""Lowest protocol version of receivers that do not have the command CFG-PRT (M10)."""
 NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"
 
 
@@ -88,7 +97,11 @@ class EmulatedGps:
         frozen: whether a fault makes the receiver repeat its last fix.
         protocol: u-blox protocol version; a receiver with version 27 or later accepts only CFG-VALSET.
         obeys: whether the receiver executes commands.
+        ports: ports of the receiver, beginning with the port that is connected.
+        needs_model: whether the receiver has a fix in orbit only with the dynamic model AIRBORNE_4G.
     """
+
+    needs_model = True
 
     def __init__(
         self,
@@ -105,6 +118,7 @@ class EmulatedGps:
         self.frozen = False
         self.protocol = 18.0
         self.obeys = True
+        self.ports: tuple[int, ...] = (UART1,)
         self._world, self._line, self._generator, self._errors = world, line, generator, errors
         self._period_ns = SECOND_NS
         self._utc_offset_ns = world.utc_ns() - now_ns
@@ -149,6 +163,7 @@ class EmulatedGps:
         self._parser = UbxParser()
         self._sending: list[tuple[int, bytes]] = []
         self._enabled = False
+        self._model = 0
         self._found_ns = now_ns + round(start * SECOND_NS)
         utc_ns = now_ns + self._utc_offset_ns
         self._epoch_ns = now_ns + (-utc_ns) % self._period_ns
@@ -160,30 +175,45 @@ class EmulatedGps:
             version = f"PROTVER={self.protocol:.2f}".encode("ascii").ljust(30, b"\0")
             self._line.write(frame(MON_VER, bytes(40) + version), now_ns)
             return
-        known = kind in ({CFG_VALSET} if self.protocol >= VALSET_PROTOCOL else {CFG_PRT, CFG_RATE, CFG_MSG})
+        if kind == CFG_PRT and not payload and self.protocol < WITHOUT_PORTS:
+            self._line.write(frame(CFG_PRT, bytes((self.ports[0], *bytes(19)))), now_ns)
+            return
+        older = {CFG_PRT, CFG_RATE, CFG_MSG, CFG_NAV5}
+        known = kind in ({CFG_VALSET} if self.protocol >= VALSET_PROTOCOL else older)
         if known and kind == CFG_VALSET:
-            self._set_values(payload[4:])
+            known = self._set_values(payload[4:])
         if known and kind == CFG_MSG and payload[:2] == bytes(NAV_PVT):
             self._enabled = payload[-1] > 0
-        if known and kind == CFG_PRT:
+        if known and kind == CFG_PRT and payload[0] == self.ports[0] and payload[0] in BAUD_RATE_KEYS:
             self._line.baud_rate = int.from_bytes(payload[8:12], "little")
         if known and kind == CFG_RATE:
             self._period_ns = max(100, int.from_bytes(payload[:2], "little")) * 1_000_000
+        if known and kind == CFG_NAV5 and payload[0] & 1:
+            self._model = payload[2]
         self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
 
-    def _set_values(self, pairs: bytes) -> None:
-        """Apply the settings of a CFG-VALSET message, which contains pairs of key and value."""
+    def _set_values(self, pairs: bytes) -> bool:
+        """Apply the settings of a CFG-VALSET message, which contains pairs of key and value.
+
+        Return whether the receiver has all keys; otherwise, the receiver ignores the message.
+        """
+        values: dict[int, int] = {}
         while len(pairs) > 4:
             key = int.from_bytes(pairs[:4], "little")
             size = VALUE_SIZES[key >> 28]
-            value = int.from_bytes(pairs[4 : 4 + size], "little")
+            values[key] = int.from_bytes(pairs[4 : 4 + size], "little")
             pairs = pairs[4 + size :]
-            if key == PVT_ON_UART1:
-                self._enabled = value > 0
-            if key == UART1_BAUDRATE:
-                self._line.baud_rate = value
-            if key == RATE_MEASUREMENT:
-                self._period_ns = max(100, value) * 1_000_000
+        keys = {RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, DYNAMIC_MODEL}
+        keys.update(*(PORT_KEYS[port] for port in self.ports), map(BAUD_RATE_KEYS.get, self.ports))
+        if not keys >= values.keys():
+            return False
+        port = self.ports[0]
+        self._enabled = values.get(PORT_KEYS[port][-1], self._enabled) > 0
+        self._line.baud_rate = values.get(BAUD_RATE_KEYS.get(port, 0), self._line.baud_rate)
+        self._model = values.get(DYNAMIC_MODEL, self._model)
+        if RATE_MEASUREMENT in values:
+            self._period_ns = max(100, values[RATE_MEASUREMENT]) * 1_000_000
+        return True
 
     def _measure(self, epoch_ns: int) -> Pvt:
         if self.frozen and self._last is not None:
@@ -201,7 +231,8 @@ class EmulatedGps:
         velocity = to_ground @ np.array(around.velocity) - ROTATION_RATE * np.array([-y, x, 0.0])
         position = exact + errors.walk * self._walk + errors.noise * noise[:3] + self.shift
         velocity = velocity + errors.velocity_noise * noise[3:]
-        found = not self.blind and epoch_ns >= self._found_ns
+        suits = self._model == AIRBORNE_4G or not self.needs_model
+        found = suits and not self.blind and epoch_ns >= self._found_ns
         self._last = self._report(utc_ns + self.clock_ns, position, velocity, found)
         return self._last
 
@@ -232,6 +263,8 @@ class EmulatedGps:
 
 class EmulatedNmeaGps(EmulatedGps):
     """An emulated receiver with RMC and GGA sentences instead of UBX messages."""
+
+    needs_model = False
 
     def _message(self, epoch_ns: int) -> bytes:
         pvt = self._measure(epoch_ns)

@@ -21,7 +21,8 @@ from scipy.ndimage import gaussian_filter
 from flight.app.devices import emulated_bench
 from flight.app.run import RunRequest
 from flight.app.service import requested_config
-from flight.schema.devices import coil_fields
+from flight.schema import reader
+from flight.schema.devices import Gps, coil_fields
 from flight.schema.document import config_path, to_yaml
 from flight.schema.sections import Config
 from ground.bringup import cameras
@@ -302,6 +303,16 @@ SEARCH = {
         base="orbit",
         says="/dev/knightcube-gps is the line of the VN-100",
     ),
+    "NMEA receiver at another baud rate": Case(
+        {"gps": {"baud_rate": 9600, "driver": "nmea"}},
+        "find",
+        ["gps wrong baud rate"],
+        base="orbit",
+        says="set `baud_rate: 9600`",
+        spoil=lambda opened: setattr(
+            opened, "config", reader.replace(opened.config, gps=Gps(driver="nmea", baud_rate=38400))
+        ),
+    ),
     "loose plug of the inertial unit": Case(
         fault("imu: intermittent"), "find", ["inertial_unit intermittent"], says="stops for up to 0.2"
     ),
@@ -443,6 +454,9 @@ PIXELS = {
     ),
 }
 GPS = {
+    "u-blox receiver at its factory baud rate": Case(
+        {"gps": {"baud_rate": 9600}}, "find gps", [], base="orbit"
+    ),
     "GPS antenna unplugged": Case(
         fault("gps: no-fix"), "gps", ["gps no fix"], base="orbit", says="with 0 satellites"
     ),

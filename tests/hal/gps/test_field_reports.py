@@ -20,11 +20,15 @@ from hal.drivers.gps import (
     CFG_MSG,
     NAV_PVT,
     ROLLOVER_NS,
+    UART1,
+    UART2,
+    USB,
     Kind,
     Pvt,
     UbloxReceiver,
     UbxParser,
     frame,
+    legacy_set_up,
     reading_of,
     unpack_pvt,
     valset,
@@ -230,13 +234,60 @@ def test_each_generation_is_set_up_at_once(protocol: float) -> None:
     assert gps.driver.link().refused == refused, "the version is known by now"
 
 
-def test_the_configuration_by_values_is_what_another_author_reads() -> None:
-    read = UBXReader.parse(valset(38400, 2 * SECOND_NS), msgmode=1)
-    assert (read.identity, read.version, read.ram, read.bbr, read.flash) == ("CFG-VALSET", 0, 1, 0, 0)
-    values = (read.CFG_UART1_BAUDRATE, read.CFG_UART1INPROT_UBX, read.CFG_UART1OUTPROT_UBX)
-    assert values == (38400, 1, 1)
-    assert (read.CFG_UART1OUTPROT_NMEA, read.CFG_MSGOUT_UBX_NAV_PVT_UART1) == (0, 1)
-    assert (read.CFG_RATE_MEAS, read.CFG_RATE_NAV, read.CFG_RATE_TIMEREF) == (2000, 1, 1)
+@pytest.mark.parametrize(("port", "name"), [(UART1, "UART1"), (UART2, "UART2"), (USB, "USB")])
+def test_the_configuration_by_values_is_what_another_author_reads(port: int, name: str) -> None:
+    data = valset(38400, 2 * SECOND_NS, port)
+    values, model = (
+        UBXReader.parse(frame(kind, body), msgmode=1) for kind, body, _ in UbxParser().feed(data)
+    )
+    for read in (values, model):
+        assert (read.identity, read.version, read.ram, read.bbr, read.flash) == ("CFG-VALSET", 0, 1, 0, 0)
+    expected = {
+        f"CFG_{name}INPROT_UBX": 1, f"CFG_{name}OUTPROT_UBX": 1, f"CFG_{name}OUTPROT_NMEA": 0,
+        f"CFG_MSGOUT_UBX_NAV_PVT_{name}": 1, "CFG_RATE_MEAS": 2000, "CFG_RATE_NAV": 1, "CFG_RATE_TIMEREF": 1,
+    } | ({} if port == USB else {f"CFG_{name}_BAUDRATE": 38400})  # fmt: skip
+    assert settings_of(values) == expected
+    assert settings_of(model) == {"CFG_NAVSPG_DYNMODEL": 8}
+
+
+def settings_of(message: Any) -> dict[str, Any]:
+    """Return the settings of a CFG-VALSET message by their names in the interface description."""
+    return {name: value for name, value in vars(message).items() if name.startswith("CFG_")}
+
+
+@pytest.mark.parametrize(("port", "mode"), [(UART1, (38400, 3, 4)), (USB, (0, 0, 0))])
+def test_the_older_configuration_is_what_another_author_reads(port: int, mode: tuple[int, ...]) -> None:
+    found = UbxParser().feed(legacy_set_up(38400, 2 * SECOND_NS, port))
+    uart, rate, message, model = (UBXReader.parse(frame(kind, body), msgmode=1) for kind, body, _ in found)
+    assert uart.portID == port
+    if port != USB:
+        assert (uart.baudRate, uart.charLen, uart.parity) == mode
+    assert (uart.inUBX, uart.inNMEA, uart.outUBX, uart.outNMEA) == (1, 0, 1, 0)
+    assert (rate.measRate, rate.navRate, rate.timeRef) == (2000, 1, 1)
+    assert (message.msgClass, message.msgID) == NAV_PVT
+    assert (model.dyn, model.minEl, model.posFixMode, model.dynModel) == (1, 0, 0, 8)
+
+
+@pytest.mark.parametrize("protocol", [18.0, 32.0, 34.0])
+@pytest.mark.parametrize("ports", [(UART1,), (UART2, UART1), (USB, UART1, UART2)])
+def test_fixes_are_enabled_on_the_port_in_use(protocol: float, ports: tuple[int, ...]) -> None:
+    """Only an M10 does not report its port, and an M10 has only UART 1."""
+    gps = bench()
+    gps.gps.protocol, gps.gps.ports = protocol, ports if protocol < 34.0 else (UART1,)
+    assert sum(reading.valid for reading in gps.fly(10.0)) >= 8
+    gps.gps.switch_off()
+    gps.gps.switch_on(gps.clock.now_ns())
+    refused = gps.driver.link().refused
+    gps.fly(35.0)
+    assert sum(reading.valid for reading in gps.fly(5.0)) >= 4
+    assert gps.driver.link().refused == refused
+
+
+def test_a_receiver_whose_dynamic_model_does_not_suit_an_orbit_has_no_fix() -> None:
+    gps = bench()
+    assert gps.fly(4.0)[-1].valid
+    gps.gps._model = 0
+    assert not gps.fly(2.0)[-1].valid
 
 
 def sentence(text: str) -> bytes:

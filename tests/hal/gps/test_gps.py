@@ -27,6 +27,7 @@ from hal.drivers.gps import (
     UbxParser,
     checksum,
     frame,
+    legacy_set_up,
     reading_of,
     unpack_pvt,
 )
@@ -244,7 +245,7 @@ def test_another_authors_client_reads_the_emulated_receiver_on_a_pseudo_terminal
     line = PtyLine(115200, np.random.default_rng(1))
     gps = EmulatedGps(body, line, np.random.default_rng(2), EXACT, start_ns)
     with serial.Serial(line.name, 115200, timeout=0.05) as port:
-        port.write(frame(CFG_MSG, bytes((*NAV_PVT, 1))))
+        port.write(legacy_set_up(115200, SECOND_NS))
         data, deadline = b"", start_ns + 8 * SECOND_NS
         while clock.now_ns() < deadline and data.count(b"\xb5\x62\x01\x07") < 2:
             line.exchange(clock.now_ns())
