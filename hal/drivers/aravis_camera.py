@@ -42,6 +42,8 @@ FAKE_PREFIX = "Fake"
 # GigE Vision numbers frames from 1 to 65,535 cyclically; USB3 Vision uses 64-bit numbers.
 _FRAME_IDS = (1 << 16) - 1
 _MICROSECOND_NS = 1_000
+# Largest difference between the set gain and the camera's gain, which has steps, relative to its range.
+_GAIN_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,6 +231,9 @@ class AravisCamera:
         if not low <= gain <= high:
             raise OutOfRange(self.name, "gain", gain, low, high, "")
         camera.set_gain(gain)
+        actual = camera.get_gain()
+        if not abs(actual - gain) <= _GAIN_TOLERANCE * (high - low):
+            raise Refused(self.name, f"its gain is {actual:g} after {gain:g} was set: choose a possible gain")
 
     def _set_exposure(self, camera: Any, exposure_ns: int) -> None:
         camera.set_exposure_time(exposure_ns / _MICROSECOND_NS)

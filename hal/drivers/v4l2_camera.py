@@ -522,10 +522,18 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
     return layout
 
 
+def set_exactly(device: VideoDevice, path: str, what: str, control: int, value: int) -> None:
+    """Set a control. Raises Refused if the camera keeps another value, for example because of its step."""
+    actual = device.set_control(control, value)
+    if actual != value:
+        cure = "`v4l2-ctl --list-ctrls` lists the values of each control and its step"
+        raise Refused(path, f"{what} is {actual} after {value} was set: {cure}")
+
+
 def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
     """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange."""
     if device.control_range(AUTO_GAIN) is not None:
-        device.set_control(AUTO_GAIN, 0)
+        set_exactly(device, settings.path, "automatic gain", AUTO_GAIN, 0)
     gain = settings.gain
     if gain is None:
         return
@@ -534,7 +542,7 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
         if known is not None:
             if not known[0] <= gain <= known[1]:
                 raise OutOfRange(settings.path, "gain", gain, *known, "")
-            device.set_control(control, gain)
+            set_exactly(device, settings.path, "gain", control, gain)
             return
     raise Refused(settings.path, "has no adjustable gain: omit `gain`")
 
@@ -542,13 +550,13 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
 def manual_exposures(name: str, device: VideoDevice, card: str) -> tuple[int, int]:
     """Switch automatic exposure off and return the range of exposure times.
 
-    Raises Refused if the camera has no control of the exposure time.
+    Raises Refused if the camera has no control of the exposure time, or keeps its automatic exposure.
     """
     exposures = device.control_range(EXPOSURE_ABSOLUTE)
     if exposures is None:
         raise Refused(name, f"{card} has no exposure control in units of time (exposure_absolute)")
     if device.control_range(EXPOSURE_AUTO) is not None:
-        device.set_control(EXPOSURE_AUTO, EXPOSURE_MANUAL)
+        set_exactly(device, name, "automatic exposure", EXPOSURE_AUTO, EXPOSURE_MANUAL)
     return exposures
 
 

@@ -204,7 +204,8 @@ class EmulatedGps:
             values[key] = int.from_bytes(pairs[4 : 4 + size], "little")
             pairs = pairs[4 + size :]
         keys = {RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, DYNAMIC_MODEL}
-        keys.update(*(PORT_KEYS[port] for port in self.ports), map(BAUD_RATE_KEYS.get, self.ports))
+        keys.update(*(PORT_KEYS[port] for port in self.ports))
+        keys.update(BAUD_RATE_KEYS[port] for port in self.ports if port in BAUD_RATE_KEYS)
         if not keys >= values.keys():
             return False
         port = self.ports[0]

@@ -56,6 +56,7 @@ class IoctlCamera:
         raw: content of each frame instead of a pattern, and its number of used bytes.
         held_ns: delay of the frames, ns.
         automatic_gain: gain after automatic exposure has been switched off.
+        stubborn: values of controls that accept each value, but do not keep it.
         intervals_ns: intervals of frames of which the nearest is chosen, or none for any interval.
         bandwidth: whether the USB bus has enough bandwidth left for the frames.
         draws: whether each frame has its own pattern; otherwise the buffer keeps its old content.
@@ -83,6 +84,7 @@ class IoctlCamera:
         self.held_ns = 0
         self.first_sequence = 0
         self.automatic_gain = 10
+        self.stubborn: dict[int, int] = {}
         self.bandwidth = True
         self.intervals_ns: tuple[int, ...] = ()
         self.knobs = {
@@ -241,7 +243,7 @@ class IoctlCamera:
         if argument.id == v4l2.EXPOSURE_AUTO and v4l2.GAIN in self.knobs and argument.value != knob.value:
             # Like many UVC cameras, the camera keeps the gain of its automatic exposure.
             self.knobs[v4l2.GAIN].value = self.automatic_gain
-        knob.value = argument.value
+        knob.value = self.stubborn.get(argument.id, argument.value)
 
     def _run(self) -> None:
         """Finish each frame whose end is due. A frame without a free buffer is lost."""

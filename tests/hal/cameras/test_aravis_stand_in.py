@@ -129,6 +129,9 @@ class FakeCamera:
     def set_gain(self, gain: float) -> None:
         self.set["gain"] = gain
 
+    def get_gain(self) -> float:
+        return float(self.set["gain"]) + self.known.get("gain_error", 0.0)
+
     def get_exposure_time_bounds(self) -> tuple[float, float]:
         return self.known["exposure_bounds"]  # type: ignore[no-any-return]  # two numbers
 
@@ -249,6 +252,7 @@ def test_a_camera_without_automatic_modes_keeps_its_gain(monkeypatch: pytest.Mon
         ({"rows": 804}, {}, Refused, "1001 x 803"),
         ({}, {"region": (0, 0, 632, 480)}, Refused, "632 x 480"),
         ({}, {"gain": False}, Refused, "gain"),
+        ({}, {"gain_error": 0.5}, Refused, "gain is 6.5 after 6 was set"),
         ({"gain": 24.5}, {}, OutOfRange, "gain"),
         ({"gain": -0.5}, {}, OutOfRange, "gain"),
         ({"exposure_ns": 9_999}, {}, OutOfRange, "exposure"),
@@ -269,6 +273,7 @@ def test_a_camera_that_cannot_be_set_up_is_refused(
 
 
 def test_the_bounds_of_gain_and_exposure_are_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    Rig(monkeypatch, {}, gain_error=0.2).driver.open()  # the steps of this camera are wide
     for gain, exposure in ((24.0, 10_000), (0.0, 2_000_000_000)):
         Rig(monkeypatch, {"gain": gain, "exposure_ns": exposure}).driver.open()
     Rig(monkeypatch, {"columns": 1001, "rows": 803}, steps=(1, 1)).driver.open()

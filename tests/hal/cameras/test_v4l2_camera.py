@@ -371,6 +371,23 @@ def test_the_camera_is_set_to_manual_with_its_gain_and_time_between_frames(
 
 
 @pytest.mark.parametrize(
+    ("control", "kept", "message"),
+    [
+        (v4l2.GAIN, 40, "gain is 40 after 42 was set"),
+        (v4l2.AUTO_GAIN, 1, "automatic gain is 1 after 0 was set"),
+        (v4l2.EXPOSURE_AUTO, 3, "automatic exposure is 3 after 1 was set"),
+    ],
+)
+def test_a_camera_that_does_not_keep_a_control_is_refused(
+    kernel: IoctlCamera, clock: ManualClock, control: int, kept: int, message: str
+) -> None:
+    kernel.knobs[v4l2.AUTO_GAIN] = Knob(0, 1, 1)
+    kernel.stubborn[control] = kept
+    with pytest.raises(Refused, match=message):
+        video_rig(kernel, clock, gain=42)
+
+
+@pytest.mark.parametrize(
     ("intervals_ms", "chosen_ms"),
     [((33, 66), 66), ((39, 80), 39), ((10, 20, 200), 200), ((10, 20), 20), ((40,), 40)],
 )
