@@ -139,6 +139,12 @@ IMU_UNUSABLE = _fault(
     "the inertial unit sends bytes that contain no reading",
     "configure the unit's output as the driver expects; check model and baud rate",
 )
+IMU_UPSET = _warn(
+    172,
+    "imu-upset",
+    "the inertial unit restarted or lost its settings, and is configured again",
+    "none for single events; if they continue, check the supply of the unit",
+)
 GYRO_LOST = _fault(
     155,
     "gyro-lost",

@@ -352,6 +352,8 @@ class Navigation:
         if (odd or endless) and not self._facts.holds(facts.GYRO_LOST):
             text = f"{odd} packets out of range, {endless} not finite: {link.rejection}"
             self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)
+        if link.upsets > before.upsets:
+            self._events.report(events.IMU_UPSET, now_ns, link.upset)
 
 
 GPS_DELAY_NS = 100_000_000

@@ -205,11 +205,18 @@ _REFUSED_WAIT_NS = 1_000_000_000
 
 
 class Recovery:
-    """Recovery of a lost unit, which counts the completed recoveries and keeps the unit's last refusal."""
+    """Recovery of a lost unit.
+
+    Attributes:
+        completed: number of completed recoveries.
+        refusal: last refusal of the unit, or an empty text after a completed recovery.
+        upsets: number of times that a unit which had sent readings was reset or had wrong settings.
+        upset: text about the last such event, or an empty text.
+    """
 
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
-        self.completed = 0
-        self.refusal = ""
+        self.completed = self.upsets = 0
+        self.refusal = self.upset = ""
         self._port, self._settings = port, settings
         self._own_rate = port.baud_rate
         self._others = [rate for rate in BAUD_RATES if rate != port.baud_rate]
@@ -225,9 +232,13 @@ class Recovery:
         self._is_fresh = False
         self._has_written = False
         self._has_asked = False
+        self._has_read = False
 
-    def reset(self) -> None:
-        """Record that the unit has restarted, and therefore runs with the settings in its flash memory."""
+    def reset(self, cause: str) -> None:
+        """Record that the unit needs to be configured, because it has restarted or has wrong settings."""
+        if self._has_read and not (self._was_reset or self._is_fresh):
+            self.upsets += 1
+            self.upset = cause
         # The first time stamp after a recovery steps back because of the restart that was already handled.
         self._was_reset = not self._is_fresh
 
@@ -242,7 +253,7 @@ class Recovery:
         if self._reading_ns is None:
             self._reading_ns = now_ns
         if readings:
-            self._is_fresh = False
+            self._is_fresh, self._has_read = False, True
         if readings and self._port.baud_rate == self._own_rate and not self._was_reset:
             self._reading_ns = now_ns
             self._has_asked = False
@@ -394,10 +405,10 @@ class ReadingConverter:
         rejection: quantity and value of the last sample with an invalid value, or an empty text.
     """
 
-    def __init__(self, settings: Vn100Settings, byte_ns: float, on_reset: Callable[[], None]) -> None:
+    def __init__(self, settings: Vn100Settings, byte_ns: float, on_reset: Callable[[str], None]) -> None:
         """Use the settings of the driver and the transmission time of one byte, `byte_ns`.
 
-        The function `on_reset` is called if the unit has restarted or has wrong settings.
+        The function `on_reset` is called with the cause if the unit has restarted or has wrong settings.
         """
         self.resets = 0
         self.out_of_range = 0
@@ -503,7 +514,7 @@ class ReadingConverter:
         self._odd_outputs += count
         if self._odd_outputs >= _CERTAIN:
             self._odd_outputs = 0
-            self._on_reset()
+            self._on_reset("the unit sends an output that was not requested")
 
     def _is_other(self, item: BinaryPacket | AsciiLine) -> bool:
         """Return whether a packet or line is neither the requested output nor an answer to a command."""
@@ -526,7 +537,7 @@ class ReadingConverter:
             device_ns = int(values[time])
             if device_ns < self._device_ns:
                 self.resets += 1
-                self._on_reset()
+                self._on_reset("the clock of the unit stepped back: the unit has restarted")
             self._check_step(device_ns - self._device_ns)
             self._device_ns = device_ns
         return device_ns, values[q], values[rate], values[mag], values[accel]
@@ -541,7 +552,7 @@ class ReadingConverter:
         off = min(part_ns, self._period_ns - part_ns) > 500_000_000 // IMU_RATE_HZ
         self._odd_steps = self._odd_steps + 1 if off else 0
         if self._odd_steps == _CERTAIN:
-            self._on_reset()
+            self._on_reset("the unit sends samples at a wrong rate")
 
     def _ascii_sample(self, line: AsciiLine) -> _Sample | None:
         values = measurement(line.sentence)
@@ -642,6 +653,8 @@ class Vn100:
             self._converter.not_finite,
             self._last_byte_ns,
             self._converter.rejection,
+            self._recovery.upsets,
+            self._recovery.upset,
         )
 
     @property

@@ -66,6 +66,9 @@ class ImuLink(NamedTuple):
         not_finite: number of samples with a value that is not finite.
         last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
         rejection: quantity and value of the last sample with an invalid value, or an empty text.
+        upsets: number of times that the unit restarted or had wrong settings, after which it is configured
+            again.
+        upset: text about the last of these events, or an empty text.
     """
 
     bytes_received: int
@@ -76,6 +79,8 @@ class ImuLink(NamedTuple):
     not_finite: int
     last_byte_ns: int
     rejection: str = ""
+    upsets: int = 0
+    upset: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ _PLAIN = {
         123 object-escapes  130 clock-off  131 field-refused  133 wide-lost  135 wide-false  141 sun-missed
         142 astray  143 coil-corrected  150 returned  151 gps-link  152 field-extrapolated  153 gps-set-up
         154 camera-saturated  157 lens-changed  160 battery-low  161 battery-very-low  165 power-sensor-lost
-        170 work-shed
+        170 work-shed  172 imu-upset
         """,
     "fault": """
         4 task-failed  9 no-progress  10 imu-silent  13 imu-line-lost  16 imu-unusable  49 worker-rests

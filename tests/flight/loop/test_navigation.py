@@ -307,6 +307,13 @@ def test_damaged_packets_are_counted_since_the_last_cycle() -> None:
     ]
 
 
+def test_a_unit_that_needs_to_be_configured_again_is_reported_with_the_cause() -> None:
+    bench = Bench()
+    bench.update(BEGIN + 10 * MS, upsets=1, upset="the unit sends samples at a wrong rate")
+    bench.update(BEGIN + 20 * MS, upsets=1, upset="the unit sends samples at a wrong rate")
+    assert bench.reports == [("imu-upset", BEGIN + 10 * MS, "the unit sends samples at a wrong rate")]
+
+
 def test_impossible_values_are_counted_unless_the_gyro_is_known_to_be_lost() -> None:
     bench = Bench()
     bench.update(BEGIN + 10 * MS, out_of_range=2, not_finite=1, rejection="field 3 T")

@@ -130,7 +130,7 @@ class FakeCamera:
         self.set["gain"] = gain
 
     def get_gain(self) -> float:
-        return float(self.set["gain"]) + self.known.get("gain_error", 0.0)
+        return float(self.set["gain"]) + float(self.known.get("gain_error", 0.0))
 
     def get_exposure_time_bounds(self) -> tuple[float, float]:
         return self.known["exposure_bounds"]  # type: ignore[no-any-return]  # two numbers

@@ -148,6 +148,7 @@ def test_a_unit_with_saved_binary_output_is_set_up_again_after_a_reset(bench: Be
     reset(bench)
     bench.run(1.5)
     assert bench.driver.resets == 1
+    assert (bench.driver.link().upsets, "has restarted" in bench.driver.link().upset) == (1, True)
     assert bench.unit.registers.read(85)[:3] == ("20", "20", "20")
 
 
@@ -188,7 +189,7 @@ def test_readings_are_not_lost_if_a_command_cannot_be_sent(
         raise NotResponding("line", "the output queue is full")
 
     monkeypatch.setattr(bench.line.host, "send", full)
-    bench.driver._recovery.reset()
+    bench.driver._recovery.reset("a restart")
     assert len(bench.run(1.0)) >= 39
 
 

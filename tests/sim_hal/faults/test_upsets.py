@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -146,6 +148,9 @@ def test_a_unit_with_additional_or_missing_outputs_is_set_up_again(register: int
     bench.run(2.0)
     assert bench.driver.recoveries == 1
     assert len(bench.run(1.0)) == pytest.approx(40, abs=1)
+    link = bench.driver.link()
+    assert link.upsets == 1
+    assert re.search("output that was not requested|at a wrong rate", link.upset)
 
 
 @pytest.mark.parametrize(("register", "bit"), [(6, 9), (7, 12), (75, 1), (75, 100)])
@@ -158,6 +163,7 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
     assert (bench.unit.registers.read(register) != before) == (bit < 100)
     assert len(bench.run(2.0)) == pytest.approx(80, abs=1)
     assert bench.driver.recoveries == 0
+    assert (bench.driver.link().upsets, bench.driver.link().upset) == (0, "")
 
 
 @pytest.mark.parametrize("name", UPSETS)

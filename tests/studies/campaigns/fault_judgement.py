@@ -26,7 +26,7 @@ _STARS = {"stars-refused", "streak-refused", "vision-failed"}
 OWN: Mapping[str, frozenset[str]] = {
     "imu": frozenset(
         {"imu-silent", "imu-corrupt", "imu-implausible", "imu-line-lost", "imu-refused", "imu-unusable"}
-        | {"gyro-lost"}
+        | {"gyro-lost", "imu-upset"}
     ),
     "pwm": frozenset({"coil-fault"}),
     "bus": frozenset({"coil-fault", "power-fault"}),
