@@ -41,7 +41,7 @@ def test_flight_and_link_run_the_new_release(observations: dict[str, Any]) -> No
     assert flown[0].endswith("+2")
 
 
-def test_a_release_whose_service_does_not_fly_gives_way_to_the_previous_one(
+def test_a_release_whose_service_does_not_fly_is_replaced_by_the_previous_one(
     observations: dict[str, Any],
 ) -> None:
     status, printed = observations["broken"]["steps"]["activate"]

@@ -108,7 +108,7 @@ CHOOSERS: dict[str, Callable[[Path], None]] = {
 
 
 @pytest.mark.parametrize("damage", CHOOSERS.values(), ids=CHOOSERS)
-def test_without_a_usable_answer_of_releases_py_the_current_release_flies_and_says_so(
+def test_without_a_usable_choice_of_releases_py_the_current_release_flies_and_reports_it(
     board: FakeBoard, damage: Callable[[Path], None]
 ) -> None:
     damage(_chooser(board))

@@ -19,7 +19,7 @@ def _rows(page: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/results/testbed.md"])
-def test_the_thesis_s_power_stands_beside_the_power_from_the_supply(page: str) -> None:
+def test_the_power_of_the_thesis_is_stated_beside_the_power_from_the_supply(page: str) -> None:
     rows = [first for first, others in _rows(page).items() if "0.10 W" in others]
     assert rows
     assert all("from the supply" in first and "R I²" not in first for first in rows)

@@ -85,7 +85,7 @@ def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path:
     assert text.count("Standard deviation of MAG") == 1, "the first object has no magnitude"
 
 
-def test_the_orbit_of_the_camera_stands_beside_the_tracks(tmp_path: Path) -> None:
+def test_the_orbit_message_has_one_state_of_the_camera_for_each_frame(tmp_path: Path) -> None:
     """Two objects of one frame share one camera state. A sighting has no state if the orbit is unknown."""
     states = [([7e6 + k, -1e6, 2e6], [1e3, 7e3 - k, -5e2]) for k in range(3)]
     track = [

@@ -28,7 +28,7 @@ def _stand_apart(plain: Picture, drawn: Picture) -> bool:
     return bool(coloured.any() and np.all(np.any(drawn[around] != plain[around], axis=1)))
 
 
-def test_streaks_and_objects_stand_apart_from_a_white_sky_and_the_picture_is_left_alone() -> None:
+def test_marks_on_a_white_sky_have_an_outline_and_the_picture_is_not_changed() -> None:
     plain = _sky(200, 255)
     ends = np.array([[[20.0, 30.0], [60.0, 50.0]], [[100.0, 5.0], [195.0, 150.0]]])
     drawn = draw_marks(plain, ends, np.array([True, False]), [np.array([[150.0, 40.0], [160.0, 50.0]])])

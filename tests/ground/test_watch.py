@@ -379,7 +379,7 @@ def test_a_watch_ends_if_the_flight_no_longer_answers(
     assert done.stderr.endswith("no further answer\n")
 
 
-def test_what_is_neither_a_run_nor_a_socket_is_refused(tmp_path: Path) -> None:
+def test_a_path_that_is_neither_a_run_nor_a_socket_is_refused(tmp_path: Path) -> None:
     done = command("watch", tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
 

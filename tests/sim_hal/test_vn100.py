@@ -544,7 +544,7 @@ def test_factory_settings_of_the_filters_registers(register: int, default: str) 
 
 
 @pytest.mark.parametrize("register", [36, 38, 50, 51])
-def test_what_is_written_is_echoed_kept_and_saved(register: int) -> None:
+def test_written_values_are_echoed_kept_and_saved(register: int) -> None:
     """Written values are echoed, kept and saved.
 
     The commands have the format of the SDK: numbers with six decimals, and register numbers with two digits.

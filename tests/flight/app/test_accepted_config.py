@@ -226,7 +226,7 @@ def test_a_disk_that_fails_is_tried_again(tmp_path: Path) -> None:
     assert texts_kept(folder) == [TEXT]
 
 
-def test_a_flight_of_a_kept_configuration_says_so_and_records_it_as_an_event(
+def test_a_flight_of_a_stored_configuration_reports_it_as_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config, state = write_config(tmp_path), tmp_path / "state"

@@ -107,7 +107,7 @@ def test_over_udp_a_refusal_is_exit_status_1_and_one_json_object(capsys: pytest.
         (["ping"], 1, "no flight listens there"),
     ],
 )
-def test_what_cannot_be_sent_is_one_line(
+def test_commands_that_cannot_be_sent_are_refused_in_one_line(
     place: Path, words: list[str], status: int, problem: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["command", "--to", str(place), *words]) == status

@@ -25,7 +25,7 @@ from flight.link.frames import (
 SPACECRAFT = 0x1A5
 
 
-def test_each_bit_of_the_header_stands_where_the_standard_puts_it() -> None:
+def test_each_bit_of_the_header_is_at_its_place_in_the_standard() -> None:
     header = TelecommandHeader(spacecraft=SPACECRAFT, channel=0b10_1101, sequence=0x7E).pack(0x123 + 1)
     version, bypass, control, reserved = "00", "1", "0", "00"
     bits = (
@@ -136,7 +136,7 @@ def test_frames_of_other_channels_that_were_received_do_not_interrupt_a_packet()
     assert found == [packet(0, 2 * ROOM - 6)]
 
 
-def test_a_packet_is_not_continued_where_the_pointer_says_that_another_begins() -> None:
+def test_a_packet_is_not_continued_if_the_pointer_marks_the_begin_of_another() -> None:
     made, assembler = framer(), PacketAssembler()
     frames = made.add(packet(0, ROOM)) + made.add(packet(1, 2 * ROOM))
     header, data, _ = open_telemetry(frames[0], SPACECRAFT)

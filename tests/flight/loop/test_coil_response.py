@@ -164,7 +164,7 @@ def _moved(
     return np.array((x, y, z)), np.array((bx, by, bz))
 
 
-def test_of_a_free_body_no_sound_coil_is_found_reversed() -> None:
+def test_no_healthy_coil_of_a_free_body_is_found_reversed() -> None:
     sound = Orbiting(np.ones(3))
     sound.fly(60.0)
     assert sound.response.axes(Finding.REVERSED) == []
@@ -172,7 +172,9 @@ def test_of_a_free_body_no_sound_coil_is_found_reversed() -> None:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_magnetometer(axis: int) -> None:
+def test_a_reversed_coil_of_a_free_body_is_found_although_its_field_exceeds_that_of_the_earth(
+    axis: int,
+) -> None:
     signs = np.ones(3)
     signs[axis] = -1.0
     broken = Orbiting(signs)
@@ -184,7 +186,7 @@ PYRAMID = 0.4 * np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 
 
 
 @pytest.mark.parametrize("reversed_coil", [None, 0, 3])
-def test_of_four_coils_the_reversed_one_is_found(reversed_coil: int | None) -> None:
+def test_the_reversed_coil_of_four_coils_is_found(reversed_coil: int | None) -> None:
     """A reversed coil of four is found, although the four currents are correlated by their common dipole."""
     signs = np.where(np.arange(4) == reversed_coil, -1.0, 1.0)
     flown = Orbiting(signs, dipoles=PYRAMID)

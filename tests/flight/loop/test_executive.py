@@ -119,7 +119,7 @@ def test_groups_run_at_their_rates_the_more_important_first() -> None:
     assert notes.slips == []
 
 
-def test_a_task_that_stalls_makes_slips_and_then_the_grid_goes_on() -> None:
+def test_a_task_that_stalls_causes_slips_and_then_the_grid_continues() -> None:
     clock, notes = SimClock(), Notes()
     starts: list[int] = []
 

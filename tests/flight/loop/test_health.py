@@ -75,7 +75,7 @@ def test_a_slope_is_not_claimed_before_its_window_is_full() -> None:
         ({"proportional": 2e9}, "memory-high"),
     ],
 )
-def test_a_bound_that_is_passed_is_reported_after_some_looks_and_never_for_one(
+def test_an_exceeded_bound_is_reported_after_some_samples_and_never_for_one(
     change: dict[str, float], event: str
 ) -> None:
     for count, names in ((1, []), (4, [event])):

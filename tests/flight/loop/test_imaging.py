@@ -72,7 +72,7 @@ def test_rows_without_noise_do_not_count_as_repeated() -> None:
         (SolveStatus.AMBIGUOUS, 40, False),
     ],
 )
-def test_only_a_frame_of_many_stars_without_a_match_is_strange(
+def test_only_a_frame_of_many_stars_without_a_match_gives_the_event_camera_strange(
     status: SolveStatus, stars: int, strange: bool
 ) -> None:
     camera = Pinhole(320, 240, 400.0)

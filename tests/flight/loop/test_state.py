@@ -219,7 +219,7 @@ def keeper_on(disk: Disk, devices: str) -> StateKeeper:
     return StateKeeper(store, notices, ManualClock(), period_ns=10_000_000_000, devices=devices)
 
 
-def test_what_was_learned_of_other_devices_is_forgotten_and_reported() -> None:
+def test_estimates_for_other_devices_are_discarded_and_reported() -> None:
     disk = Disk()
     learned = {PLANT: Learned.of(np.array([0.01, 1e-3, 1.1]), np.eye(3) * 1e-8)}
     first = keeper_on(disk, "a")

@@ -96,7 +96,7 @@ def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -
     assert not second.notices(), "reported once"
 
 
-def test_what_is_noted_is_on_disk_after_a_period_with_the_operating_time() -> None:
+def test_noted_values_are_on_disk_after_a_period_with_the_operating_time() -> None:
     disk, clock = Disk(), ManualClock()
     keeper = keeper_on(disk, clock)
     learned = Learned.of(np.array([1e-4, 0.0, 0.0]), np.eye(3) * 1e-10)

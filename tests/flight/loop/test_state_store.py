@@ -33,7 +33,7 @@ FOLDER = Path("/state")
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_what_is_stored_is_read_back_by_another_process_of_the_application(tmp_path: Path) -> None:
+def test_a_stored_state_is_read_by_another_process_of_the_application(tmp_path: Path) -> None:
     reports = Reports()
     store = StateStore(tmp_path, reports)
     assert store.load() == StoredState(), "a folder without a state is a first boot"
@@ -99,7 +99,7 @@ def test_the_model_of_power_loss_finds_a_write_that_forgets_to_sync(forgotten: s
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EIO, errno.EROFS])
-def test_a_disk_that_fails_at_any_call_keeps_a_whole_state_and_says_so(error: int) -> None:
+def test_a_disk_that_fails_at_any_call_keeps_an_intact_state_and_the_failure_is_reported(error: int) -> None:
     for stop in range(calls_of_one_write(1 << 30)):
         disk, reports = Disk(), Reports()
         store = _stored(disk, reports)

@@ -292,7 +292,7 @@ def test_progress_counts_all_cases_and_those_that_were_done_before(
     assert shown.endswith("] 3/3  0 s left\r\x1b[K")
 
 
-def test_a_complete_campaign_says_when_it_began_and_that_nothing_ran(
+def test_a_complete_campaign_reports_its_start_and_that_no_case_ran(
     tmp_path: Path, in_process: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fly(TOY, 3, 5, tmp_path)

@@ -319,9 +319,7 @@ def test_a_guardian_that_died_is_a_fault_of_the_step(tmp_path: Path, monkeypatch
     assert scripted.report()["steps"]["dark"]["findings"][0]["part"] == "guardian"
 
 
-def test_devices_that_were_missing_are_looked_for_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_devices_are_searched_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scripted = Scripted(monkeypatch, tmp_path, find=Outcome([FAULT], {"answers": {"gps": "no answer"}}))
     scripted.run()
     scripted.done.clear()

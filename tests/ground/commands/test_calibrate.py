@@ -82,7 +82,7 @@ def test_undetermined_parameters_of_the_lens_are_named_and_not_written(
     assert load_camera(out).lens.k2 == 0.0  # type: ignore[union-attr]  # it has just been written
 
 
-def test_a_camera_file_says_how_well_the_lens_is_known(calibrated: tuple[dict[str, Any], Path]) -> None:
+def test_a_camera_file_states_the_uncertainty_of_the_lens(calibrated: tuple[dict[str, Any], Path]) -> None:
     """`knightcube rate` uses the uncertainty of the focal length in the camera file."""
     facts, out = calibrated
     accuracy = load_camera(out).accuracy

@@ -194,7 +194,7 @@ def test_the_commented_example_of_the_testbed_is_right(tmp_path: Path) -> None:
     configuration.load(with_camera(tmp_path, other[other.index("{") :], 12))
 
 
-def test_nothing_of_aravis_is_imported_before_such_a_camera_is_opened() -> None:
+def test_no_module_of_aravis_is_imported_before_an_aravis_camera_is_opened() -> None:
     source = (ROOT / "hal" / "drivers" / "aravis_camera.py").read_text(encoding="utf-8")
     top = [line for line in source.splitlines() if line.startswith(("import ", "from "))]
     assert not [line for line in top if "gi" in line.split() or "aravis" in line]

@@ -104,7 +104,7 @@ def test_a_rate_is_printed_in_milliradians_with_its_deviation() -> None:
     ]
 
 
-def test_a_rate_of_unknown_sign_says_so() -> None:
+def test_the_text_of_a_rate_states_that_its_sign_is_unknown() -> None:
     text = rate._text(motion(status=StreakStatus.AMBIGUOUS), ())
     assert "direction:     unknown, the rate may have the opposite sign: give --prior\n" in text
 

@@ -54,7 +54,7 @@ def test_every_command_has_a_help(words: list[str], capsys: pytest.CaptureFixtur
     assert "usage: knightcube" in output
 
 
-def test_a_short_flight_says_what_it_did_and_what_to_do_next(tmp_path: Path) -> None:
+def test_a_short_flight_prints_its_results_and_the_next_command(tmp_path: Path) -> None:
     done = command("run", DEMO, "--duration", "3", "--out", tmp_path / "run", "--seed", "4")
     assert done.returncode == 0
     assert "knightcube report" in done.stdout

@@ -268,9 +268,7 @@ def test_the_schedule_consists_of_commands_that_can_be_sent(capsys: pytest.Captu
         assert end.words == "point nadir"
 
 
-def test_elements_may_stand_in_a_file_of_their_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_elements_may_be_in_a_separate_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "elements.txt"
     file.write_text("SATELLITE\n" + "\n".join(POLAR_ORBIT) + "\n")
     assert main(["passes", str(file), "--from", "2026-03-20T12:00:00", *BERLIN]) == 0

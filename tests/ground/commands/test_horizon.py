@@ -63,7 +63,7 @@ def test_colour_without_an_altitude_gives_one_and_a_picture(folder: Path) -> Non
     assert orange > 512
 
 
-def test_a_picture_without_a_horizon_says_so_with_exit_status_1(folder: Path) -> None:
+def test_a_picture_without_a_horizon_is_reported_with_exit_status_1(folder: Path) -> None:
     done = command("horizon", folder / "sky.png", "--fov", "67", "--json")
     assert done.returncode == 1
     assert json.loads(done.stdout)["status"] == "no-horizon"

@@ -138,7 +138,7 @@ def test_a_run_that_learned_nothing_is_refused() -> None:
         learned_description(packed_run(description=[(10.0, packet)]), config)
 
 
-def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Path) -> None:
+def test_estimated_sensor_errors_are_combined_with_the_configured_ones(tmp_path: Path) -> None:
     config = tmp_path / "known.yaml"
     config.write_text(
         "extends: orbit_3u\ninertial_unit:\n  calibration:\n"

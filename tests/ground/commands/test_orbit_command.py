@@ -83,7 +83,7 @@ def test_the_orbit_is_the_true_one_in_each_form(
     assert rows["CZ_DOT_X"].endswith("[km**2/s]")
 
 
-def test_a_short_arc_is_said_to_be_one(
+def test_a_short_arc_is_reported_as_such(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     run, _ = tracked(60.0)

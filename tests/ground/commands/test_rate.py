@@ -125,7 +125,7 @@ def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) 
     assert done.stderr.count("\n") == 1
 
 
-def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, picture: Path) -> None:
+def test_options_describe_the_camera_and_a_refusal_states_the_reason(scene: Scene, picture: Path) -> None:
     """A stated point spread function that is too wide increases the uncertainty, or leads to a refusal.
 
     The true width is 1 px. With a stated width of 2 px, the uncertainty is larger. With 4 px, the rate is
@@ -155,7 +155,7 @@ def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, pictur
     assert "times as wide as configured" in json.loads(wrong.stdout)["reason"]
 
 
-def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_path: Path) -> None:
+def test_the_configuration_of_a_camera_states_its_uncertainty(picture: Path, tmp_path: Path) -> None:
     def sigma(accuracy: str) -> float:
         path = tmp_path / "camera.yaml"
         lens = f"{{focal_length: {CAMERA.pinhole.focal_length}, centre: [319.5, 319.5]}}"

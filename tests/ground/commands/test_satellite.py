@@ -221,7 +221,7 @@ def test_the_optional_numbers_of_a_goal_are_not_named_as_missing(capsys: pytest.
     assert made.target.numbers == ()
 
 
-def test_options_may_stand_behind_the_command() -> None:
+def test_options_may_follow_the_command() -> None:
     assert words("slew", "0.2", "--json", "--timeout", "7").timeout == 7.0
     assert words("slew", "0.2").timeout == 2.0
 

@@ -188,7 +188,7 @@ def test_the_overlay_shows_the_stars_and_the_text_lists_them(picture: Path, tmp_
     assert coloured > 1000
 
 
-def test_a_picture_without_stars_is_not_solved_and_says_why(tmp_path: Path) -> None:
+def test_a_picture_without_stars_is_not_solved_and_the_reason_is_stated(tmp_path: Path) -> None:
     noise = np.random.default_rng(33).normal(100.0, 10.0, (256, 256)).astype(np.uint16)
     path = tmp_path / "noise.png"
     pillow.fromarray(noise).save(path, compress_level=1)

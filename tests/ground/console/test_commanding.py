@@ -183,7 +183,7 @@ sys.exit("knightcube: the disk failed")
 """
 
 
-def test_a_flight_that_writes_much_goes_on_and_its_failure_is_reported(
+def test_a_flight_with_long_output_continues_and_its_failure_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pipe that nobody reads blocks a process after 64 KiB."""
@@ -258,7 +258,7 @@ def during(feed: LinkFeed, request: Callable[[], Any]) -> Any:
     return result
 
 
-def test_a_file_goes_up_stands_in_the_list_and_comes_down_again(
+def test_a_file_is_uplinked_listed_and_downlinked_again(
     console: tuple[Ends, LinkFeed, LinkFiles],
 ) -> None:
     _, feed, files = console

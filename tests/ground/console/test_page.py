@@ -146,7 +146,7 @@ def satellite(browser: Any, orbit_url: str) -> Page:
     return open_page(browser, orbit_url)
 
 
-def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder: Path) -> None:
+def test_a_page_of_a_restarted_console_states_that_it_is_stale(folder: Path) -> None:
     with ExitStack() as first, ExitStack() as second:
         url = first.enter_context(serving(folder))
         page = second.enter_context(opened(url))

@@ -356,7 +356,7 @@ def test_an_inertia_known_for_sure_makes_the_torque_constant_of_the_motion(
     assert plant.torque_constant.sigma == pytest.approx(made.sigma("gain") * world.inertia, rel=1e-3)
 
 
-def test_without_a_magnetometer_the_field_is_as_uncertain_as_believed_and_says_so(
+def test_without_a_magnetometer_the_field_has_its_configured_uncertainty(
     identified: list[Identified],
 ) -> None:
     world, _, made = identified[0]

@@ -65,7 +65,7 @@ def test_the_record_does_not_depend_on_the_truth_log(short: Run) -> None:
         assert np.array_equal(getattr(with_truth, name), getattr(without, name))
 
 
-def test_samples_that_the_host_noted_late_stand_at_the_time_of_the_unit(short: Run) -> None:
+def test_samples_that_the_host_received_late_have_the_time_of_the_unit(short: Run) -> None:
     exact = recorded(short).time
     rng = np.random.default_rng(6)
     noted = short["imu"]["sample_time_ns"] + (20e6 * rng.uniform(size=len(exact)) ** 3).astype(int)

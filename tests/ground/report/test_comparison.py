@@ -124,7 +124,7 @@ def test_events_are_counted_in_both(pair: tuple[Path, Path]) -> None:
     assert facts["events"] == [{"name": "target", "a": 8, "b": 6}]
 
 
-def test_as_text_the_runs_stand_beside_each_other(pair: tuple[Path, Path]) -> None:
+def test_the_text_shows_both_runs_side_by_side(pair: tuple[Path, Path]) -> None:
     done = command("report", *pair)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"A  {pair[0]}: 90.0 s of made-up on simulated devices, seed 7, lock-step")

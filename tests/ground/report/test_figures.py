@@ -80,7 +80,7 @@ def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
     assert drawn.max() == CURRENT
 
 
-def test_the_thesis_line_stands_beside_the_supply_power_and_r_i_squared_apart(tmp_path: Path) -> None:
+def test_the_plot_has_lines_for_the_thesis_the_supply_power_and_r_i_squared(tmp_path: Path) -> None:
     """A coil with 0.1 A for a tenth of the time takes 34 mW at 3.4 V, and 50 mW from the bus.
 
     The plot has separate lines for the thesis's limit, for the supply power and for R I^2.

@@ -115,7 +115,7 @@ def test_requirements_are_judged_and_what_cannot_be_known_is_unknown(folder: Pat
     assert [row["verdict"] for row in wider] == ["unknown", "pass", "pass"]
 
 
-def test_without_the_configuration_nothing_is_judged_and_the_report_says_so(
+def test_without_the_configuration_no_requirement_is_judged_and_the_report_states_it(
     folder: Path, tmp_path: Path
 ) -> None:
     for log in folder.glob("*.ccsds"):

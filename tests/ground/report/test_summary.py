@@ -61,7 +61,7 @@ def test_every_step_of_a_full_run_is_judged_on_the_truth(full: Run) -> None:
     assert not summary["run"]["cut_short"]
 
 
-def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
+def test_the_worst_value_of_each_result_is_stated_beside_that_of_the_thesis(full: Run) -> None:
     rows = {row["quantity"]: row for row in summarise(full)["thesis"]}
     limits = {name: (row["limit"], row["unit"]) for name, row in rows.items()}
     assert limits == {
@@ -103,7 +103,7 @@ def test_without_truth_estimate_and_written_currents_are_judged(tmp_path: Path) 
     assert "no truth log: judged on the estimate" in summary["notes"]
 
 
-def test_a_run_cut_short_is_judged_on_its_complete_steps_and_says_so(tmp_path: Path) -> None:
+def test_a_truncated_run_is_judged_on_its_complete_steps_and_reported_as_truncated(tmp_path: Path) -> None:
     summary = summarise(short(tmp_path))
     assert [step["complete"] for step in summary["steps"]] == [True, True, False]
     unfinished = summary["steps"][2]
@@ -370,7 +370,7 @@ def test_the_text_shows_the_table_of_the_thesis(full: Run) -> None:
     assert max(len(line) for line in text.splitlines()) <= 120
 
 
-def test_the_text_of_the_barest_run_says_what_is_missing(tmp_path: Path) -> None:
+def test_the_text_of_a_run_without_optional_packets_states_the_missing_results(tmp_path: Path) -> None:
     changes = {"truth": False, "identity": False, "performance": False, "commands": False, "duration": 0.5}
     text = format_report(summarise(short(tmp_path, **changes)))
     assert "note: no target packets" in text

@@ -211,7 +211,7 @@ def test_a_late_frame_has_the_time_of_its_exposure(kernel: IoctlCamera, clock: M
     video.camera.close()
 
 
-def test_a_camera_that_does_not_expose_as_long_as_it_says_is_refused(
+def test_a_camera_whose_exposure_differs_from_the_reported_one_is_refused(
     kernel: IoctlCamera, clock: ManualClock
 ) -> None:
     video = settled(kernel, clock)
@@ -264,7 +264,7 @@ def test_an_unplugged_camera_is_reported_and_comes_back_by_itself(
     video.camera.close()
 
 
-def test_a_camera_that_stands_still_is_opened_again(kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_a_camera_that_sends_no_frames_is_opened_again(kernel: IoctlCamera, clock: ManualClock) -> None:
     video = settled(kernel, clock)
     kernel.stopped = True
     video.camera.trigger(EXPOSURE_NS)

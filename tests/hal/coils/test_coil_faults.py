@@ -227,7 +227,7 @@ def test_close_gives_zero_from_every_state_and_twice(rig: Rig, bring_there: Call
     assert not rig.clock.tickers
 
 
-def test_off_gives_up_after_its_tries_and_the_job_goes_on_trying(rig: Rig) -> None:
+def test_off_gives_up_after_its_tries_and_the_job_continues_to_write_zero(rig: Rig) -> None:
     _commanded(rig)
     rig.wire.bus.nack(PCA, times=None)
     before = rig.wire.bus.transactions

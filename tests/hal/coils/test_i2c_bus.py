@@ -277,7 +277,7 @@ def test_faults_of_the_wire_affect_messages_too(bus: SMBus, kernel: IoctlWire) -
 
 
 @pytest.mark.parametrize(("size", "code"), [(5, errno.EOPNOTSUPP), (7, errno.EOPNOTSUPP), (8, errno.EINVAL)])
-def test_what_the_adapter_cannot_do_is_refused_like_the_kernels(
+def test_transfers_that_the_adapter_does_not_support_have_the_errors_of_the_kernel(
     kernel: IoctlWire, size: int, code: int
 ) -> None:
     """An adapter refuses transfers that it does not support, with the errors of the kernel.

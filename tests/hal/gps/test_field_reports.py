@@ -313,7 +313,7 @@ def sentence(text: str) -> bytes:
         (frame(NAV_PVT, PVT.packed()), ""),
     ],
 )
-def test_what_keeps_fixes_away_is_named(piece: bytes, named: str) -> None:
+def test_the_cause_of_missing_fixes_is_named(piece: bytes, named: str) -> None:
     _, driver, _ = received([piece] * 50)
     condition = driver.link().condition
     assert named in condition

@@ -54,7 +54,7 @@ def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> t
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
+def test_the_errors_agree_with_the_covariance(known: bool) -> None:
     """The NEES at the ends of 60 passes has the sum of a chi-square with 120 degrees of freedom."""
     rng = np.random.default_rng(16)
     times = np.arange(0.0, 24.0, _PERIOD)

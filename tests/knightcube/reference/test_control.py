@@ -40,7 +40,7 @@ def test_an_unknown_torque_is_learnt_and_the_offset_goes() -> None:
     assert largest_error(fixed, 0.1, 20.0) == pytest.approx(math.degrees(4e-3), abs=0.05)
 
 
-def test_nothing_is_learnt_while_the_coil_is_at_its_limit_nor_from_noise() -> None:
+def test_no_parameter_is_adapted_while_the_coil_is_at_its_limit_or_by_noise() -> None:
     controller = AdaptiveController(BELIEVED, PERIOD, replace(SETTINGS, reference_bandwidth=None))
     before = controller.parameters.copy()
     assert controller.command(PathSample(1.0, 0.0, 0.0), 0.0, 0.0).saturated

@@ -125,7 +125,7 @@ def test_edges_and_flat_parts_have_no_response_and_corners_have_one(neighbours: 
     assert response[20, 20] == pytest.approx(0.5 if neighbours == 4 else 1.0)
 
 
-def test_a_threshold_hides_weak_corners_and_lets_strong_ones_through() -> None:
+def test_a_threshold_removes_weak_corners_and_keeps_strong_ones() -> None:
     image = np.zeros((40, 40))
     image[10:16, 10:16], image[25:31, 25:31] = 1.0, 0.3
     both = trajkovic_response(image, 8, 0.02, 0.02)

@@ -67,7 +67,7 @@ def test_the_streaks_of_every_detector_are_identified_and_both_ends_give_the_rat
     assert np.linalg.norm(found.rate) == pytest.approx(np.linalg.norm(frame.rate), rel=0.02)
 
 
-def test_the_errors_of_attitude_and_rate_are_of_the_size_that_they_are_said_to_be() -> None:
+def test_the_errors_of_attitude_and_rate_agree_with_their_covariances() -> None:
     """The squared normalised errors of ten frames are below twice the 1e-5 quantiles of chi-square."""
     attitude, rate = 0.0, 0.0
     for seed in range(10):

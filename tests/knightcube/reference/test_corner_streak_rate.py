@@ -115,7 +115,7 @@ def test_a_prior_decides_the_direction_of_time() -> None:
     np.testing.assert_array_equal(backward.endpoints, forward.endpoints[:, ::-1])
 
 
-def test_first_ends_are_the_earlier_ones() -> None:
+def test_the_first_end_of_each_streak_is_the_earlier_one() -> None:
     rng = np.random.default_rng(12)
     rate = rate_at(0.5 * np.pi, 50.0 / _FOCAL)
     directions, magnitudes = random_stars(rng, _SMALL.pinhole, 0.03, 6.5)
@@ -144,7 +144,7 @@ def test_the_prior_counts_only_beyond_its_own_error() -> None:
 
 
 @pytest.mark.parametrize("length", [0.0, 5.0, 12.0, 17.0])
-def test_below_twenty_pixels_it_says_too_short(length: float) -> None:
+def test_streaks_below_twenty_pixels_are_reported_as_too_short(length: float) -> None:
     rate = rate_at(0.5 * np.pi, length / _FOCAL)
     result = _estimate(star_frame(_WHOLE, rate, 1.0, 3, faintest=7.0), _WHOLE, rate)
     assert result.status is StreakStatus.TOO_SHORT

@@ -333,7 +333,7 @@ def test_noisy_stars_give_the_attitude_of_the_q_method_within_its_uncertainty() 
         assert optimal.loss <= found.loss < 1.02 * optimal.loss + 1e-6
 
 
-def test_a_prior_that_looks_away_is_refused() -> None:
+def test_a_prior_with_the_opposite_boresight_is_refused() -> None:
     observed, reference, true = _stars(5, 0.0)
     behind = multiply(from_rotation_vector(np.array([np.pi, 0.0, 0.0])), true)
     with pytest.raises(AttitudeError, match="in front of the camera"):

@@ -82,7 +82,7 @@ def test_keys_out_of_order_and_ends_that_are_not_numbers_are_refused() -> None:
         star_tables.build_k_vector(np.array([1.0])).ranges(np.nan, 1.0)
 
 
-def test_members_of_ranges_stand_one_after_the_other_with_their_range() -> None:
+def test_members_of_ranges_are_consecutive_and_have_the_number_of_their_range() -> None:
     place, owner = star_tables.members(np.array([3, 7, 0]), np.array([5, 7, 3]))
     assert place.tolist() == [3, 4, 0, 1, 2]
     assert owner.tolist() == [0, 0, 2, 2, 2]

@@ -50,7 +50,9 @@ def _campaign(name: str) -> Outcome:
 
 
 @pytest.mark.parametrize(("name", "limit"), [("logarithmic", 0.005), ("linear", 0.01)])
-def test_the_sun_is_found_to_hundredths_of_a_degree_wherever_it_stands(name: str, limit: float) -> None:
+def test_the_sun_is_found_to_hundredths_of_a_degree_at_any_position_in_the_frame(
+    name: str, limit: float
+) -> None:
     """The Sun is found to hundredths of a degree at any position in the frame.
 
     A pixel is 0.15 deg, and the core of the Sun's disc is saturated in both cameras. The test uses twelve

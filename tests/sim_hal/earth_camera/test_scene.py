@@ -256,7 +256,7 @@ def test_lines_just_inside_the_limb_hit_the_ellipsoid_and_lines_just_outside_pas
     assert np.all(np.isinf(upward.heights))
 
 
-def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
+def test_the_intersection_is_on_the_ellipsoid_and_on_the_line() -> None:
     generator = np.random.default_rng(3)
     scene = random_scene(generator, NOISELESS)
     rays = nadir(scene) + 0.1 * np.array([random_direction(generator) for _ in range(50)])

@@ -46,7 +46,7 @@ def released(section: FreeBodySection, seed: int = 1, currents: FloatArray = MOV
     return body
 
 
-def test_the_body_is_held_until_its_release_while_the_orbit_goes_on() -> None:
+def test_the_body_does_not_move_before_its_release_while_the_orbit_continues() -> None:
     body = released(FreeBodySection(release=TipOff(speed=0.2)))
     first = body.motion(0)
     held = body.motion(2 * SECOND - 1)
@@ -60,7 +60,7 @@ def test_the_body_is_held_until_its_release_while_the_orbit_goes_on() -> None:
     assert body.supply_energy == pytest.approx(3.4 * 0.06, rel=1e-6)
 
 
-def test_the_result_hardly_depends_on_how_often_time_is_advanced_and_looked_at() -> None:
+def test_the_result_hardly_depends_on_the_number_of_time_steps_and_reads() -> None:
     seldom, often = released(FreeBodySection()), released(FreeBodySection())
     for step in range(1, 4001):
         often.advance_to(step * SECOND // 200)
@@ -226,7 +226,7 @@ def independent(
 
 
 @pytest.mark.parametrize("craft", ["knightcube", "cubesat_3u"])
-def test_coils_and_gravity_gradient_turn_the_body_as_another_integrator_says(
+def test_the_motion_under_coils_and_gravity_gradient_equals_that_of_another_integrator(
     craft: Literal["knightcube", "cubesat_3u"],
 ) -> None:
     section = FreeBodySection(craft=craft, disturbances=QUIET)

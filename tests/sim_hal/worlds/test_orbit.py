@@ -302,7 +302,7 @@ ABERRATION = 20.5 * ARCSECOND
         (2_448_908.5, (-0.93739691, -0.31316824, -0.13577924)),
     ],
 )
-def test_the_sun_stands_where_it_was_published(
+def test_the_position_of_the_sun_is_the_published_one(
     julian_date: float, published: tuple[float, float, float]
 ) -> None:
     """The position of the Sun agrees with published positions to 40" and 1e-4 AU.
@@ -453,7 +453,7 @@ def test_the_air_turns_with_the_earth() -> None:
     assert speed == pytest.approx(7.292115e-5 * np.linalg.norm(around.position), rel=1e-6)
 
 
-def test_what_is_random_depends_on_the_seed_alone() -> None:
+def test_random_quantities_depend_on_the_seed_alone() -> None:
     asked_often, asked_once, other = make(), make(), make(seed=2)
     for time in range(0, 1500, 7):
         asked_often.at(float(time))

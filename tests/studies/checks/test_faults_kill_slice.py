@@ -49,7 +49,7 @@ def board(folder: Path, bus: Any = None) -> Board:
     return made
 
 
-def test_a_coil_that_nobody_zeroes_is_reported_and_one_that_is_zeroed_is_not(
+def test_a_coil_that_stays_driven_is_reported_and_a_coil_that_is_zeroed_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(faults_kill, "LIMIT_S", 0.1)

@@ -138,7 +138,7 @@ def test_the_campaign_meets_every_fault_in_every_mode() -> None:
     assert len(met) == len(drawn)
 
 
-def test_its_table_shows_the_worst_of_each_fault() -> None:
+def test_the_table_of_the_campaign_shows_the_worst_result_of_each_fault() -> None:
     base = {
         "exercised": True,
         "detected_s": 0.5,

@@ -107,7 +107,7 @@ def refly(
     return orbit_faults.run(Case(name, (seed, number), {"fault": fault, "mode": mode}))
 
 
-def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
+def test_false_pictures_from_the_start_do_not_cause_a_permanent_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Flight 97 of seed 3: false pictures caused a bias of 0.5 deg/s; then every new attitude failed."""

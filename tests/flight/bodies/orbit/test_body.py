@@ -319,7 +319,7 @@ def test_sun_readings_go_to_the_acquisition_and_to_the_filter() -> None:
     bench.found._sun.accept.assert_called_once_with("reading")
 
 
-def test_what_the_filter_learned_is_stored_with_the_factors_of_the_coils() -> None:
+def test_estimates_of_the_filter_are_stored_with_the_factors_of_the_coils() -> None:
     found = estimation()
     correction = CoilCorrection()
     correction.weigh(1, 0.8)

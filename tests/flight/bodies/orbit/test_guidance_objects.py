@@ -143,7 +143,7 @@ def test_a_knightcube_follows_an_object_through_ten_seconds_without_it() -> None
     assert max(flown.off[25:]) < 3.0
 
 
-def test_a_3u_says_when_its_torque_does_not_suffice() -> None:
+def test_a_3u_reports_that_its_torque_is_not_sufficient() -> None:
     flown = chase(LONG, 0.6, 0.0)
     flown.fly(8)
     names = [name for name, _ in flown.told]

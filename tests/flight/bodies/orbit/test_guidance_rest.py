@@ -167,7 +167,7 @@ def test_a_new_plan_is_followed_from_its_start_or_if_it_is_late_from_the_present
         assert flight.planner.counts() == (1, 0)
 
 
-def test_without_a_plan_for_the_rest_the_running_plan_goes_on(slew: PointingTable) -> None:
+def test_without_a_plan_for_the_rest_the_current_plan_continues(slew: PointingTable) -> None:
     for value, outcome, events in ((None, "done", []), (None, "died", ["planner-failed"])):
         flight = Flight()
         flight.paths.offer(slew, NADIR, 0)

@@ -65,7 +65,7 @@ def test_the_predicted_field_is_the_simulators_within_what_models_and_coils_diff
     assert np.ptp(np.unwrap(directions[3:8])) > 4.0
 
 
-def test_the_local_frame_looks_down_and_ahead() -> None:
+def test_the_axes_of_the_local_frame_are_nadir_and_the_direction_of_flight() -> None:
     frame = local_frame(np.array([7e6, 0.0, 0.0]), np.array([10.0, 7.5e3, 0.0]))
     assert frame @ frame.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(frame) == pytest.approx(1.0)

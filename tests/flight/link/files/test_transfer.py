@@ -239,7 +239,9 @@ def test_a_wrong_checksum_and_a_full_disk_are_reported_and_nothing_is_kept(
     assert not [path for path in folder.received.rglob("*") if path.is_file()]
 
 
-def test_metadata_that_a_failing_disk_could_not_judge_are_judged_when_they_come_again(tmp_path: Path) -> None:
+def test_metadata_that_could_not_be_checked_on_a_failing_disk_are_checked_when_repeated(
+    tmp_path: Path,
+) -> None:
     reasons: list[str | OSError] = [OSError(errno.EIO, "failed"), "not allowed"]
 
     def accept(_: Metadata) -> str:
@@ -430,7 +432,9 @@ def _sliced(missing: set[int]) -> list[tuple[int, int]]:
     return gaps[:1] + [(max(begin, 7), end) for begin, end in gaps if end > 7][-1:]
 
 
-def test_the_same_file_asked_for_again_goes_on_and_a_ninth_is_refused(tmp_path: Path, file: Path) -> None:
+def test_a_repeated_request_of_a_file_continues_its_transfer_and_a_ninth_transfer_is_refused(
+    tmp_path: Path, file: Path
+) -> None:
     pair = Pair(tmp_path, 0.0)
     first = pair.send(SATELLITE, file, "a")
     assert pair.send(SATELLITE, file, "a").number == first.number

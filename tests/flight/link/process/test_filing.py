@@ -143,7 +143,7 @@ def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
 
 
 @pytest.mark.parametrize("name", [b"bad\xff", b"loop"])
-def test_a_strange_name_in_the_log_does_not_end_the_link(link: FiledEnds, name: bytes) -> None:
+def test_a_name_that_is_not_utf_8_in_the_log_does_not_end_the_link(link: FiledEnds, name: bytes) -> None:
     """The link continues if the log contains a file name that is not UTF-8, or a symbolic link to itself."""
     link.record(*timing_packets(50))
     run = link.place / "runs" / "run-000001"
@@ -188,7 +188,7 @@ def test_a_file_that_was_not_asked_for_replaces_no_file_on_the_ground(link: File
 @pytest.mark.parametrize(
     "name", ["log/../../keys/satellite/1.a", "keys/1.a", "/etc/passwd", "log/link", "log", "received/none"]
 )
-def test_nothing_outside_the_two_folders_comes_down_or_is_deleted(link: FiledEnds, name: str) -> None:
+def test_no_file_outside_the_two_folders_is_sent_or_deleted(link: FiledEnds, name: str) -> None:
     (link.place / "secret").write_text("x")
     (link.place / "runs" / "link").symlink_to(link.place / "secret")
     assert "such file" in (said := link.command(SendFile(name))) or "name" in said

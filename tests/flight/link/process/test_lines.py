@@ -19,7 +19,7 @@ FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")
 ELSEWHERE = [IPv4Network("192.0.2.0/24")]
 
 
-def test_udp_telemetry_goes_to_authentic_senders_for_a_minute_and_to_nobody_else() -> None:
+def test_udp_telemetry_is_sent_to_authentic_senders_only_and_for_a_minute() -> None:
     line = UdpLine("127.0.0.1:0")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
         ground.bind(("127.0.0.1", 0))

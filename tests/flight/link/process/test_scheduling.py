@@ -179,7 +179,7 @@ def test_the_list_has_the_results_of_past_entries(link: BothEnds) -> None:
     assert len(texts(link, send(link, Listing()))[1:-2]) == 8
 
 
-def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> None:
+def test_commands_that_cannot_be_scheduled_are_refused_with_the_reason(link: BothEnds) -> None:
     def refused(at: str, words: str) -> str:
         counter = send(link, Scheduled(at, words))
         assert link.stages(counter) == ["accepted", "failed"]

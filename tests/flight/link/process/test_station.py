@@ -201,7 +201,7 @@ def test_a_counter_that_is_next_is_obeyed_up_to_the_highest(link: BothEnds, coun
     assert [stages.count("repeated"), stages.count("refused")] == [good, 2 * (not good)]
 
 
-def test_a_report_that_cannot_be_packed_is_counted_said_and_does_not_end_the_link(
+def test_a_report_that_cannot_be_packed_is_counted_and_reported_and_does_not_end_the_link(
     link: BothEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(station, "_HIGHEST_REPORTED", 2**64)

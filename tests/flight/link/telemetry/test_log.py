@@ -91,7 +91,7 @@ def test_a_budget_below_two_segments_is_refused(tmp_path: Path) -> None:
         FlightLog(tmp_path, clock=ManualClock(), segment_bytes=1000, budget_bytes=1999)
 
 
-def test_a_full_queue_loses_the_newest_and_says_so(tmp_path: Path) -> None:
+def test_a_full_queue_loses_the_newest_packets_and_reports_it(tmp_path: Path) -> None:
     log = FlightLog(tmp_path, clock=ManualClock(), queue_packets=5)
     packets = timing_packets(8)
     for packet in packets:

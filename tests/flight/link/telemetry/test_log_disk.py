@@ -68,7 +68,7 @@ def test_a_disk_that_was_full_and_has_room_again_gets_what_waited(tmp_path: Path
     assert (log.error(), log.lost) == ("", 0)
 
 
-def test_what_did_not_fit_while_the_disk_was_full_is_counted_to_the_end(tmp_path: Path) -> None:
+def test_packets_that_were_lost_on_a_full_disk_are_counted_until_the_end(tmp_path: Path) -> None:
     clock, disk = ManualClock(0), SmallDisk(0)
     packets = timing_packets(30)
     log = FlightLog(tmp_path, clock=clock, queue_packets=10, opener=disk.open)

@@ -112,7 +112,7 @@ def test_a_packet_that_is_a_segment_of_a_sequence_is_refused() -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 5, 77, 300])
-def test_a_run_with_a_torn_tail_is_reported_and_says_what_was_cut_off(
+def test_a_run_with_an_incomplete_end_is_reported_with_the_number_of_lost_bytes(
     run: Path, tmp_path: Path, cut: int
 ) -> None:
     whole = read_run(run)

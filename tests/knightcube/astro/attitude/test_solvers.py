@@ -169,7 +169,7 @@ def test_two_close_stars_give_the_attitude_to_the_accuracy_of_their_directions()
 
 @pytest.mark.parametrize("name", _ALL)
 @pytest.mark.parametrize(("n", "half_field"), [(2, _FIELD), (6, None), (20, _FIELD)])
-def test_errors_are_as_large_as_the_covariance_says(name: str, n: int, half_field: float | None) -> None:
+def test_errors_agree_with_the_covariance(name: str, n: int, half_field: float | None) -> None:
     rng = np.random.default_rng([66, n])
     runs, total, losses = 120, 0.0, 0.0
     for _ in range(runs):

@@ -66,7 +66,7 @@ WAYS: dict[
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_errors_are_as_large_as_the_covariance_says(way: str) -> None:
+def test_errors_agree_with_the_covariance(way: str) -> None:
     """With full covariances, the mean NEES of 150 attitudes is in its 99.9 % band."""
     make, lopsided = WAYS[way]
     rng = np.random.default_rng(SEED)

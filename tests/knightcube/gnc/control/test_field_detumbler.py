@@ -485,7 +485,7 @@ def test_a_dipole_without_growth_makes_the_body_no_faster_and_what_brakes_it_sta
     assert 30 < changed < 70
 
 
-def test_of_two_quantities_none_grows_and_a_dipole_that_can_keep_both_is_not_given_up() -> None:
+def test_neither_of_two_quantities_grows_and_a_feasible_dipole_is_not_set_to_zero() -> None:
     rng = np.random.default_rng(6)
     idle = 0
     for _ in range(200):

@@ -167,7 +167,7 @@ def test_the_error_is_that_of_the_shorter_rotation() -> None:
     assert command.error == pytest.approx(6.0 - 2.0 * math.pi)
 
 
-def test_without_authority_the_coil_is_off_and_says_so() -> None:
+def test_without_authority_the_coil_is_off_and_the_output_states_it() -> None:
     tracker = LqTracker(PLANT, *WEIGHTS)
     lost = tracker.command(REST, math.pi / 2 - 0.01, 0.0)
     assert not lost.authority

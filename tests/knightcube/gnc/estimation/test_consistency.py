@@ -24,7 +24,7 @@ def flown() -> dict[str, list[Result]]:
 
 
 @pytest.mark.parametrize("scene", ["testbed", "free"])
-def test_errors_and_innovations_are_as_large_as_the_filter_says(
+def test_errors_and_innovations_agree_with_the_covariance_of_the_filter(
     scene: str, flown: dict[str, list[Result]]
 ) -> None:
     """The NEES at the end of the runs is in its 99.9 % band.

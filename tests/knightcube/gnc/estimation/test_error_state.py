@@ -78,7 +78,7 @@ def test_a_considered_block_is_not_corrected_and_keeps_its_covariance() -> None:
     np.testing.assert_allclose(after[:3], optimal[:3], rtol=1e-9, atol=1e-12)
 
 
-def test_the_blocks_stand_one_after_the_other_and_a_fixed_one_is_known() -> None:
+def test_the_blocks_of_the_state_are_consecutive_and_a_fixed_block_is_known() -> None:
     layout = ErrorState(with_role(BLOCKS, {"rate": Role.FIXED}))
     assert layout.sizes == {"rate": 3, "bias": 2, "age": 1}
     np.testing.assert_array_equal(layout.prior[3:5, 3:5], [[0.04, 0.01], [0.01, 0.09]])

@@ -97,7 +97,7 @@ def test_the_residual_dipole_is_estimated_within_its_uncertainty() -> None:
     assert np.all(np.abs(missing) < 4.0 * sigma)
 
 
-def test_late_attitudes_serve_as_well_as_timely_ones() -> None:
+def test_late_attitudes_give_nearly_the_accuracy_of_timely_ones() -> None:
     timely, late = (fly(120, 3, age) for age in (0.0, 3.0))
     assert late[0].refused == 0
     assert angle_between(late[0].quaternion, late[1]) < 4.0 * STAR

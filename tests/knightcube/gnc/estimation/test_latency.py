@@ -61,7 +61,7 @@ def test_the_age_of_samples_is_estimated_and_corrected(late: int) -> None:
         assert sigmas(flight, follow_late(flight, late, SETTINGS)[1]) > 10.0
 
 
-def test_the_error_of_the_age_is_as_large_as_the_filter_says() -> None:
+def test_the_error_of_the_age_agrees_with_its_variance() -> None:
     """The sum of the squared normalised errors of the age in ten flights agrees with chi-square (99.9 %)."""
     squares = []
     for seed in range(20, 30):

@@ -199,7 +199,7 @@ def test_holding_the_old_target_is_adrift_once_a_plan_for_the_new_one_is_late(gu
     assert guidance.is_adrift(121 * SECOND + SECOND // 2)
 
 
-def test_what_remains_of_a_path_counts_from_now_and_is_nothing_for_another_target(
+def test_the_remaining_path_begins_now_and_is_none_for_another_target(
     guidance: PathGuidance, good: StepPlan
 ) -> None:
     assert guidance.remains(103 * SECOND) == good.path.starting_at(-3 * SECOND)

@@ -34,7 +34,7 @@ def test_current_and_acceleration_are_inverse(angle: float, rate: float, acceler
     assert THREAD.currents(*arrays)[0] == pytest.approx(current, rel=1e-12, abs=1e-15)
 
 
-def test_full_current_turns_the_knightcube_as_the_torque_says() -> None:
+def test_full_current_accelerates_the_knightcube_by_torque_divided_by_inertia() -> None:
     """The full current accelerates a KnightCube by 4.3157e-5 N m / 1.05e-3 kg m^2 = 0.041102 rad/s^2.
 
     The torque is 80 x 0.0081 m^2 x 4.5e-4 T x 0.148 A.

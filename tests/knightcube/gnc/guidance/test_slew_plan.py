@@ -69,7 +69,7 @@ def test_a_slew_of_least_time_is_found_although_the_first_path_cannot_be_flown()
     assert off_degrees(flown(plan, task)[:4], np.array(case["qf"])) <= 0.005
 
 
-def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
+def test_if_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_requested_horizon() -> None:
     """If no initial guess leads to a path of the requested duration, a longer slew is planned and shortened.
 
     The slew is case 21 of `bench orbit_slews`.

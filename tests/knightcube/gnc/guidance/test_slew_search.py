@@ -382,7 +382,7 @@ def test_a_guess_that_ends_without_a_path_is_not_tried_again(monkeypatch: pytest
     assert (found, search.tried, len(solver.asked)) == ([], 1, 1)
 
 
-def test_of_three_paths_the_cheapest_is_tried_and_the_next_ones_later(
+def test_the_path_of_least_heat_of_three_is_tried_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     solver = Guesses({"a": 8, "b": 8, "c": 8}, {})

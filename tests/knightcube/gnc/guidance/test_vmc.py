@@ -119,7 +119,7 @@ def bang_bang_time(problem: Problem) -> float:
     return leg(rest, switch) + leg(end, switch) + (opening if against else -opening)
 
 
-def test_the_thesis_slew_is_stretched_to_nearly_the_bang_bang_time_and_says_so() -> None:
+def test_the_thesis_slew_is_stretched_to_nearly_the_bang_bang_time_and_reported_as_stretched() -> None:
     found = THESIS.planned()
     shortest = bang_bang_time(THESIS)
     assert shortest == pytest.approx(13.7, abs=0.05)  # value of errata.md

@@ -20,7 +20,7 @@ DATA = Path(__file__).resolve().parents[5] / "shared/data"
 PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hale_bopp.jpg", "orion2.jpg")
 
 
-def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> None:
+def test_the_number_of_scan_lines_that_cross_a_circle_follows_from_its_extent() -> None:
     """Scan lines cross a circle as often as its extent in x and y predicts.
 
     A scan line is counted only up to 0.954 of the radius from the centre, where the cosine of the angle

@@ -301,7 +301,7 @@ def test_predicted_stars_are_measured_to_the_bound_and_named_by_their_prediction
     assert 0.8 < np.mean(nees) < 1.25
 
 
-def test_nothing_is_found_where_there_is_no_star() -> None:
+def test_no_star_is_found_at_a_position_without_a_star() -> None:
     pixels = frame_of(CAMERA, PLACES, np.full(30, MAGNITUDE), [2, 41])
     empty = np.array([[5.0, 5.0], [700.0, 1019.0], [-50.0, 20.0], [3000.0, 10.0]])
     apart = np.linalg.norm(empty[:2, None] - PLACES, axis=-1).min()

@@ -113,7 +113,9 @@ def test_other_cameras_and_worse_detectors_are_supported(kind: ListKind) -> None
 
 
 @pytest.mark.parametrize(("false_stars", "least"), [(3, 6), (10, 6), (20, 5)])
-def test_false_stars_brighter_than_all_true_ones_do_not_hide_the_sky(false_stars: int, least: int) -> None:
+def test_false_stars_brighter_than_all_true_ones_do_not_prevent_the_identification(
+    false_stars: int, least: int
+) -> None:
     """False stars that are brighter than all true stars do not prevent the identification.
 
     The lists are a small part of the lists of `python -m tests.studies.bench starid --hard`, with an unknown

@@ -30,7 +30,7 @@ from sim_hal.worlds.orbit import sun_position
 from tests.support.compiled_forms import assert_forms_agree
 
 
-def test_the_identity_looks_at_the_north_celestial_pole() -> None:
+def test_the_boresight_of_the_identity_is_the_north_celestial_pole() -> None:
     assert Pointing.of(IDENTITY).declination == pytest.approx(0.5 * np.pi)
 
 
