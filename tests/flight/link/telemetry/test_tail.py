@@ -125,6 +125,6 @@ def test_a_run_with_an_incomplete_end_is_reported_with_the_number_of_lost_bytes(
     assert 1 <= lost <= 10
     summary = summarise(torn)
     (row,) = [row for row in summary["logs"] if row["log"] == "flight"]
-    assert row["truncated_bytes"] == torn.flight.truncated_bytes
+    assert row["truncated_bytes"] == torn.flight.truncated_bytes > 0
     assert torn.flight.skipped_bytes == 0
     assert "Log integrity" in format_report(summary)
