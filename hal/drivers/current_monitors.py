@@ -67,6 +67,7 @@ class PolledMonitor(Generic[_Reading]):
 
 CONFIG, SHUNT, BUS, POWER = 0x00, 0x01, 0x02, 0x03
 
+BUS_32_V = 1 << 13
 AVERAGE_128 = 0b1111
 CONTINUOUS = 0b111
 SHUNT_STEP_V = 10e-6
@@ -99,8 +100,11 @@ def range_for(maximum_current: float, shunt_ohm: float) -> int:
 
 
 def config_for(range_bits: int) -> int:
-    """Return the Config word for the 16 V bus range, the given shunt range and continuous conversions."""
-    return range_bits << 11 | AVERAGE_128 << 7 | AVERAGE_128 << 3 | CONTINUOUS
+    """Return the Config word for the 32 V bus range, the given shunt range and continuous conversions.
+
+    The bus voltage has steps of 4 mV in both ranges of the chip, 16 V and 32 V.
+    """
+    return BUS_32_V | range_bits << 11 | AVERAGE_128 << 7 | AVERAGE_128 << 3 | CONTINUOUS
 
 
 class Ina219(PolledMonitor[PowerReading]):

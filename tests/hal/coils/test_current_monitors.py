@@ -41,8 +41,19 @@ def test_the_narrowest_range_is_chosen(current: float, bits: int) -> None:
     assert range_for(current, 0.1) == bits
 
 
-def test_config_asks_for_16_v_80_mv_and_128_samples() -> None:
-    assert config_for(0b01) == 0x0FFF
+def test_config_asks_for_32_v_80_mv_and_128_samples() -> None:
+    assert config_for(0b01) == 0x2FFF
+
+
+def test_a_supply_of_24_v_is_measured() -> None:
+    """The INA219 measures up to 26 V, but its 16 V range reports at most 16 V."""
+    rig = Rig()
+    rig.wire.monitor._measure = lambda start_ns, end_ns: (24.0, 0.1)
+    monitor = Ina219(rig.bus, INA, rig.clock)
+    rig.clock.advance(1400 * MS)
+    reading = monitor.latest()
+    assert reading is not None
+    assert (reading.voltage, reading.current) == pytest.approx((24.0, 0.1), abs=4e-3)
 
 
 @pytest.mark.parametrize(
@@ -204,14 +215,14 @@ def test_a_brown_out_is_detected_reported_and_repaired(rig: Rig) -> None:
     rig.wire.monitor.brown_out()
     rig.clock.advance(200 * MS)
     assert "brown-out" in monitor.error()
-    assert rig.wire.monitor.register(0x00) == 0x0FFF
+    assert rig.wire.monitor.register(0x00) == 0x2FFF
     rig.clock.advance(1200 * MS)
     assert monitor.error() == ""
 
 
 def test_a_brown_out_is_reported_even_if_an_earlier_run_had_set_the_chip_up() -> None:
     rig = Rig()
-    rig.bus.write_i2c_block_data(INA, 0x00, [0x0F, 0xFF])
+    rig.bus.write_i2c_block_data(INA, 0x00, [0x2F, 0xFF])
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.clock.advance(400 * MS)
     assert monitor.error() == ""
