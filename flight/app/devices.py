@@ -497,17 +497,23 @@ def open_ublox(rig: Rig, gps: Gps) -> GpsReceiver:
 
 
 def probe_ublox(rig: Rig, gps: Gps) -> str:
-    """Wait for bytes of the GPS receiver, which sends without a request.
+    """Wait for bytes of the GPS receiver, whose baud rate the driver changes if necessary."""
+    port = rig.wires.serial(gps.device, gps.baud_rate)
+    return _wait_for(lambda: bool(port.receive()), rig, gps, "byte")
+
+
+def _wait_for(arrived: Callable[[], bool], rig: Rig, gps: Gps, what: str) -> str:
+    """Wait until a GPS receiver, which sends without a request, has sent `what`. Raises NotResponding.
 
     A receiver sends at least once a second after its power-on, and once per `period` after a flight.
     """
     listened_ns = max(_LISTENED_NS, round((gps.period + 0.5) * SECOND_NS))
-    port, deadline_ns = rig.wires.serial(gps.device, gps.baud_rate), rig.clock.now_ns() + listened_ns
+    deadline_ns = rig.clock.now_ns() + listened_ns
     while rig.clock.now_ns() < deadline_ns:
-        if port.receive():
+        if arrived():
             return "sends"
         rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
-    silence = f"the port opens, but no byte arrived in {listened_ns * 1e-9:g} s"
+    silence = f"the port opens, but no {what} arrived in {listened_ns * 1e-9:g} s"
     raise NotResponding(gps.device, f"{silence}: check power, the cable and the baud rate")
 
 
@@ -517,7 +523,15 @@ def open_nmea(rig: Rig, gps: Gps) -> GpsReceiver:
     return NmeaReceiver(port, rig.clock, max(EARLIEST_NS, rig.earliest_utc_ns))
 
 
-probe_nmea = probe_ublox
+def probe_nmea(rig: Rig, gps: Gps) -> str:
+    """Wait for a valid sentence, because the driver cannot change the receiver's baud rate."""
+    receiver = open_nmea(rig, gps)
+
+    def arrived() -> bool:
+        receiver.poll()
+        return receiver.link().sentences > 0
+
+    return _wait_for(arrived, rig, gps, f"NMEA sentence at {gps.baud_rate} baud")
 
 
 def open_ads1115(rig: Rig, section: SolarStringsSection) -> AdsSolarStrings:

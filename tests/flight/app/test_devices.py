@@ -46,6 +46,23 @@ def test_a_receiver_that_sends_once_per_period_is_found(period: float, arrival: 
 
 
 @pytest.mark.parametrize(
+    ("data", "found"), [(b"$GNTXT,01,01,02,u-blox*12\r\n", True), (b"\x80\xf8" * 99, False)]
+)
+def test_a_receiver_with_another_baud_rate_is_found_only_by_a_driver_that_changes_it(
+    data: bytes, found: bool
+) -> None:
+    clock = SimClock()
+    port = Mock(receive=lambda: [(clock.now_ns(), data)], baud_rate=9600)
+    rig: Any = SimpleNamespace(clock=clock, wires=Mock(serial=lambda *_: port), earliest_utc_ns=0)
+    assert devices.probe_ublox(rig, Gps()) == "sends"
+    if found:
+        assert devices.probe_nmea(rig, Gps(driver="nmea")) == "sends"
+    else:
+        with pytest.raises(NotResponding, match=r"no NMEA sentence at 9600 baud arrived in 2\.5 s"):
+            devices.probe_nmea(rig, Gps(driver="nmea", baud_rate=9600))
+
+
+@pytest.mark.parametrize(
     ("quantity", "names", "problem"),
     [
         ("magnetic", ("x", "y", "y"), r"is \[x, y, y\]: name each of the sensor's axes x, y and z once"),
