@@ -239,9 +239,9 @@ def renewed_text(kind: str, artefact: Path, present: str, kept: str, digest: str
         lines = artefact.read_text(encoding="ascii").split("\n")
     except UnicodeDecodeError as error:
         raise Refused(f"the {kind} is not text: {error}") from error
-    if len([line for line in lines if line.strip()]) != 2:
-        raise Refused("elements are two lines")
     pair = [line.rstrip() for line in lines if line.strip()]
+    if len(pair) != 2:
+        raise Refused(f"the elements have {len(pair)} lines instead of two")
     return replaced(present, _VALUES[kind], json.dumps(pair))
 
 

@@ -521,7 +521,9 @@ class Renewal:
         word, kind = str(request.get("do", "")), str(request.get("kind", ""))
         try:
             if state.begun[name] > MOST_TRIES:
-                raise Refused(f"the board or the renewal program stopped {MOST_TRIES} times during it")
+                raise Refused(
+                    f"the board or the renewal program stopped {MOST_TRIES} times during this request"
+                )
             if word == "restart":
                 self._restart(name, str(request["part"]))
             elif kind in KINDS and word == "activate":
@@ -582,7 +584,7 @@ class Renewal:
                 replace_file(index, (staging / "artefact").read_bytes())
             new = board.keep("", staging / "set")
             if new == old:
-                raise Refused(f"this {kind} flies already")
+                raise Refused(f"this {kind} is in use already")
         state.trial = Trial(what, kind, version, name, old, new, "install", left_s, despite, before, session)
         self._save()
         self._continue()
@@ -635,7 +637,7 @@ class Renewal:
         if trial.what == "configuration":
             state.previous = trial.old
         state.trial = None
-        text = f"{kind} {trial.version} stays"
+        text = f"{kind} {trial.version} is kept"
         self._report(trial.request, "completed", "activate", text)
         self._report(name, "completed", "confirm", text)
         self._save()
@@ -683,7 +685,7 @@ class Renewal:
                 trial.new = self._built()
                 self._save()
             if trial.new == trial.old:
-                raise Refused("this release flies already")
+                raise Refused("this release is in use already")
             board.point("previous", trial.old)
             board.point("current", trial.new)
         board.restart()  # if killed before the state is stored, this step is repeated

@@ -104,7 +104,9 @@ def write_attitudes(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
     # Readers of the message refuse two attitudes with the same time.
     packets = packets[np.unique(packets["time_ns"], return_index=True)[1]]
     if not len(packets) or not len(run["navigation"]) or not len(run["run"]):
-        raise UsageError(f"{run.folder}: it has no attitudes of a satellite with respect to the stars")
+        raise UsageError(
+            f"{run.folder}: has no attitude with respect to the stars: give the run of a satellite"
+        )
     start_ns = int(run["run"]["utc_ns"][-1])
     dates = [ccsds_date(start_ns + int(time)) for time in packets["time_ns"]]
     lines = [

@@ -184,6 +184,12 @@ def flight_segments(folder: Path) -> list[Path]:
     return segments
 
 
+def not_a_folder(path: Path) -> UsageError:
+    """Return the error for a file that is given as a run, with its folder if that contains a flight log."""
+    near = f", such as {path.parent}" if find_segments(path.parent, "flight") else ""
+    return UsageError(f"{path}: is not a folder: give the folder of a run{near}")
+
+
 def is_first(segment: Path) -> bool:
     """Return whether a file is the first segment of a log, with the first packets of a flight."""
     return int(segment.stem.rpartition("-")[2]) == 1
@@ -193,7 +199,7 @@ def read_run(folder: Path) -> Run:
     """Read a run's folder. Raises UsageError if the folder has no flight log with a valid packet."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise UsageError(f"{folder}: is not a folder: give a run's folder, such as {folder.parent}")
+        raise not_a_folder(folder)
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a run (option --out of the run)")
     segments = flight_segments(folder)

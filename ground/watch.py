@@ -34,7 +34,16 @@ from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
 from ground.link.commanding import exchange
-from ground.telemetry import date_of, decode, flight_segments, is_first, named, scan, with_sorted_events
+from ground.telemetry import (
+    date_of,
+    decode,
+    flight_segments,
+    is_first,
+    named,
+    not_a_folder,
+    scan,
+    with_sorted_events,
+)
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import KnightCubeError, UsageError, reason_of
 
@@ -88,7 +97,7 @@ class LogTail:
         """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""
         if not folder.is_dir():
             if folder.exists():
-                raise UsageError(f"{folder}: is not a folder: give a run's folder, such as {folder.parent}")
+                raise not_a_folder(folder)
             cure = "give the folder of a run, or the socket of a flight in progress"
             raise UsageError(f"{folder}: no such folder or socket; {cure}")
         segments = flight_segments(folder)

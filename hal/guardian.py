@@ -317,7 +317,7 @@ class GuardianLine:
         try:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         except OSError as error:
-            raise NotResponding(DEVICE, f"no line to it: {error.strerror}") from error
+            raise NotResponding(DEVICE, f"its socket cannot be opened: {error.strerror}") from error
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _QUEUE_BYTES)
         reach = self._reach
         words = [str(theirs.fileno()), reach.opener, reach.where, *reach.words]

@@ -80,9 +80,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = vn100.add_argument
     add("--rate-deg-s", type=_number, metavar="R", help="rotate at a constant R degrees per second")
-    add("--amplitude-deg", type=_number, default=20.0, metavar="A", help="oscillation amplitude (default 20)")
-    add("--period-s", type=_positive, default=20.0, metavar="S", help="oscillation period (default 20)")
-    add("--field", type=_number, default=4.5e-4, metavar="T", help="tesla (default 4.5e-4)")
+    add(
+        "--amplitude-deg",
+        type=_number,
+        default=20.0,
+        metavar="A",
+        help="amplitude of the swing, deg (default 20)",
+    )
+    add("--period-s", type=_positive, default=20.0, metavar="S", help="period of the swing, s (default 20)")
+    add("--field", type=_number, default=4.5e-4, metavar="T", help="magnetic field, T (default 4.5e-4)")
     add("--baud", type=int, choices=BAUD_RATES, default=115200, help="baud rate of the unit (default 115200)")
     add("--noise", choices=sorted(PROFILES), default="thesis", help="noise profile (default thesis)")
     add("--seed", type=_seed, default=1, help="random seed of the sensor noise (default 1)")

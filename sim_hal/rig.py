@@ -518,8 +518,11 @@ def running_server(facts_path: Path) -> Iterator[Served]:
             facts = json.load(file)
             facts = {name: facts[name] for name in _FACTS}
         except (OSError, ValueError, LookupError, TypeError) as error:
-            problem = f"{facts_path} describes no server: give a file that `sim_hal serve --facts` wrote"
-            raise UsageError(problem) from error
+            problem = "describes no server"
+            if isinstance(error, OSError):
+                problem = f"cannot be read ({error.strerror})"
+            cure = "give a file that `python -m sim_hal serve --facts` wrote"
+            raise UsageError(f"--devices {facts_path}: {problem}: {cure}") from error
         try:
             lock_bus(file.fileno())
         except OSError as error:

@@ -79,7 +79,7 @@ from hal.guardian import GuardianLine
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Ticker
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 
 if TYPE_CHECKING:  # see `flight.app.run`
     from flight.loop.flight_loop import FlightLoop
@@ -653,9 +653,9 @@ def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes |
         data = _persistently(read, path)
         expected = _persistently(LinuxFiles().read, sum_file(path))
     except OSError as error:
-        return None, f"cannot be read: {error.strerror or error}", False
+        return None, f"cannot be read: {reason_of(error)}", False
     if data is None:
-        return None, f"cannot be read: {no_such_file()}", False
+        return None, f"cannot be read: {no_such_file(path)}", False
     if expected is None:
         dangling = os.path.lexists(sum_file(path))
         return data, f"{sum_file(path).name} leads nowhere" if dangling else "", False

@@ -505,7 +505,7 @@ class HealthWatch:
 
     def _check_streams(self, now_ns: int) -> None:
         error = self._power.error() if self._power is not None else ""
-        self._facts.update(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
+        self._facts.update(facts.POWER_FAULT, bool(error), now_ns, error or "readings arrive again")
         reading = self._power.latest() if self._power is not None else None
         if reading is not None and reading.time_ns != self._power_ns:
             self._power_ns = reading.time_ns

@@ -331,7 +331,7 @@ class PointingWatch:
             facts.HOLD_IMPOSSIBLE,
             impossible,
             now_ns,
-            lambda: f"{error:.2f} rad off for {settings.hold_patience:g} s",
+            lambda: f"{error:.2f} rad from the target for {settings.hold_patience:g} s",
         )
         return error
 
@@ -538,7 +538,7 @@ class ModeControl:
             self._steering.isolate()
         elif reaction is Reaction.RESTART:
             self.restart = f"{kind.name}: {text}"
-            self._stop(f"restart wanted: {self.restart}")
+            self._stop(f"restart requested: {self.restart}")
         elif reaction is Reaction.RETURN:
             if self._returns is not None and not _barred(self._facts):
                 self._fire(self._returns, kind.name, time_ns)
@@ -590,8 +590,8 @@ class ModeControl:
         slewing = (now_ns - self._machine.since_ns) * 1e-9
         near = error < settings.arrived_angle and self._targets.speed(estimate) < settings.arrived_rate
         if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
-            self._fire(Trigger.ARRIVED, f"{error:.4f} rad off", now_ns)
-        text = f"{error:.3f} rad off after {slewing:.0f} s"
+            self._fire(Trigger.ARRIVED, f"{error:.4f} rad from the target", now_ns)
+        text = f"{error:.3f} rad from the target after {slewing:.0f} s"
         self._facts.update(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
 
     def _fire(self, trigger: Trigger, reason: str, now_ns: int) -> None:

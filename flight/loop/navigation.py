@@ -332,7 +332,7 @@ class Navigation:
         limit_ns = self._settings.max_age_ns
         quiet_ns = now_ns - max(link.last_byte_ns, self._since_ns)
         silent = quiet_ns > limit_ns
-        text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
+        text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes arrive again"
         self._facts.update(facts.IMU_SILENT, silent, now_ns, text)
         if silent:
             self._bytes_since_ns = now_ns
@@ -415,7 +415,7 @@ class Positioning:
         cause = f": {link.condition}" if link.condition else ""
         text = error or f"no usable fix for {age_ns * 1e-9:.0f} s{cause}"
         lost_now = bool(error) or age_ns > self._max_age_ns
-        self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
+        self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes arrive again")
 
     def _watch_line(self, now_ns: int) -> GpsLink:
         """Record the counters of the serial line, report the problems that they indicate, and return them."""
@@ -611,7 +611,7 @@ class HorizonCameraTask:
         """Report the cameras that have delivered no frame for longer than the limit."""
         limit_ns = self._settings.max_age_ns
         old = [number for number, seen in enumerate(self._seen_ns) if now_ns - seen > limit_ns]
-        text = "frames come again"
+        text = "frames arrive again"
         if old:
             error = next((self._errors[number] for number in old if self._errors[number]), "")
             names = ", ".join(str(number + 1) for number in old)

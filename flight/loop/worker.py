@@ -61,7 +61,7 @@ def encode_values(value: Any) -> tuple[bytes, list[Array]]:
     try:
         return msgspec.msgpack.encode(tree), arrays
     except (OverflowError, UnicodeError) as error:
-        raise KnightCubeError(f"no value to be sent: {error}") from error
+        raise KnightCubeError(f"the value cannot be sent: {error}") from error
 
 
 def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:

@@ -32,7 +32,7 @@ from msgspec import Meta, inspect
 
 from hal.interfaces.errors import DeviceError, NotResponding
 from knightcube.astro.arrays import FloatArray
-from knightcube.errors import InputError, KnightCubeError
+from knightcube.errors import InputError, KnightCubeError, reason_of
 from knightcube.gnc.guidance.plant import Q2_LIMIT
 from knightcube.gnc.guidance.pointing_target import ROLLS, Goal, PointingTarget
 
@@ -281,10 +281,10 @@ def read_text(path: Path, packaged: bool = True) -> str:
         with path.open(encoding="utf-8") as file:
             text = file.read(_LONGEST + 1)  # a device file may be endless
     except FileNotFoundError as error:
-        missing = no_such_file() if packaged else "no such file; check the path"
+        missing = no_such_file(path) if packaged else "no such file; check the path"
         raise UnreadConfigError(str(path), f"cannot be read: {missing}") from error
     except OSError as error:
-        raise UnreadConfigError(str(path), f"cannot be read: {error}") from error
+        raise UnreadConfigError(str(path), f"cannot be read: {reason_of(error)}") from error
     except UnicodeDecodeError as error:
         raise not_utf_8(path, error) from error
     return checked_length(text, path)
@@ -301,9 +301,13 @@ def names() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
-def no_such_file() -> str:
-    """Return the message about a missing file, which lists the names of the packaged configurations."""
-    return f"no such file; the packaged configurations are {', '.join(names())}"
+def no_such_file(path: Path) -> str:
+    """Return the message about a missing file, with the most similar packaged configuration, or all."""
+    known = names()
+    similar = difflib.get_close_matches(path.name.removesuffix(".yaml"), known, n=1, cutoff=0.75)
+    if similar:
+        return f"no such file; did you mean the packaged configuration `{similar[0]}`?"
+    return f"no such file; the packaged configurations are {', '.join(known)}"
 
 
 def checked_length(text: str, path: Path) -> str:
@@ -411,7 +415,8 @@ def _read_once(text: str, name: str) -> Document:
         problem += next((cure for text, cure in _YAML_CURES.items() if text in problem), "")
         raise ConfigError(where, f"is not YAML: {problem.splitlines()[0]}") from error
     if not isinstance(values, dict):
-        raise ConfigError(name, "must be a mapping of sections, see config/step_demo.yaml")
+        problem = "is empty" if values is None else "is not a mapping"
+        raise ConfigError(name, f"{problem}: give lines of the form `key: value`")
     document = Document(values, name, lines, chain=(name,))
     _check_plain(values, "", document)
     return document

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from flight.schema.bodies import Craft, ExclusionCones, OrbitConfig, TestbedConfig, as_testbed
+from flight.schema.bodies import Craft, ExclusionCones, OrbitConfig, TestbedConfig, as_orbit, as_testbed
 from flight.schema.devices import (
     AravisDevice,
     Camera,
@@ -609,6 +609,14 @@ def load_testbed(path: Path) -> TestbedConfig:
     """Read and validate a configuration of the testbed. Raises ConfigError, also for another body."""
     try:
         return as_testbed(load(path))
+    except ConfigError as error:
+        raise placed(error, read_text(path), str(path)) from error
+
+
+def load_orbit(path: Path) -> OrbitConfig:
+    """Read and validate a satellite's configuration. Raises ConfigError, also for another body."""
+    try:
+        return as_orbit(load(path))
     except ConfigError as error:
         raise placed(error, read_text(path), str(path)) from error
 

@@ -242,7 +242,8 @@ def fly_case(case: Case) -> Result:
             flown = fly(request)
             report = summarise(read_run(request.out))
         except (KnightCubeError, DeviceError) as error:
-            return found | {"error": str(error), "config": given["config"]}
+            # The configuration is kept as `failed/KEY.yaml`; the temporary file of the message is deleted.
+            return found | {"error": str(error).replace(f"{place}/", ""), "config": given["config"]}
     if flown.interrupted:  # Ctrl-C also reaches the worker processes
         raise KeyboardInterrupt
     found["mode"] = flown.ending.mode

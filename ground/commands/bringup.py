@@ -29,7 +29,7 @@ from flight.schema.sections import Config
 from ground.bringup.bench import Outcome, Session, StepSkipped
 from ground.bringup.diagnosis import Finding
 from ground.bringup.session import STEPS, steps_of
-from ground.commands.options import interruptible, print_result
+from ground.commands.options import CONFIG_HELP, interruptible, print_result
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import write_picture
 
@@ -57,7 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  knightcube bringup /etc/knightcube/flight.yaml --out bench --only coils\n"
         "  knightcube bringup step_demo --out rehearsal        (with emulated devices)\n"
     )
-    parser.add_argument("config", type=config_path, metavar="CONFIG", help="file or installed name")
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help=CONFIG_HELP)
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the results (default: bringup)")
     parser.add_argument(
         "--only", action="append", choices=tuple(STEPS), help="repeat only this step (repeatable)"

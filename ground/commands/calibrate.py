@@ -43,8 +43,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"(`accuracy`); it needs at least {MIN_STARS} stars."
     )
     parser.epilog = "example: knightcube calibrate night*.tiff --fov 11.4 --out camera.yaml"
-    parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
-    parser.add_argument("--fov", type=positive, metavar="DEG", help="rough field of view across the columns")
+    text = "pictures of the night sky: PNG, TIFF, JPEG, BMP, PGM or FITS"
+    parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help=text)
+    parser.add_argument(
+        "--fov",
+        type=positive,
+        metavar="DEG",
+        help="rough field of view across the columns, deg (default: search)",
+    )
     text = "file to which the camera is written, for --camera of other commands"
     parser.add_argument("--out", type=Path, metavar="YAML", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -212,8 +218,12 @@ def configure_samples(parser: argparse.ArgumentParser) -> None:
         "commands to try are printed."
     )
     parser.epilog = "example: knightcube samples --out samples"
-    parser.add_argument("--out", type=Path, default=Path("samples"), metavar="DIR", help="default: samples")
-    parser.add_argument("--seed", type=seed_number, default=1, metavar="N", help="of the noise (default 1)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("samples"), metavar="DIR", help="folder (default samples)"
+    )
+    parser.add_argument(
+        "--seed", type=seed_number, default=1, metavar="N", help="seed of the noise (default 1)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run_samples)
 
@@ -264,7 +274,11 @@ def configure_index(parser: argparse.ArgumentParser) -> None:
     text = "magnitude of the faintest star that the camera detects (default %(default)s)"
     parser.add_argument("--faintest", type=float, default=DEFAULT.faintest, metavar="V", help=text)
     parser.add_argument(
-        "--epoch", type=float, default=DEFAULT.epoch, metavar="YEAR", help="Julian year (default %(default)s)"
+        "--epoch",
+        type=float,
+        default=DEFAULT.epoch,
+        metavar="YEAR",
+        help="epoch, as Julian year (default %(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="file of the index")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

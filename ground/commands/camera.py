@@ -18,7 +18,7 @@ from flight.app.run import RunRequest
 from flight.app.service import requested_config
 from flight.schema.devices import Camera, camera_model
 from flight.schema.document import ConfigError, config_path
-from ground.commands.options import finite, print_result
+from ground.commands.options import CONFIG_HELP, finite, print_result
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
@@ -50,9 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  knightcube camera --config step_demo --exposure 0.3 --rate 0.05 -0.02 0.01 --out turn.png\n"
         "  knightcube rate turn.png --camera step_demo --exposure 0.3 --prior 0.05 -0.02 0.01\n"
     )
-    parser.add_argument(
-        "--config", type=config_path, required=True, metavar="CONFIG", help="file or installed name"
-    )
+    parser.add_argument("--config", type=config_path, required=True, metavar="CONFIG", help=CONFIG_HELP)
     parser.add_argument("--out", type=Path, metavar="PNG", help="write the frame; several as name-NUMBER.png")
     parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
     text = "exposure time, 1e-6 to 10 s, instead of that of the configuration"

@@ -9,7 +9,7 @@ from pathlib import Path
 from flight.app.cli import PROGRAM, to_json
 from flight.app.cli.run import seed_number
 from flight.schema.document import config_path
-from ground.commands.options import count, interruptible, positive
+from ground.commands.options import CONFIG_HELP, count, interruptible, positive
 from knightcube.errors import UsageError
 
 
@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"example: {PROGRAM} campaign orbit_3u --vary craft.inertia=10% --vary detumble.act=0.5..2 --runs 50"
     )
     add = parser.add_argument
-    add("config", type=config_path, metavar="CONFIG", help="file or installed name")
+    add("config", type=config_path, metavar="CONFIG", help=CONFIG_HELP)
     text = (
         "random value, may be repeated: 10%% (uniform, relative), +-0.5 (uniform), 'normal 10%%' or "
         "'normal 0.5' (standard deviation), 1..5 (uniform), 'log 1..100' (uniform in the logarithm), 'a|b|c' "

@@ -16,8 +16,8 @@ import numpy as np
 from flight.app.cli import PROGRAM, to_json
 from flight.link.process.commanding import MOST_ENTRIES
 from flight.schema import reader as configuration
-from flight.schema.bodies import OrbitConfig, as_orbit
-from flight.schema.document import Document, config_path, convert, read_text
+from flight.schema.bodies import OrbitConfig
+from flight.schema.document import Document, config_path, convert, not_utf_8, read_text
 from ground.commands.options import finite, positive, print_result, utc
 from ground.report.text import number, table
 from ground.satellite_description import check_values, read_value
@@ -28,7 +28,7 @@ from knightcube.astro.earth.omm import NamedElements, read_elements
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.errors import KnightCubeError, UsageError, reason_of
 from knightcube.gnc.guidance.pointing_target import Goal
 from sim_hal.settings import OrbitSection, Simulation
 from sim_hal.worlds.orbit import elements, julian_date, propagate
@@ -101,12 +101,14 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
     orbit.add_argument("--epoch", metavar="UTC", help="required, such as 2026-03-20T12:00:00")
     orbit.add_argument("--eccentricity", type=finite, metavar="E", help=f"default {_ECCENTRICITY:g}")
     node = orbit.add_mutually_exclusive_group()
-    node.add_argument("--node", type=finite, metavar="DEG", help="right ascension of the ascending node (0)")
+    node.add_argument(
+        "--node", type=finite, metavar="DEG", help="right ascension of ascending node (default 0)"
+    )
     node.add_argument(
         "--local-time", type=finite, metavar="H", help="local time of the ascending node instead"
     )
-    orbit.add_argument("--perigee", type=finite, metavar="DEG", help="argument of perigee (0)")
-    orbit.add_argument("--anomaly", type=finite, metavar="DEG", help="true anomaly at the epoch (0)")
+    orbit.add_argument("--perigee", type=finite, metavar="DEG", help="argument of perigee (default 0)")
+    orbit.add_argument("--anomaly", type=finite, metavar="DEG", help="true anomaly at the epoch (default 0)")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -128,7 +130,7 @@ def run(options: argparse.Namespace) -> int:
         fixes = read_fixes(options.fixes)
         dates, positions, velocities = fixes.dates, fixes.positions, fixes.velocities
     elif options.config is not None:
-        as_orbit(configuration.load(options.config))
+        configuration.load_orbit(options.config)
         text = read_text(options.config)
         section = configuration.simulation_section(text, str(options.config), Simulation)
         if section is None or section.free_body is None:
@@ -149,8 +151,10 @@ def read_file(path: Path, satellite: int | None) -> NamedElements:
     """
     try:
         found = read_elements(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {reason_of(error)}") from error
+    except UnicodeDecodeError as error:
+        raise not_utf_8(path, error) from error
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from error
     chosen = [each for each in found if satellite in {None, each.number}]
@@ -236,8 +240,12 @@ def read_fixes(path: Path) -> Fixes:
                 place = f"{path}:{reader.line_num}"
                 numbers = (_number(row[name], place) for name in columns)
                 found.append([_date(row["utc"] or "", place), *numbers])
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {reason_of(error)}") from error
+    except UnicodeDecodeError as error:
+        raise not_utf_8(path, error) from error
+    except csv.Error as error:
+        raise UsageError(f"{path}: is not a CSV file: {error}") from error
     table = np.array(found).reshape(-1, 1 + len(columns))
     return _celestial(table[:, 0], table[:, 1:])
 
@@ -350,7 +358,13 @@ def add_stations(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stations", type=Path, metavar="FILE", help="YAML file with a list `stations` of ground stations"
     )
-    parser.add_argument("--from", dest="begin", type=utc, metavar="UTC", help="start (default now)")
+    parser.add_argument(
+        "--from",
+        dest="begin",
+        type=utc,
+        metavar="UTC",
+        help="start, such as 2026-03-20T12:00:00 (default now)",
+    )
     text = "length of the prediction (default %(default)g days)"
     parser.add_argument("--days", type=positive, default=1.0, metavar="N", help=text)
 
@@ -458,9 +472,9 @@ def _elements(path: Path, satellite: int | None) -> tuple[tuple[str, str], Orbit
     """Return the two-line elements in a file, and the configuration that contains them. Raises UsageError."""
     if path.suffix not in {".yaml", ".yml"}:
         return read_file(path, satellite).lines, None
-    config = as_orbit(configuration.load(path))
+    config = configuration.load_orbit(path)
     if config.elements is None:
-        raise UsageError(f"{path}: `elements` is missing: the orbit is not known")
+        raise UsageError(f"{path}: `elements` is missing: make it with `knightcube elements`")
     return config.elements, config
 
 

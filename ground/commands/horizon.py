@@ -17,6 +17,7 @@ from ground.commands.options import (
     add_field,
     add_output,
     add_picture,
+    check_camera,
     check_size,
     finite,
     positive,
@@ -124,12 +125,10 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
     rows, columns = pixels.shape
     if options.camera is None:
         if not 1.0 <= options.fov <= 150.0:
-            raise UsageError(f"--fov {options.fov:g}: a pinhole camera can have 1 to 150 degrees")
+            raise UsageError(f"--fov {options.fov:g}: must be 1 to 150 deg")
         return Pinhole.from_field_of_view(columns, rows, math.radians(options.fov))
     model = camera_model(configuration.load_camera(options.camera))
-    if (rows, columns) != (model.rows, model.columns):
-        own = f"the camera of {options.camera} has {model.columns} x {model.rows}"
-        raise UsageError(f"{options.image}: {columns} x {rows} pixels, but {own}")
+    check_camera(options, pixels, model.columns, model.rows)
     return model
 
 

@@ -89,7 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = "example: knightcube identify config/testbed.yaml --out plant.yaml --picture fit.png"
     add = parser.add_argument
-    text = "YAML file, installed name such as testbed, or the folder of a run"
+    text = "YAML file, name of a packaged configuration such as testbed, or the folder of a run"
     add("source", type=config_path, metavar="CONFIG", help=text)
     add("--out", type=Path, metavar="YAML", help="write the constants to this file")
     add("--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)")

@@ -230,7 +230,7 @@ class Replay:
 
 def _address(config: Path, section: Link | None) -> str:
     if section is None:
-        raise UsageError(f"{config}: has no section `link`")
+        raise UsageError(f"{config}: has no section `link`: add it, or use --recorded RUN")
     if section.udp is None and section.tcp is None:
         raise UsageError(f"{config}: has neither `link.udp` nor `link.tcp`: give --link ADDRESS")
     return section.udp or f"tcp:{section.tcp}"

@@ -22,6 +22,8 @@ from knightcube.errors import UsageError, reason_of
 from knightcube.vision.camera.images import read_image, read_raw, stated_exposure
 from knightcube.vision.frame import LEAST_SIDE
 
+CONFIG_HELP = "YAML file, or name of a packaged configuration"
+"""Help of an argument that is read by `config_path`."""
 _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)(?:\+([0-9]+))?")
 
 
@@ -40,8 +42,8 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
 def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
     """Add the arguments that describe the camera; if `required`, the user must give exactly one."""
     group = parser.add_mutually_exclusive_group(required=True) if required else parser
-    group.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
-    text = "configuration (file or packaged name) or calibration of the camera"
+    group.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns, deg")
+    text = f"configuration ({CONFIG_HELP}) or calibration of the camera"
     group.add_argument("--camera", type=config_path, metavar="YAML", help=text)
 
 
@@ -127,6 +129,14 @@ def check_size(path: Path, pixels: Image) -> None:
     rows, columns = pixels.shape
     if min(rows, columns) < LEAST_SIDE:
         raise UsageError(f"{path}: {columns} x {rows} pixels: give {LEAST_SIDE} or more per side")
+
+
+def check_camera(options: argparse.Namespace, pixels: Image, columns: int, rows: int) -> None:
+    """Raise UsageError if the picture's size differs from that of the camera that `--camera` names."""
+    if pixels.shape != (rows, columns):
+        found = f"{options.image}: {pixels.shape[1]} x {pixels.shape[0]} pixels"
+        own = f"the camera of {options.camera} has {columns} x {rows}"
+        raise UsageError(f"{found}, but {own}: give the configuration of the camera that took the picture")
 
 
 def raw_shape(text: str) -> tuple[int, int, int, int]:

@@ -14,9 +14,9 @@ import numpy as np
 
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
-from flight.schema.bodies import OrbitConfig, as_orbit
+from flight.schema.bodies import OrbitConfig
 from flight.schema.document import config_path
-from ground.commands.options import check_picture, finite, positive, print_result, utc
+from ground.commands.options import CONFIG_HELP, check_picture, finite, positive, print_result, utc
 from knightcube import plan_slew, plan_step
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
@@ -60,13 +60,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
+    text = "duration of the slew, s (default: `guidance.horizon`)"
+    parser.add_argument("--horizon", type=finite, metavar="S", help=text)
     text = "cost of time, W: choose the horizon of least energy plus this cost times the horizon"
     parser.add_argument("--time-price", type=positive, metavar="W", help=text)
     text = "energy to minimise: R I^2 of the mean current (heat), or V |I| from the supply"
     parser.add_argument("--cost", choices=[cost.value for cost in PathCost], help=text)
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
-    text = f"configuration of the plant, a file or an installed name (default {_DEFAULT_CONFIG})"
+    text = f"configuration of the testbed: {CONFIG_HELP} (default {_DEFAULT_CONFIG})"
     parser.add_argument("--config", type=config_path, metavar="CONFIG", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the path, its rate and its current")
@@ -157,27 +158,27 @@ def _q2(option: str, text: str) -> float:
 
 
 def _check(options: argparse.Namespace) -> None:
-    for option, value, (low, high) in (
-        ("--from-rate", options.from_rate, (-FASTEST, FASTEST)),
-        ("--to-rate", options.to_rate, (-FASTEST, FASTEST)),
-        ("--horizon", options.horizon, HORIZON_RANGE),
-        ("--nodes", options.nodes, NODES_RANGE),
+    for option, value, (low, high, unit) in (
+        ("--from-rate", options.from_rate, (-FASTEST, FASTEST, " rad/s")),
+        ("--to-rate", options.to_rate, (-FASTEST, FASTEST, " rad/s")),
+        ("--horizon", options.horizon, (*HORIZON_RANGE, " s")),
+        ("--nodes", options.nodes, (*NODES_RANGE, "")),
     ):
-        _check_range(option, value, low, high)
+        _check_range(option, value, low, high, unit)
     if options.time_price is not None and options.horizon is not None:
         raise UsageError(f"--horizon {options.horizon:g}: --time-price chooses the horizon: give one of them")
 
 
-def _check_range(option: str, value: float | None, low: float, high: float) -> None:
+def _check_range(option: str, value: float | None, low: float, high: float, unit: str = "") -> None:
     """Raise UsageError for an option whose value is given and out of range."""
     if value is not None and not low <= value <= high:
-        raise UsageError(f"{option} {value:g}: must be {low:g} to {high:g}")
+        raise UsageError(f"{option} {value:g}: must be {low:g} to {high:g}{unit}")
 
 
 def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("with --orbit")
     text = (
-        "plan a slew of this satellite, a file or an installed name; --from and --to are then targets: "
+        f"plan a slew of this satellite ({CONFIG_HELP}); --from and --to are then targets: "
         "nadir, velocity, sun, 'inertial QX QY QZ QW', 'ground LAT LON', each with 'roll DEG' or a free roll"
     )
     group.add_argument("--orbit", type=config_path, metavar="CONFIG", help=text)
@@ -200,10 +201,10 @@ def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
 def _run_orbit(options: argparse.Namespace) -> int:
     if options.at is None or options.within is None:
         raise UsageError("--orbit needs --at UTC and --within S")
-    config = as_orbit(configuration.load(options.orbit))
+    config = configuration.load_orbit(options.orbit)
     at = options.at
     if config.elements is None:
-        raise UsageError(f"{options.orbit}: `elements` is missing: the orbit is not known")
+        raise UsageError(f"{options.orbit}: `elements` is missing: make it with `knightcube elements`")
     begun = time.process_time()
     made = _planned(options, config, config.elements, at)
     solved_s = time.process_time() - begun
@@ -235,14 +236,15 @@ def _planned(
     low, high = SLEW_HORIZON_RANGE
     longest = min(STRETCH * options.within, high) if options.longest is None else options.longest
     if not low <= options.within <= longest <= high:
-        raise UsageError(f"--within {options.within:g}, longest {longest:g}: must be {low:g} to {high:g}")
+        given = f"--within {options.within:g}, --longest {longest:g}"
+        raise UsageError(f"{given}: must be {low:g} to {high:g} s, and --within not above --longest")
     cones: dict[Literal["sun", "earth", "moon"], float] = {
         name: math.radians(value)
         for name in BODIES
         if (value := getattr(options, f"{name}_cone")) is not None
     }
     if cones and config.camera is None:
-        raise UsageError(f"{options.orbit}: a cone needs a `camera`")
+        raise UsageError(f"{options.orbit}: has no `camera`, to which an exclusion cone applies")
     boresight = np.array(config.pointing.axis)
     if config.camera is not None:
         boresight = attitude_matrix(np.array(config.camera.mounting))[2]

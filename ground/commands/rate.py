@@ -16,6 +16,7 @@ from ground.commands.options import (
     add_field,
     add_output,
     add_picture,
+    check_camera,
     exposure_of,
     finite,
     positive,
@@ -69,11 +70,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_field(parser)
     text = "standard deviation of --fov (default 0), for the uncertainty of the rate"
     parser.add_argument("--fov-error", type=positive, metavar="DEG", help=text)
-    text = "exposure time (default: of the picture's metadata, or of --camera)"
+    text = "exposure time (default: that of the picture's metadata, or of --camera)"
     parser.add_argument("--exposure", type=positive, metavar="S", help=text)
     parser.add_argument("--gain", type=positive, metavar="E", help="electrons per count (default 1)")
-    parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="count at which pixels clip")
-    parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, 1 sigma (default 1)")
+    parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="counts of a saturated pixel")
+    parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, 1 sigma, px (default 1)")
     text = "time between rows, 0 for a global shutter (default: unknown, about 0)"
     parser.add_argument("--line-time", type=finite, metavar="S", help=text)
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
@@ -117,15 +118,15 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
     fov_deg = options.fov or (camera.field_of_view_deg if camera else None)
     exposure, differing = exposure_of(options, camera.exposure if camera else None)
     sys.stderr.write(differing)
-    if fov_deg is None or exposure is None:
-        raise UsageError("give --fov and --exposure, or --camera with a configuration that has them")
+    if fov_deg is None:
+        raise UsageError("the field of view is unknown: give --fov DEG or --camera CONFIG")
+    if exposure is None:
+        raise UsageError("the picture states no exposure time: give --exposure S or --camera CONFIG")
     if options.fov is None and camera is not None and camera.lens is not None:
-        if (camera.rows, camera.columns) != pixels.shape:
-            own = f"{camera.columns} x {camera.rows}"
-            raise UsageError(f"{options.image} has {columns} x {rows} pixels, but the camera has {own}")
+        check_camera(options, pixels, camera.columns, camera.rows)
         return streak_camera(camera_model(camera)), exposure
     if not 0.1 <= fov_deg <= 120.0:
-        raise UsageError(f"--fov {fov_deg}: a pinhole camera can have 0.1 to 120 degrees")
+        raise UsageError(f"--fov {fov_deg:g}: must be 0.1 to 120 deg")
     return Pinhole.from_field_of_view(columns, rows, math.radians(fov_deg)), exposure
 
 
@@ -211,7 +212,7 @@ def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:
     lines = [f"status:        {found.status.value}"]
     if _reason(found):
         cure = f": {_CURES[found.status]}" if found.status in _CURES else ""
-        lines.append(f"why:           {_reason(found)}{cure}")
+        lines.append(f"reason:        {_reason(found)}{cure}")
     if found.rate is not None and found.covariance is not None:
         sigma = np.sqrt(np.diag(found.covariance))
         size = float(np.linalg.norm(found.rate))

@@ -74,7 +74,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signed.add_argument(
         "--expires", metavar="DATE", help="end of the signature, such as 2030-01-01 (default none)"
     )
-    signed.add_argument("--least", type=int, default=1, metavar="N", help="lowest version of the metadata")
+    signed.add_argument(
+        "--least", type=int, default=1, metavar="N", help="lowest version of the new metadata (default 1)"
+    )
     signed.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the bundle")
     for word, purpose in (
         ("activate", "start the trial of a bundle that was uploaded to the satellite"),

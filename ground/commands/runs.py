@@ -80,7 +80,7 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = "example: knightcube export runs/demo --format sqlite"
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument("--format", choices=FORMATS, default="csv", help="default: csv")
+    parser.add_argument("--format", choices=FORMATS, default="csv", help="format of the files (default csv)")
     places = ", ".join(f"RUN/{place}" for place in FORMATS.values())
     text = f"folder of the files, or the SQLite file (default {places})"
     parser.add_argument("--out", type=Path, metavar="PLACE", help=text)

@@ -85,9 +85,8 @@ def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:
     )
     add_link_options(parser, way)
     _add_spi(parser)
-    parser.add_argument(
-        "--timeout", type=float, default=timeout, metavar="S", help=f"time to wait (default {timeout:g} s)"
-    )
+    text = f"longest wait for the answer (default {timeout:g} s)"
+    parser.add_argument("--timeout", type=float, default=timeout, metavar="S", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -131,7 +130,9 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
         "part", choices=directives.PARTS, metavar="PART", help=" or ".join(directives.PARTS)
     )
     key = words.add_parser("new-key", help="with --link: change a key of ground and satellite")
-    key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
+    spis = (*COMMAND_SPIS, *TELEMETRY_SPIS)
+    text = "SPI of the key: {} or {} for commands, {} or {} for telemetry".format(*spis)
+    key.add_argument("changed", type=int, choices=spis, metavar="SPI", help=text)
     _allow_behind(words)
     parser.set_defaults(command=run_command)
 
@@ -180,11 +181,12 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
         numbers = parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help=text)
         numbers.required = False  # otherwise argparse names the optional numbers among missing arguments
         parser.add_argument(
-            "--roll", type=float, metavar="DEG", help="about the pointing axis (default free)"
+            "--roll", type=float, metavar="DEG", help="angle about the pointing axis (default free)"
         )
         return
     for field in packet.fields if packet is not commands.PING else ():
-        meaning = meaning_of(replace(field, states=())).replace("%", "%%")
+        unit = "" if field.unit in {"", "-"} else f", {field.unit}"
+        meaning = f"{meaning_of(replace(field, states=()))}{unit}".replace("%", "%%")
         if field.states:
             parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
         elif field.kind.startswith("S"):
@@ -423,7 +425,7 @@ def _change(text: str) -> tuple[str, float]:
     """Return the name and the value of an argument NAME=VALUE. Raises UsageError."""
     key, _, value = text.partition("=")
     if key not in PARAMETER_KEYS:
-        raise UsageError(f"{key}: no such parameter: {', '.join(PARAMETER_KEYS)}")
+        raise UsageError(f"{key}: no such parameter; there are {', '.join(PARAMETER_KEYS)}")
     try:
         return key, float(value)
     except ValueError as error:
@@ -465,7 +467,9 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
     listed = words.add_parser("list", help="list the files on board")
-    listed.add_argument("under", nargs="?", default="", metavar="BEGINNING", help="beginning of their names")
+    listed.add_argument(
+        "under", nargs="?", default="", metavar="BEGINNING", help="first letters of the listed names"
+    )
     got = words.add_parser("get", help="get files from the satellite")
     got.add_argument("names", nargs="+", metavar="NAME", help="name in the list")
     for word, purpose, text in (
@@ -601,11 +605,12 @@ class _FileWork:
         if self._ended():
             raise KnightCubeError(f"ended by a signal{kept}")
         if now_ns - self._session.received_ns > self._patience_s * 1e9:
-            raise KnightCubeError(f"no packet for {self._patience_s:g} s{kept}")
+            cause = "check --link and --keys, and that the link runs"
+            raise KnightCubeError(f"no packet from the satellite for {self._patience_s:g} s: {cause}{kept}")
         if name and now_ns * 1e-9 - self._shown_s >= _SHOW_S:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():
                 if one.name not in {"", name}:  # an earlier transfer that continues is not shown
                     continue
-                part = f"{one.done} of {one.size} bytes" if one.size else "started"
+                part = f"{one.done} of {one.size} bytes" if one.size else "waiting for data"
                 sys.stderr.write(f"knightcube: {shown(one.name or name)}: {part}\n")

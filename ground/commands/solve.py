@@ -18,6 +18,7 @@ from ground.commands.options import (
     add_field,
     add_output,
     add_picture,
+    check_camera,
     check_new,
     exposure_of,
     finite,
@@ -46,7 +47,6 @@ from knightcube.vision.star_tracker import (
 )
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings
-from knightcube.vision.streaks.streak_result import REASONS
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
 IMAGE = "image"
@@ -66,13 +66,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_field(parser)
     add = parser.add_argument
     add("--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of the field)")
-    text = "exposure time, needed for the angular rate from streaks (default: of metadata or --camera)"
+    text = "exposure time, for the rate (default: that of the picture's metadata, or of --camera)"
     add("--exposure", type=positive, metavar="S", help=text)
     add("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     text = "time of the picture, such as 2026-11-21, for proper motion, aberration and planets"
     add("--date", type=utc, metavar="UTC", help=text)
     add("--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here")
-    add("--index", type=Path, metavar="FILE", help="another sky index")
+    add(
+        "--index",
+        type=Path,
+        metavar="FILE",
+        help="sky index, made by `knightcube index`",
+    )
     _add_methods(parser)
     add_output(parser, run)
 
@@ -137,10 +142,7 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
     accuracy = None
     if options.camera is not None:
         camera = configuration.load_camera(options.camera)
-        if pixels.shape != (camera.rows, camera.columns):
-            size = f"{pixels.shape[1]} x {pixels.shape[0]} pixels"
-            own = f"the camera of {options.camera} has {camera.columns} x {camera.rows}"
-            raise UsageError(f"{options.image}: {size}, but {own}")
+        check_camera(options, pixels, camera.columns, camera.rows)
         lens, configured = camera_model(camera), camera.exposure
         if camera.lens is None and error is None:
             # The field of view has a tolerance unless the lens is calibrated.
@@ -221,9 +223,7 @@ def _motion_facts(solution: StarSolution) -> dict[str, Any] | None:
 def _text(solution: StarSolution, seconds: float, axis_sigma: float | None = None) -> str:
     lines = [f"status:           {solution.status}"]
     if not solution:
-        motion = solution.frame.motion
-        detail = "" if motion is None else motion.reason or REASONS.get(motion.status, "")
-        lines.append(f"reason:           {solution.reason}{f': {detail}' if detail else ''}")
+        lines.append(f"reason:           {solution.reason}")
         return "\n".join(lines) + "\n"
     sigma = ARCSECONDS * np.sqrt(np.diag(solution.covariance))
     stars, frame = solution.stars, solution.frame

@@ -315,7 +315,7 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         metavar="NAME,LAT,LON[,HEIGHT[,MASK]]",
         help="ground station whose passes the page lists, given as for `passes`; may be repeated",
     )
-    parser.add_argument("--stations", type=Path, metavar="FILE", help="YAML file with a list `stations`")
+    parser.add_argument("--stations", type=Path, metavar="FILE", help="YAML file of ground stations")
     text = "port of the page, 0 for any (default %(default)s)"
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=text)
     parser.add_argument("--open", action="store_true", help="open the page in the browser")

@@ -114,11 +114,13 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
     try:
         line.sendto(data, address)
     except OSError as error:
-        raise KnightCubeError(f"{to}: no flight listens there: {error.strerror or error}") from error
+        reason = error.strerror or error
+        cure = "check that the flight runs, and its `commands.socket` or `commands.udp`"
+        raise KnightCubeError(f"{to}: no flight listens there ({reason}): {cure}") from error
     try:
         return line.recv(LONGEST_PACKET)
     except OSError as error:
-        raise KnightCubeError(f"{to}: no answer within {timeout:g} s") from error
+        raise KnightCubeError(f"{to}: no answer within {timeout:g} s: check that the flight runs") from error
 
 
 def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExclusiveGroup) -> None:
@@ -159,7 +161,7 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
         raise UsageError("--link needs --keys, the ground's folder of `knightcube keys`")
     section = DEFAULTS if options.config is None else load(options.config).link
     if section is None:
-        raise UsageError(f"{options.config}: has no section `link`")
+        raise UsageError(f"{options.config}: has no section `link`: give the flight's configuration")
     settings = TerminalSettings.of(section)
     hints = get_type_hints(Link, include_extras=True)
     for name in ("spacecraft", "frame_bytes"):

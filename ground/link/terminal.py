@@ -425,4 +425,5 @@ def _reaching(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise KnightCubeError(f"{name}: cannot be reached: {error.strerror or error}") from error
+        reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or error
+        raise KnightCubeError(f"{name}: cannot be reached: {reason}") from error

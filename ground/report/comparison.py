@@ -119,7 +119,7 @@ def _sensing(summary: Object) -> Iterator[_Figure]:
         errors = part["rms_error"] or []
         worst = None if None in errors else max(errors, default=None)
         yield f"{kind}: worst axis, rms error", (_scaled(worst, scale), unit)
-        yield f"{kind}: mean e' P^-1 e / 3", (part["normalised"], "")
+        yield f"{kind}: NEES per axis", (part["normalised"], "")
     yield "frames without rate or attitude", (len(summary["failed_frames"]), "")
 
 

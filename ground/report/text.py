@@ -402,7 +402,7 @@ def _errors(found: Object, axes: str, unit: str, digits: int, scale: float, what
     errors = ", ".join(number(error, digits, scale) for error in found["rms_error"])
     return [
         f"  rms error {axes} {errors} {unit} over {found['compared']} {what}; "
-        f"mean e' P^-1 e / 3 = {number(found['normalised'])}"
+        f"NEES per axis {number(found['normalised'])}"
     ]
 
 

@@ -496,9 +496,9 @@ def meaning(name: str, error: OSError, doing: str) -> DeviceError:
         return Refused(name, f"busy while {doing}: another program uses the camera")
     if error.errno == errno.ENOSPC:
         cure = "connect it to another USB controller, or choose a smaller image or a compressed pixel format"
-        return Refused(name, f"the bandwidth of its USB bus is exhausted (found {doing}): {cure}")
+        return Refused(name, f"the bandwidth of its USB bus is exhausted (while {doing}): {cure}")
     if error.errno == errno.ENOTTY:
-        return Refused(name, f"is not a V4L2 device (found {doing})")
+        return Refused(name, f"is not a V4L2 device (while {doing})")
     return NotResponding(name, f"failed while {doing}: {os.strerror(error.errno or errno.EIO)}")
 
 

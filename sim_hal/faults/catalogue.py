@@ -849,5 +849,5 @@ def listing() -> str:
         name = f"{kind.name} ({given})" if given else kind.name
         only = "" if kind.where is Where.BOTH else f"; {kind.where.value}"
         bounds = "".join(f"; {name} {parameter.bounds()}" for name, parameter in kind.parameters.items())
-        lines.append(f"  {name:44} {kind.meaning}{bounds}{only}")
+        lines.append(f"  {name:50} {kind.meaning}{bounds}{only}")
     return "\n".join(lines)

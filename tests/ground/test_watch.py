@@ -191,7 +191,10 @@ def test_a_file_is_not_called_a_missing_folder(growing: Path) -> None:
     for name in ("watch", "console", "report", "export"):
         done = command(name, growing / "flight-0001.ccsds")
         assert done.returncode == 2
-        assert f"is not a folder: give a run's folder, such as {growing}" in done.stderr
+        assert f"is not a folder: give the folder of a run, such as {growing}" in done.stderr
+    (growing.parent / "other.txt").touch()
+    done = command("report", growing.parent / "other.txt")
+    assert (done.returncode, done.stderr.endswith("give the folder of a run\n")) == (2, True)
 
 
 def test_a_watch_of_a_log_that_does_not_grow_ends_after_its_patience_with_status_1(growing: Path) -> None:

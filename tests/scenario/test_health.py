@@ -140,7 +140,7 @@ def test_too_much_memory_ends_the_flight_in_order_and_requests_a_restart(tmp_pat
     run = fly(demo_config(20.0, camera=False), tmp_path, prepare)
     assert run["control"]["time_ns"][-1] < 6 * SECOND
     assert loops[0].restart.startswith("memory-high: 2e+09 bytes")
-    assert run["event"]["text"][-1].startswith(b"restart wanted: memory-high")
+    assert run["event"]["text"][-1].startswith(b"restart requested: memory-high")
     assert last(run, "cpu_share") == pytest.approx(0.3)
     for log in run.logs.values():
         assert log.intact

@@ -72,7 +72,7 @@ def _add(
         words = {"type": get_args(kind)[0], "nargs": "+"}
     if parameter.default is not Parameter.empty:
         words["default"] = parameter.default
-        shown += "" if parameter.default in (None, "") else " (default %(default)s)"
+        shown += "" if parameter.default in (None, "", ()) else " (default %(default)s)"
     if parameter.kind is Parameter.KEYWORD_ONLY:
         parser.add_argument(option, help=shown, required="default" not in words, **words)
     else:

@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 
 from flight import __version__
 from hal.interfaces.errors import DeviceError
-from knightcube.errors import KnightCubeError, PlanningError, UsageError, shown
+from knightcube.errors import KnightCubeError, PlanningError, UsageError, reason_of, shown
 
 _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:  # such as an invalid file name or a folder without permission
         if error.filename is None:
             return complain(error.strerror or str(error), 1)
-        return complain(f"{error.filename}: {error.strerror}", 2)
+        return complain(f"{error.filename}: {reason_of(error)}", 2)
 
 
 def _obey(words: Sequence[str]) -> int:
@@ -186,8 +186,27 @@ def _complete(parser: argparse.ArgumentParser) -> None:
     argcomplete.autocomplete(parser)
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
+
+
+def _whole_number(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
+
+
 class _Parser(argparse.ArgumentParser):
     """Parser that reports wrong arguments also as a JSON object, if the arguments contain `--json`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.register("type", float, _number)  # argparse would name the type `float` in its message
+        self.register("type", int, _whole_number)
 
     def error(self, message: str) -> NoReturn:
         """Report wrong arguments, and end the process with the exit status 2."""
@@ -220,7 +239,7 @@ def _overview(available: Mapping[str, tuple[str, str, str]]) -> str:
     lines = ["The on-board application of the KnightCube, and the tools of its ground."]
     for group, heading in GROUPS.items():
         lines += ["", f"{heading}:"]
-        lines += [f"  {name:14} {purpose}" for name, (own, purpose, _) in available.items() if own == group]
+        lines += [f"  {name:15} {purpose}" for name, (own, purpose, _) in available.items() if own == group]
     return "\n".join(lines)
 
 

@@ -140,7 +140,9 @@ def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
-        raise ConfigError(str(chosen.path), "no `link` section: there is nothing to connect")
+        raise ConfigError(
+            str(chosen.path), "has no section `link`, which describes the line to the ground: add it"
+        )
     return config, chosen.problem
 
 

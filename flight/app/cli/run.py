@@ -125,8 +125,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     place.add_argument(
         "--archive", type=Path, metavar="DIR", help="folder of all runs of a board; this run is added"
     )
-    parser.add_argument("--duration", type=float, metavar="S", help="another duration")
-    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation")
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="duration that replaces the configured one"
+    )
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed that replaces the configured one")
     parser.add_argument(
         "--realtime", action="store_true", help="run simulated devices on the machine's clock"
     )
@@ -134,7 +136,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--devices",
         type=Path,
         metavar="FILE",
-        help="use the simulated devices of `python -m sim_hal serve --facts FILE`; with --realtime",
+        help="with --realtime: use the simulated devices of `python -m sim_hal serve --facts FILE`",
     )
     parser.add_argument(
         "--fault",
@@ -145,7 +147,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object when done")
     parser.set_defaults(command=run)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     plain = parser.format_help
     parser.format_help = lambda: plain() + _faults_help()  # type: ignore[method-assign]  # the list is slow to load
 
@@ -241,7 +242,7 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
     def show(progress: FlightProgress) -> None:
         write(lambda: _progress_text(progress))
 
-    report_compilations(lambda name: write(lambda: f"waits once until numba has compiled {name}"))
+    report_compilations(lambda name: write(lambda: f"compiling {name} for this machine, once"))
     return show
 
 

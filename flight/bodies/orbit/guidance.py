@@ -509,7 +509,7 @@ class PointingPlanner:
                 self._plan_rest(estimate, goal, now_ns)
             return
         if self._paths.has_arrived(now_ns):
-            text = f"{math.degrees(self._paths.off):.2f} deg off its path"
+            text = f"{math.degrees(self._paths.off):.2f} deg from its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
             self._wanted = True
         wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved

@@ -108,9 +108,9 @@ class PointingTarget:
         if self.roll is not None and self.goal in ROLLS:
             raise UsageError(ROLLS[self.goal])
         if self.goal is Goal.GROUND and not abs(self.numbers[0]) <= _RIGHT:
-            raise UsageError(f"latitude {math.degrees(self.numbers[0]):g} deg is beyond a pole")
+            raise UsageError(f"latitude {math.degrees(self.numbers[0]):g} deg: must be -90 to 90 deg")
         if self.goal is Goal.OBJECT and self.numbers and not abs(self.numbers[1]) <= _RIGHT:
-            raise UsageError(f"declination {math.degrees(self.numbers[1]):g} deg is beyond a pole")
+            raise UsageError(f"declination {math.degrees(self.numbers[1]):g} deg: must be -90 to 90 deg")
         self._check_angles()
 
     def _check_angles(self) -> None:

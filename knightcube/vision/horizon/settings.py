@@ -228,6 +228,6 @@ class HorizonSettings:
         low, high = self.altitudes
         if not LEAST_ALTITUDE <= low < high < math.inf:
             raise UsageError(
-                f"altitudes of {1e-3 * low:g} to {1e-3 * high:g} km: give an increasing range from"
-                f" {1e-3 * LEAST_ALTITUDE:g} km, below which no limb is visible"
+                f"altitudes of {1e-3 * low:g} to {1e-3 * high:g} km: give the lower altitude first,"
+                f" and at least {1e-3 * LEAST_ALTITUDE:g} km, below which no limb is visible"
             )

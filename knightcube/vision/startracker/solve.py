@@ -37,6 +37,7 @@ from knightcube.vision.startracker.tracking import PRIOR_SIGMAS, track
 from knightcube.vision.startracker.verification import expected_stars
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
 from knightcube.vision.streaks.streak_result import (
+    REASONS,
     FrameMotion,
     LikelihoodSettings,
     MotionResult,
@@ -367,7 +368,7 @@ def solve_motion(
     """Return the attitude at mid-exposure of a frame of streaks, from the star positions in `motion`."""
     seen = FrameSolution(
         SolveStatus.NO_STARS,
-        f"the streaks give no motion: {motion.status.value}",
+        f"the streaks give no motion: {motion.reason or REASONS.get(motion.status, motion.status.value)}",
         FrameKind.STREAKS,
         camera,
         motion=motion,

@@ -148,13 +148,13 @@ def test_random_bytes_are_always_refused_by_a_command_error() -> None:
     ("goal", "numbers", "roll", "why"),
     [
         (Goal.NADIR, (1.0,), None, "takes 0 numbers"),
-        (Goal.GROUND, (2.0, 0.0), None, "beyond a pole"),
+        (Goal.GROUND, (2.0, 0.0), None, "must be -90 to 90 deg"),
         (Goal.GROUND, (math.nan, 0.0), None, "finite"),
         (Goal.INERTIAL, (1.0, 1.0, 0.0, 0.0), None, "length 1"),
         (Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8), 0.1, "an inertial attitude includes its roll"),
         (Goal.SUN, (), math.inf, "finite"),
         (Goal.OBJECT, (1.0,), None, "takes 0 or 2 numbers"),
-        (Goal.OBJECT, (0.0, 2.0), None, "beyond a pole"),
+        (Goal.OBJECT, (0.0, 2.0), None, "must be -90 to 90 deg"),
         (Goal.OBJECT, (), 0.5, "free roll"),
     ],
 )

@@ -203,7 +203,7 @@ def test_readings_of_the_current_monitor_are_noted_once_and_its_errors_reported(
     bench.run()
     bench.run()
     assert bench.notes == [("power", 5 * S, 0.25)]
-    assert bench.said["power-fault"] == (False, "readings come again")
+    assert bench.said["power-fault"] == (False, "readings arrive again")
     bench.power.said = "no acknowledge"
     bench.run()
     assert bench.said["power-fault"] == (True, "no acknowledge")

@@ -244,7 +244,7 @@ def test_a_slew_arrives_when_angle_and_rate_were_small_for_their_time() -> None:
         assert bench.step() is Mode.SLEW
     assert bench.step() is Mode.HOLD
     assert bench.control.wanted is wanted, "the attitude of the slew is held"
-    assert bench.texts[-1].startswith("slew -> hold, arrived: 0.0190 rad off")
+    assert bench.texts[-1].startswith("slew -> hold, arrived: 0.0190 rad from the target")
 
 
 def test_a_slew_is_late_after_its_limit_and_becomes_a_hold() -> None:

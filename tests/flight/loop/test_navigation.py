@@ -258,7 +258,7 @@ def test_with_a_gyro_the_speed_is_that_of_the_newest_reading_without_the_estimat
 
 @pytest.mark.parametrize(
     ("quiet", "silent", "text"),
-    [(200 * MS, False, "bytes come again"), (200 * MS + 1, True, "no byte for 0.20 s")],
+    [(200 * MS, False, "bytes arrive again"), (200 * MS + 1, True, "no byte for 0.20 s")],
 )
 def test_a_line_without_a_byte_for_longer_than_the_age_limit_is_silent(
     quiet: int, silent: bool, text: str

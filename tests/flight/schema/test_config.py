@@ -318,7 +318,7 @@ def test_a_camera_is_read_from_a_configuration_or_from_a_file_of_its_own(tmp_pat
 def test_a_missing_file_and_a_list_are_clear_errors(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         reader.load(tmp_path / "nothing.yaml")
-    with pytest.raises(ConfigError, match="must be a mapping"):
+    with pytest.raises(ConfigError, match="is not a mapping: give lines of the form `key: value`"):
         reader.parse("- 1\n- 2\n")
 
 

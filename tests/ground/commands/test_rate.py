@@ -107,9 +107,9 @@ def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path)
     ("words", "complaint"),
     [
         (["nothing.png", "--fov", "20", "--exposure", "1"], "nothing.png: cannot be read"),
-        (["{picture}", "--fov", "20"], "give --fov and --exposure"),
+        (["{picture}", "--fov", "20"], "states no exposure time: give --exposure S or --camera CONFIG"),
         (["{picture}", "--camera", "config/testbed.yaml"], "give a configuration with a camera"),
-        (["{picture}", "--fov", "170", "--exposure", "1"], "--fov 170.0"),
+        (["{picture}", "--fov", "170", "--exposure", "1"], "--fov 170: must be 0.1 to 120 deg"),
         (["{picture}", "--fov", "20", "--overlay", "{picture}"], "would replace a file that is read"),
         (
             ["{picture}", "--fov", "20", "--overlay", "config/testbed.yaml"],

@@ -95,7 +95,7 @@ def orbit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         *(_event(events.CAMERA_SATURATED, 2.1 + 0.01 * k, f"frame {k} is saturated") for k in range(105)),
         _event(events.CAMERA_LATE, 3.0, "frame 7 is overdue"),
         _event(events.CAMERA_LOST, 3.0, "no frame for 9 s"),
-        _event(events.IMU_RECOVERED, 5.0, "bytes come again"),
+        _event(events.IMU_RECOVERED, 5.0, "bytes arrive again"),
         Packer().pack(HEALTH, 6 * 10**9, {**plain_contents(HEALTH), "facts": FACTS_BIT["camera-lost"]}),
     ]
     with (run / "flight-0001.ccsds").open("ab") as file:
@@ -332,7 +332,7 @@ def test_events_of_one_cause_are_one_line_with_begin_and_end(satellite: Page) ->
     assert "× 105: frame 104 is saturated" in saturated[3]
     (silent,) = [row for row in texts if "imu-silent" in row[3]]
     assert silent[:2] == ["2.0", "5.0"]
-    assert "imu-recovered: bytes come again" in silent[3]
+    assert "imu-recovered: bytes arrive again" in silent[3]
     (late,) = [row for row in texts if "camera-late" in row[3]]
     assert late[:2] == ["3.0", "6.0"], "its end was suppressed, and the health packet shows that it is over"
     (lost,) = [row for row in texts if "camera-lost" in row[3]]

@@ -286,9 +286,9 @@ def test_estimate_streaks_and_stars_have_their_errors() -> None:
     assert blocks(estimate=estimate, streaks=streaks, stars=stars)[-1].splitlines() == [
         "Estimate: rms error 2.000 mrad, 0.300 mrad/s; divided by the estimated sigma 1.10, -",
         "Streaks: 4 frames (ok 3), 3 rates, 2 used by the estimator",
-        "  rms error x, y, z 1.000, 2.000, 3.000 mrad/s over 3 rates; mean e' P^-1 e / 3 = 0.90",
+        "  rms error x, y, z 1.000, 2.000, 3.000 mrad/s over 3 rates; NEES per axis 0.90",
         "Stars:   4 frames (ok 3), 1 tracked, median of 11 matches, 2 used by the estimator",
-        "  rms error about x, y, z 1.00, 2.00, 30.00 arcsec over 3 attitudes; mean e' P^-1 e / 3 = 0.90",
+        "  rms error about x, y, z 1.00, 2.00, 30.00 arcsec over 3 attitudes; NEES per axis 0.90",
     ]
     assert len(blocks(streaks={**streaks, "rms_error": None})[-1].splitlines()) == 1
 

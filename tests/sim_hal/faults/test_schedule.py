@@ -72,9 +72,9 @@ def test_a_fault_is_read_with_its_time_and_parameters(
         ("imu: silent @ soon", "'soon' is not a number"),
         ("imu: silent @ -3", "cannot be below zero"),
         ("imu: silent @ nan", "'nan' is not a number"),
-        ("imu: bits (chanc=0.1)", "imu: bits has chance"),
-        ("imu: bits (chance)", "imu: bits has chance"),
-        ("imu: silent (delay=1)", "has no parameters"),
+        ("imu: bits (chanc=0.1)", "`imu: bits` takes chance=VALUE"),
+        ("imu: bits (chance)", "`imu: bits` takes chance=VALUE"),
+        ("imu: silent (delay=1)", "takes no parameters"),
         ("", "write it as"),
     ],
 )

@@ -111,11 +111,12 @@ def test_the_option_devices_is_refused_for_real_devices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("facts", [None, "{", "[]", "{}"])
-def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | None) -> None:
+def test_a_file_that_describes_no_server_is_refused(tmp_path: Path, facts: str | None) -> None:
     path = tmp_path / "facts.json"
     if facts is not None:
         path.write_text(facts, encoding="utf-8")
-    with pytest.raises(UsageError, match=r"facts\.json describes no server"):
+    problem = r"cannot be read \(No such file" if facts is None else "describes no server: give a file"
+    with pytest.raises(UsageError, match=rf"--devices .*facts\.json: {problem}"):
         fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))
 
 

@@ -22,16 +22,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     listed = "\n".join(f"  {name:18} {one.purpose}" for name, one in CAMPAIGNS.items())
     parser = argparse.ArgumentParser(
         prog="python -m tests.studies.campaigns",
-        description="Run a Monte Carlo campaign on all cores. Broken off, it goes on where it was.",
+        description="Run a Monte Carlo campaign. After an interruption, the same command continues it.",
         epilog=f"campaigns:\n{listed}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("name", choices=sorted(CAMPAIGNS), metavar="NAME", help="which campaign")
-    parser.add_argument("--runs", type=_positive, metavar="N", help="runs of each cell, or of the whole")
-    parser.add_argument("--hours", type=_positive, dest="runs", metavar="H", help="of soak: hours of flight")
+    parser.add_argument("name", choices=sorted(CAMPAIGNS), metavar="NAME", help="one of the list below")
+    parser.add_argument("--runs", type=_positive, metavar="N", help="runs of each cell, or of all cells")
+    parser.add_argument("--hours", type=_positive, dest="runs", metavar="H", help="for soak: hours of flight")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of all draws (default 1)")
     parser.add_argument(
-        "--only", default="", metavar="TEXT", help="only cases whose key contains it: 'coil-x: open', ' 3.0 '"
+        "--only",
+        default="",
+        metavar="TEXT",
+        help="only cases with TEXT in their key, such as 'coil-x: open'",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes (default: the cores)")
@@ -57,10 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"campaigns: {error}\n")
         return 2
     except CampaignError as error:
-        sys.stderr.write(f"campaigns: {error}; the same command goes on where it was ({out})\n")
+        sys.stderr.write(f"campaigns: {error}; the same command continues the campaign in {out}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write(f"\nbroken off; the same command goes on where it was ({out})\n")
+        sys.stderr.write(f"\ninterrupted; the same command continues the campaign in {out}\n")
         return 130
     if options.json:
         sys.stdout.write(json.dumps(summary.facts) + "\n")

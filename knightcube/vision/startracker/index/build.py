@@ -84,7 +84,7 @@ class IndexSettings:
         than a sixteenth of the field of view.
         """
         if not _NARROWEST <= fov <= _WIDEST:
-            raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index can serve 2 to 120 deg")
+            raise UsageError(f"a field of view of {np.rad2deg(fov):g} deg: a sky index needs 2 to 120 deg")
         if pixel is not None and not 0.0 < pixel < _WIDEST_PIXEL * fov:
             raise ArgumentError(
                 "pixel", f"{pixel:g} rad: give more than 0 and less than a sixteenth of `fov`"

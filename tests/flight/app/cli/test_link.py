@@ -225,7 +225,7 @@ def test_one_link_at_a_time_has_the_counters(lines: dict[str, str]) -> None:
         (["command", "--to", "x", "play", "0", "1"], "send it with --link"),
         (["command", "--link", "nowhere", "--keys", "{keys}", "ping"], "give HOST:PORT"),
         (["command", "--link", "127.0.0.1:5", "--keys", "/nowhere", "ping"], "no such folder"),
-        (["link", str(CONFIG), "--log", "."], "no `link` section"),
+        (["link", str(CONFIG), "--log", "."], "has no section `link`"),
     ],
 )
 def test_wrong_use_is_one_line(

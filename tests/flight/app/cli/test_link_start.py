@@ -199,7 +199,7 @@ def test_each_call_of_a_start_fails_once_and_the_whole_disk_for_a_while(tmp_path
         (lambda text: text.replace("link:", "lnik:"), "`lnik` is an unknown key"),
         (lambda text: text.replace("127.0.0.1:0", "127.0.0.1:65536"), "expected HOST:PORT"),
         (lambda text: text.replace('"udp"', '"spacecraft": 2000, "udp"'), "`link.spacecraft`"),
-        (lambda text: text[: text.index("link:")], "no `link` section"),
+        (lambda text: text[: text.index("link:")], "has no section `link`"),
         (lambda text: text + "\n]", "is not YAML"),
     ],
 )

@@ -185,7 +185,7 @@ def test_the_line_of_progress_names_the_function_that_numba_compiles(monkeypatch
     progress_on(stream)
     for name in ("first", "second"):
         reports[0](name)
-    assert stream.getvalue() == "waits once until numba has compiled second\n"
+    assert stream.getvalue() == "compiling second for this machine, once\n"
     stream.close()
     monkeypatch.setattr("flight.app.cli.run.time.perf_counter", lambda: 30.0)
     reports[0]("third")

@@ -194,7 +194,7 @@ def test_the_end_of_a_slew_is_reported_and_a_new_path_planned() -> None:
     bench = Bench()
     bench.paths.has_arrived.return_value, bench.paths.off = True, np.radians(1.25)
     assert bench.serve(5 * S) == 1
-    assert bench.reports == [("slew-ended", 5 * S, "1.25 deg off its path")]
+    assert bench.reports == [("slew-ended", 5 * S, "1.25 deg from its path")]
 
 
 def test_a_body_far_off_its_path_is_reported_once_and_planned_for_when_it_is_slow() -> None:

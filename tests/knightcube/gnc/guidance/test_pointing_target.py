@@ -67,8 +67,8 @@ def test_a_roll_is_shown_in_degrees() -> None:
         (Goal.INERTIAL, (0.0, 0.0, 0.0, 0.9989), None, "has length 0.9989"),
         (Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0), 0.0, "includes its roll"),
         (Goal.OBJECT, (), 0.1, "free roll"),
-        (Goal.GROUND, (1.58, 0.0), None, "latitude 90.5273 deg is beyond a pole"),
-        (Goal.OBJECT, (0.0, -1.58), None, "declination -90.5273 deg is beyond a pole"),
+        (Goal.GROUND, (1.58, 0.0), None, "latitude 90.5273 deg: must be -90 to 90"),
+        (Goal.OBJECT, (0.0, -1.58), None, "declination -90.5273 deg: must be -90 to 90"),
     ],
 )
 def test_a_target_that_defines_no_attitude_is_refused(
