@@ -8,7 +8,7 @@ const LAST_OF_FLIGHT = 0x21f; // APID; the link process obeys the commands above
 export async function ask(path, body) {
   try {
     return await (await fetch(path, { method: "POST", body, headers: { "Content-Type": "application/json" } })).json();
-  } catch { return { error: "the console does not answer" }; }
+  } catch { return { error: "the console does not answer: check that `knightcube console` runs" }; }
 }
 export function say(place, words, kind = "") { place.textContent = words; place.className = kind; }
 const make = (kind, properties, ...children) => { const element = Object.assign(document.createElement(kind), properties); element.append(...children); return element; };

@@ -40,7 +40,7 @@ export class GroundTrack {
     ctx.stroke();
     this.dot(ctx, place.sun_latitude, place.sun_longitude, colour("sun"), 7);
     this.dot(ctx, place.latitude, place.longitude, colour("dipole"), 5);
-    const light = place.sunlit > 0.99 ? "in sunlight" : place.sunlit < 0.01 ? "in the Earth's shadow" : "in half-shadow";
+    const light = place.sunlit > 0.99 ? "in sunlight" : place.sunlit < 0.01 ? "in the Earth's shadow" : "in penumbra";
     this.words.textContent = `${place.latitude.toFixed(2)}°, ${place.longitude.toFixed(2)}°, ${place.altitude_km.toFixed(0)} km, ${light}`;
   }
 

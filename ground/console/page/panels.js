@@ -5,7 +5,7 @@ const make = (kind, properties, ...children) => { const element = Object.assign(
 const clock = (utc) => utc.slice(0, 19).replace("T", " ");
 
 async function answerOf(request) {
-  try { return await (await request).json(); } catch { return { error: "the console does not answer" }; }
+  try { return await (await request).json(); } catch { return { error: "the console does not answer: check that `knightcube console` runs" }; }
 }
 
 export class Passes {
@@ -27,7 +27,7 @@ export class Passes {
     const answer = await answerOf(fetch(`/api/passes?${query}`));
     this.body.replaceChildren();
     if (answer.error) { say(this.status, answer.error, "error"); return; }
-    say(this.status, `${answer.passes.length} passes; times are certain to ${answer.timing_error_s.toFixed(1)} s (1 sigma) at the end of the span.${this.schedules ? "" : " To schedule from here, start with --link."}`, "legend");
+    say(this.status, `${answer.passes.length} passes; standard deviation of the times at the end of the span: ${answer.timing_error_s.toFixed(1)} s.${this.schedules ? "" : " To schedule from here, start with --link."}`, "legend");
     for (const one of answer.passes) this.add(one);
   }
 
@@ -91,7 +91,7 @@ export class Files {
       try {
         const answer = await fetch(`/api/file?${new URLSearchParams({ name })}`);
         return answer.ok ? { blob: await answer.blob() } : await answer.json();
-      } catch { return { error: "the console does not answer" }; }
+      } catch { return { error: "the console does not answer: check that `knightcube console` runs" }; }
     };
     return this.during(`getting ${name} ...`, request, ({ blob }) => {
       const link = make("a", { href: URL.createObjectURL(blob), download: name.split("/").at(-1) });

@@ -109,7 +109,7 @@ export class Health {
     if (link) {
       const causes = Object.entries(link).filter(([name, count]) => name.startsWith("refused_") && count > 0);
       const words = causes.map(([name, count]) => `${name.slice("refused_".length)} ${count}`).join(", ");
-      add("frames let in", String(link.admitted), "");
+      add("accepted frames", String(link.admitted), "");
       add("frames refused", words || "none", words ? "warn" : "good");
     }
     this.draw(cards);

@@ -345,6 +345,14 @@ def test_a_flight_beyond_a_limit_or_with_an_error_keeps_its_configuration(
     found = fly_case(CASE)
     assert (found["error"], found["config"], found["judged"]) == (str(flight.error), "name: x\n", [])
     assert "mode" not in found
+
+    def refused(request: Any) -> Any:
+        raise UsageError(f"{request.config_path}:45: `coils.current_limit` is 5.0: must be 0.001 to 1 A")
+
+    monkeypatch.setattr(varied, "fly", refused)
+    assert fly_case(CASE)["error"].startswith("flight-00003.yaml:45: "), (
+        "the kept file, not the temporary one"
+    )
     Flight(monkeypatch, interrupted=True)
     with pytest.raises(KeyboardInterrupt):
         fly_case(CASE)

@@ -122,7 +122,7 @@ def test_without_a_rate_the_reason_is_printed() -> None:
     reason = REASONS[StreakStatus.TOO_FEW]
     status, why, streaks = rate._text(none, ()).splitlines()
     assert (status, streaks) == ("status:        too-few", "streaks:       2 found, 1 used")
-    assert why.startswith(f"why:           {reason}: "), "the remedy follows the reason"
+    assert why.startswith(f"reason:        {reason}: "), "the remedy follows the reason"
     facts = rate._facts(none, (), "harris")
     assert facts == {
         "method": "harris", "status": "too-few", "reason": reason, "rate_rad_s": None,

@@ -117,5 +117,5 @@ def test_a_frame_of_one_value_is_black_or_saturated_and_has_no_length(
     Image.fromarray(np.full((64, 64), value, np.uint8)).save(path)
     done = command("rate", path, "--fov", "20", "--exposure", "0.2", "--method", method)
     assert done.returncode == 1
-    assert done.stdout.startswith(f"status:        {status}\nwhy:           {reason}: ")
+    assert done.stdout.startswith(f"status:        {status}\nreason:        {reason}: ")
     assert done.stdout.endswith("\nstreaks:       0 found, 0 used\n")
