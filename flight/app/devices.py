@@ -88,6 +88,7 @@ from knightcube.errors import UsageError
 if TYPE_CHECKING:
     from sim_hal.rig import EmulatedBench, PosedCamera, SimulationRequest
 
+NO_INDEX = "no such file: make it with `knightcube index --camera CONFIG --out FILE`"
 NO_CAMERA = (
     "the flight uses real devices: give `{driver: v4l2, path: ...}` or `{driver: aravis, name: ...}`, or "
     "give `camera: none`"

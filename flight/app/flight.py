@@ -24,6 +24,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from flight.app.devices import (
+    NO_INDEX,
     Devices,
     check_settings,
     injected_faults,
@@ -140,7 +141,7 @@ def open_flight(
     if tracker is not None and tracker.index is None:
         ensure_default_index()
     elif tracker is not None and not patient and not Path(tracker.index or "").is_file():
-        raise ConfigError("camera.star_tracker.index", f"is {tracker.index!r}: there is no such file")
+        raise ConfigError("camera.star_tracker.index", f"is {tracker.index!r}: {NO_INDEX}")
     jobs = _open_jobs(config, rig, stack, worker_cores() if patient else frozenset())
     recorder = Recorder(flight_log, performance_log)
     feed, beat = nothing, nothing

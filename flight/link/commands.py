@@ -615,7 +615,7 @@ class DatagramChannel:
         bound.setblocking(False)
         old, self._socket, self._file = self._socket, bound, _identity(path)
         old.close()
-        self._news = f"{path} was gone: bound again"
+        self._news = f"{path} had been removed and is bound again"
 
 
 def open_unix(path: Path) -> DatagramChannel:

@@ -522,7 +522,7 @@ class ObjectTracks:
             self._events.report(events.OBJECT_FOUND, now_ns, text)
         for track in ended:
             away = (middle_ns - track.seen_ns) * 1e-9
-            text = f"object {track.number}: not seen for {away:.1f} s, {track.sightings} sightings"
+            text = f"object {track.number}: not detected for {away:.1f} s, {track.sightings} sightings"
             self._events.report(events.OBJECT_LOST, now_ns, text)
 
     def _record_track(self, track: Track, now_ns: int, attitude: FloatArray | None = None) -> None:

@@ -479,7 +479,7 @@ class SunSensing:
             if now_ns - reading.time_ns <= self._max_age_ns:
                 wrong = self._accept(reading)
                 if wrong is not None:
-                    self._facts.update(facts.SUN_UNCLEAR, bool(wrong), now_ns, wrong or "the Sun is seen")
+                    self._facts.update(facts.SUN_UNCLEAR, bool(wrong), now_ns, wrong or "the Sun is detected")
         age_ns = now_ns - self._read_ns
         lost = age_ns > self._max_age_ns
         text = self._strings.error() or f"no reading for {age_ns * 1e-9:.0f} s"

@@ -180,7 +180,7 @@ class PowerTask:
             if all(one is not None for one in found) and not any(texts):
                 texts = [self._contradiction(*found)] * 2
         for fact, text in zip((facts.BATTERY_MONITOR_LOST, facts.BUS_MONITOR_LOST), texts, strict=False):
-            self._facts.update(fact, bool(text), now_ns, text or "the readings are trusted again")
+            self._facts.update(fact, bool(text), now_ns, text or "the readings are used again")
         trusted = [None if text else one for one, text in zip(found, texts, strict=True)]
         return trusted[0], trusted[1] if len(trusted) == 2 else None
 

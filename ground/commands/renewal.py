@@ -291,7 +291,7 @@ def artefact(kind: str, path: Path) -> bytes:
         return text.encode()
     data = LinuxFiles().read(path)
     if data is None:
-        raise UsageError(f"{path}: there is no such file")
+        raise UsageError(f"{path}: no such file; check the path")
     if kind == "elements":
         return _two_lines(data, path)
     index.load(path)  # raises InputError for a file that is not a sky index

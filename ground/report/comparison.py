@@ -138,7 +138,7 @@ def _loop(summary: Object) -> Iterator[_Figure]:
         yield f"rate group {group['name']}: overruns", (group["overruns"], "")
     for log in summary["logs"]:
         lost = log["missing_packets"] + log["skipped_bytes"] + log["truncated_bytes"]
-        yield f"log {log['log']}: missing packets and bad bytes", (lost, "")
+        yield f"log {log['log']}: missing packets and damaged bytes", (lost, "")
 
 
 def _counted(names: Iterable[str]) -> Iterator[str]:
@@ -314,7 +314,7 @@ def _label(utc_ns: int) -> str | None:
 
 def format_archive(summary: Object) -> str:
     """Return the table of an archive as text that ends in a newline."""
-    head = ["run", "configuration", "UTC (label)", "s", "packets", "bad bytes", "missing", "end"]
+    head = ["run", "configuration", "UTC (label)", "s", "packets", "damaged bytes", "missing", "end"]
     rows = [
         [
             Path(row["folder"]).name,

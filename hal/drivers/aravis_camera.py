@@ -133,7 +133,7 @@ class AravisCamera:
         """Return the triggered frame once, or None until the frame arrives. Raises NotResponding."""
         _, stream = self._opened()
         if self._lost:
-            raise NotResponding(self.name, "gone: was it unplugged?")
+            raise NotResponding(self.name, "the camera disappeared: check its cable")
         while (buffer := stream.try_pop_buffer()) is not None:
             frame = self._judge(buffer)
             stream.push_buffer(buffer)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from flight.app.cli import PROGRAM, complain, to_json
 from flight.app.devices import (
     NO_CAMERA,
+    NO_INDEX,
     check_settings,
     check_simulated_elements,
     fault_catalogue,
@@ -313,8 +314,7 @@ def _files(config: Config) -> Iterator[Probed]:
     tracker = config.camera.star_tracker if config.camera is not None else None
     if tracker is not None and tracker.index is not None:
         there = Path(tracker.index).is_file()
-        cure = "no such file: make it with `knightcube index --camera CONFIG --out FILE`"
-        yield Probed("camera.star_tracker.index", tracker.index, there, "is there" if there else cure)
+        yield Probed("camera.star_tracker.index", tracker.index, there, "is there" if there else NO_INDEX)
     for index, camera in enumerate(config.wide_cameras):
         if camera.structure_file is not None:
             try:
@@ -484,7 +484,7 @@ def _drivers(config: Config) -> dict[str, str]:
 def _text(verdict: CheckResult) -> str:
     config, result = verdict.config, verdict.result
     foreign = [f"{key} {name}" for key, name in _drivers(config).items() if ":" in name]
-    devices = "simulated" if config.simulation is not None else f"{len(verdict.devices)} looked for"
+    devices = "simulated" if config.simulation is not None else f"{len(verdict.devices)} checked"
     lines = [
         ("configuration", f"{verdict.path}: {config.name}, valid"),
         *(("extends", name) for name in verdict.chain[1:]),

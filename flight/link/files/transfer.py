@@ -273,7 +273,7 @@ class Sender:
             case Finished(condition, complete, _):
                 self.condition = condition if self._stopped is None else self._stopped
                 if not self.said:
-                    self.said = "received whole" if complete else _condition_text(condition)
+                    self.said = "received completely" if complete else _condition_text(condition)
                 return [answer_to(content)]
             case _:
                 pass

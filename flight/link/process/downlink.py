@@ -395,8 +395,8 @@ class Playback:
         """Begin a playback and return the reports due now; `done` is the report of completion."""
         folder = self._log.folder(play.run)
         if folder is None:
-            return [replace(done, stage=Stage.FAILED, text=f"there is no run {play.run}")]
-        reports = self.end("another takes its place")
+            return [replace(done, stage=Stage.FAILED, text=f"the archive has no run {play.run}")]
+        reports = self.end("replaced by another playback")
         self._downlink.play(stretch(folder, play.begin, play.end))
         self._done = done
         return [*reports, replace(done, stage=Stage.STARTED)]

@@ -196,4 +196,4 @@ def test_a_lost_object_is_reported_with_its_age_and_sightings() -> None:
             )  # fmt: skip
         bench.tracks.ingest(number, number * S, sighted, 99)
     assert bench.reports[-1][0] is events.OBJECT_LOST
-    assert bench.reports[-1][1] in {f"object 1: not seen for {age}.0 s, 3 sightings" for age in (4, 5)}
+    assert bench.reports[-1][1] in {f"object 1: not detected for {age}.0 s, 3 sightings" for age in (4, 5)}

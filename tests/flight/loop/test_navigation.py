@@ -490,7 +490,9 @@ def test_a_new_reading_of_the_solar_cells_is_accepted_once_unless_it_is_old() ->
     cells.reading = cast(Any, SimpleNamespace(time_ns=BEGIN + 6 * S))
     task.run(BEGIN + 9 * S + 1)
     assert accepted == [BEGIN + 5 * S], "too old"
-    for number, (wrong, expected) in enumerate((("", (False, "the Sun is seen")), ("dim", (True, "dim")))):
+    for number, (wrong, expected) in enumerate(
+        (("", (False, "the Sun is detected")), ("dim", (True, "dim")))
+    ):
         answer[0] = wrong
         cells.reading = cast(Any, SimpleNamespace(time_ns=BEGIN + (20 + number) * S))
         task.run(BEGIN + (20 + number) * S)

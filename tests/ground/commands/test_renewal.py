@@ -156,7 +156,7 @@ def test_elements_are_signed_as_the_command_elements_prints_them(signing: Path, 
         ("elements", LINES.replace("26079", "26078"), [], "line 1, column 69: checksum 5"),
         ("elements", f"elements: {LINES.replace('297.0955', '297.0965').splitlines()}", [], "checksum 3"),
         ("catalogue", "x", [], "the file is not a sky index"),
-        ("catalogue", None, [], "there is no such file"),
+        ("catalogue", None, [], "no such file; check the path"),
     ],
 )
 def test_artefacts_that_the_board_would_refuse_are_not_signed(
