@@ -13,7 +13,7 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray, finite_array
+from knightcube.astro.arrays import FloatArray, brief, check_numbers, finite_array
 from knightcube.astro.earth import geomagnetism
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orbit_knowledge import LOWEST_RADIUS, elements_of, propagated
@@ -104,6 +104,7 @@ def magnetic_field_on_ground(
             a pole, more than 12 km below the ellipsoid, or farther than ten Earth radii.
         ArgumentError: for a longitude beyond 2 pi rad, which is usually in degrees.
     """
+    check_numbers(latitude=latitude, longitude=longitude, height=height)
     _check_angle("longitude", longitude)
     year = float(julian_epoch(julian_date(time)))
     geomagnetism.check_year(year)
@@ -193,6 +194,7 @@ def _check_elements(
 ) -> None:
     """Raise UsageError for Kepler elements that `orbit_state` refuses; `angles` are the other angles, rad."""
     sizes = {"semi_major_axis": semi_major_axis, "eccentricity": eccentricity, "inclination": inclination}
+    check_numbers(**sizes, **angles)
     for name, value in (sizes | angles).items():
         if not math.isfinite(value):
             raise ArgumentError(name, f"{value}: the elements of an orbit must be finite")
@@ -328,8 +330,8 @@ def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> 
         OrbitError: if a time is too far from the epoch of the elements, or if SGP4 fails at a time, for
             example because the orbit has decayed.
     """
-    if isinstance(times, datetime):
-        raise ArgumentError("times", f"{times!r}: give a sequence of times, such as [time]")
+    if not np.iterable(times):
+        raise ArgumentError("times", f"{brief(times)}: give a sequence of times, such as [time]")
     satellite = elements_of(elements)
     states = [satellite.known_at(julian_date(time)) for time in times]
     position = np.array([state.position for state in states]).reshape(-1, 3)

@@ -32,17 +32,12 @@ def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> F
     if np.ma.is_masked(value):
         count = np.count_nonzero(np.ma.getmaskarray(np.ma.asarray(value)))
         raise ArgumentError(name, f"{count} masked elements: replace them by finite numbers")
-    try:
-        if np.iscomplexobj(value):
-            raise TypeError
-        found = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ArgumentError(name, f"{value!r}: give finite numbers") from None
+    found = _as_floats(name, value, "give finite numbers")
     if shapes and found.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
         raise ArgumentError(name, f"an array of shape {found.shape}: give finite numbers of shape {wanted}")
     if not np.isfinite(found).all():
-        raise ArgumentError(name, f"{found.tolist()}: give finite numbers")
+        raise ArgumentError(name, f"{brief(found.tolist())}: give finite numbers")
     return found
 
 
@@ -50,7 +45,7 @@ def checked_number(name: str, value: float, unit: str) -> float:
     """Return the argument `name` in `unit`. Raises ArgumentError unless it is a positive, finite number."""
     number = real_number(value)
     if not 0.0 < number < math.inf:
-        raise ArgumentError(name, f"{value!r}: give a positive, finite number of {unit}")
+        raise ArgumentError(name, f"{brief(value)}: give a positive, finite number of {unit}")
     return number
 
 
@@ -61,48 +56,91 @@ def checked_deviation(name: str, value: float, unit: str) -> float:
     """
     number = real_number(value)
     if not number >= 0.0:
-        raise ArgumentError(name, f"{value!r}: give a standard deviation of 0 {unit} or more")
+        raise ArgumentError(name, f"{brief(value)}: give a standard deviation of 0 {unit} or more")
     return number
 
 
-def real_number(value: npt.ArrayLike) -> float:
+def real_number(value: object) -> float:
     """Return an integer or a floating-point number as a float, and NaN for any other value."""
-    return (
-        float(np.asarray(value))
-        if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "uif"
-        else math.nan
-    )
+    return float(np.asarray(value)) if _is_number(value) else math.nan
 
 
-def check_numbers(**given: npt.ArrayLike | None) -> None:
-    """Raise ArgumentError, with the name, for an argument that is neither None nor a number."""
+def check_numbers(**given: object) -> None:
+    """Raise ArgumentError, with the name, for an argument that is not a number."""
     for name, value in given.items():
-        if value is not None and not (np.ndim(value) == 0 and np.asarray(value).dtype.kind in "uif"):
-            raise ArgumentError(name, f"{value!r}: give a number")
+        if not _is_number(value):
+            raise ArgumentError(name, f"{brief(value)}: give a number")
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is an integer or a floating-point number that numpy can store."""
+    if isinstance(value, float):  # without numpy, which takes ten times as long
+        return True
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError):
+        return False
+    return found.ndim == 0 and found.dtype.kind in "uif"
+
+
+def float_rows(name: str, value: npt.ArrayLike, count: int) -> FloatArray:
+    """Return the argument `name` of a public method as an array (..., count) of numbers, which may be NaN.
+
+    Raises ArgumentError for values that are not numbers, and for an array of another shape.
+    """
+    found = value if isinstance(value, np.ndarray) and value.dtype == float else None
+    if found is None:
+        found = _as_floats(name, value, f"give numbers of shape (n, {count})")
+    if found.shape[-1:] != (count,):
+        raise ArgumentError(name, f"an array of shape {found.shape}: give numbers of shape (n, {count})")
+    return found
+
+
+def _as_floats(name: str, value: npt.ArrayLike, remedy: str) -> FloatArray:
+    """Return a new array of the numbers in `value`. Raises ArgumentError for texts, dates and other types."""
+    try:
+        if np.asarray(value).dtype.kind not in "buifO":
+            raise TypeError
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise ArgumentError(name, f"{brief(value)}: {remedy}") from None
+
+
+_LONGEST_TEXT = 100
+
+
+def brief(value: object) -> str:
+    """Return the representation of a value in one line of at most `_LONGEST_TEXT` characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _LONGEST_TEXT else f"{text[: _LONGEST_TEXT - 3]}..."
 
 
 def check_type(name: str, value: object, kind: type[object]) -> None:
     """Raise ArgumentError unless the argument `name` of a public function is an object of a class.
 
-    The whole numbers of a dataclass are checked too (`check_whole`).
+    The numbers of a dataclass are checked too (`check_fields`).
     """
     if not isinstance(value, kind):
-        raise ArgumentError(name, f"{value!r}: give an object of the class {kind.__name__}")
+        raise ArgumentError(name, f"{brief(value)}: give an object of the class {kind.__name__}")
     if is_dataclass(value):
-        check_whole(value, f"{name}.")
+        check_fields(value, f"{name}.")
 
 
-def check_whole(settings: Any, prefix: str = "") -> None:
-    """Raise ArgumentError unless the fields of a dataclass that are annotated as int are whole numbers.
+def check_fields(settings: Any, prefix: str = "") -> None:
+    """Raise ArgumentError unless the fields of a dataclass that are annotated as int or float are numbers.
 
-    Dataclasses that are values of fields are also checked. The text `prefix` precedes the names.
+    Fields annotated as int must be whole numbers. Dataclasses that are values of fields are also checked. The
+    text `prefix` precedes the names.
     """
     for field in fields(settings):
         value = getattr(settings, field.name)
         if field.type == "int" and not isinstance(value, (int, np.integer)):
-            raise ArgumentError(prefix + field.name, f"{value!r}: give a whole number")
+            raise ArgumentError(prefix + field.name, f"{brief(value)}: give a whole number")
+        is_real = field.type == "float" or (field.type == "float | None" and value is not None)
+        if is_real and not _is_number(value):
+            raise ArgumentError(prefix + field.name, f"{brief(value)}: give a number")
         if is_dataclass(value):
-            check_whole(value, f"{prefix}{field.name}.")
+            check_fields(value, f"{prefix}{field.name}.")
 
 
 _UNIT = 1e-12

@@ -20,11 +20,20 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, median
+from knightcube.astro.arrays import (
+    BoolArray,
+    FloatArray,
+    Image,
+    IntArray,
+    check_type,
+    checked_number,
+    median,
+)
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import ArgumentError
 from knightcube.vision.background import MAD_TO_SIGMA
@@ -491,6 +500,25 @@ def count_of_floats(image: Image) -> float:
     sample = image[::4, ::4].astype(float)
     spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - np.median(sample))))
     return (spread or float(sample.std()) or 1.0) / _FLOATING_NOISE
+
+
+_LONGEST_LINE_TIME = 0.01
+"""Largest accepted line time of a rolling shutter, s per row."""
+
+
+def check_detector(settings: Any, kind: type[object]) -> None:
+    """Raise ArgumentError unless `settings` of the class `kind` describe a possible detector and lens.
+
+    Gain, saturation and width of the point spread must be positive, and the line time must be short.
+    """
+    check_type("settings", settings, kind)
+    checked_number("settings.gain", settings.gain, "electrons per count")
+    checked_number("settings.psf_sigma", settings.psf_sigma, "pixels")
+    if settings.saturation is not None and not settings.saturation > 0.0:
+        raise ArgumentError("settings.saturation", f"{settings.saturation}: give a positive number of counts")
+    line_time = getattr(settings, "line_time", None)
+    if line_time is not None and not abs(line_time) <= _LONGEST_LINE_TIME:
+        raise ArgumentError("settings.line_time", f"{line_time}: give at most {_LONGEST_LINE_TIME} s per row")
 
 
 def gain_in_counts(gain: float, unit: float) -> float:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, brief
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.astro.quaternion import attitude_matrix
@@ -555,6 +555,8 @@ def calibrate_lens(
         CalibrationError: if the solved images do not determine a lens.
     """
     images = _grey_images(images)
+    if not (progress is None or callable(progress)):
+        raise ArgumentError("progress", f"{brief(progress)}: give a function of two numbers")
     sky = default_index()
     model: CameraModel
     model, scale = camera_of_field(fov_deg, None, images[0].shape)
@@ -593,6 +595,8 @@ def calibrate_lens(
 
 def _grey_images(images: Sequence[Image]) -> list[Image]:
     """Return grey images of one shape. Raises UsageError, which states the number of the image, from 1."""
+    if not np.iterable(images):
+        raise ArgumentError("images", f"{brief(images)}: give a sequence of images")
     found: list[Image] = []
     for number, image in enumerate(images, start=1):
         try:

@@ -20,6 +20,7 @@ from knightcube.astro.arrays import (
     FloatArray,
     Image,
     IntArray,
+    brief,
     check_type,
     checked_deviation,
     checked_number,
@@ -30,7 +31,7 @@ from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import ArgumentError, InputError
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole, check_camera
-from knightcube.vision.frame import Bins, grey_image
+from knightcube.vision.frame import Bins, check_detector, grey_image
 from knightcube.vision.frame_job import BIN_SIZES, binned_settings, found_in_image, in_whole_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index import SkyIndex, load_once
@@ -44,7 +45,7 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
 )
 from knightcube.vision.startracker.survey import FrameKind
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0
 """Range of the field of view (deg) that is searched if the field of view is unknown."""
@@ -229,6 +230,7 @@ class StarTracker:
         self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
         self._settings = SolveSettings() if settings is None else settings
         check_type("settings", self._settings, SolveSettings)
+        check_detector(self._settings.likelihood, LikelihoodSettings)
         if not isinstance(self._settings.lens, CameraKnowledge | None):
             raise ArgumentError(
                 "settings.lens",
@@ -237,10 +239,12 @@ class StarTracker:
         for name, unit in _DEVIATIONS.items():
             if (value := getattr(self._settings.lens, name, None)) is not None:
                 checked_deviation(f"settings.lens.{name}", value, unit)
+        if not isinstance(learn, bool):
+            raise ArgumentError("learn", f"{brief(learn)}: give True or False")
         self._learn = learn
         self.lens: LensKnowledge | None = None
         if not isinstance(index, SkyIndex | Path | str | None):
-            raise ArgumentError("index", f"{index!r}: give a SkyIndex or the path of a sky index file")
+            raise ArgumentError("index", f"{brief(index)}: give a SkyIndex or the path of a sky index file")
         if index is None:
             self._index = default_index()
         else:
@@ -297,7 +301,7 @@ class StarTracker:
         sky, settings = self._index, self._settings
         if utc is not None:
             if not isinstance(utc, datetime):
-                raise ArgumentError("utc", f"{utc!r}: give a datetime, such as datetime(2026, 7, 2, 12, 30)")
+                raise ArgumentError("utc", f"{brief(utc)}: give a datetime, as datetime(2026, 7, 2, 12, 30)")
             date = ephemeris_date("utc", utc)
             sky = sky.at(2000.0 + (date - J2000) / 365.25)
             settings = replace(settings, velocity=earth_velocity(date))

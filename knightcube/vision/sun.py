@@ -24,7 +24,7 @@ from enum import Enum
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type, check_whole, tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_fields, check_type, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, image_of_camera
@@ -72,7 +72,7 @@ class SunSettings:
     floor_sigma: float = 0.01
 
     def __post_init__(self) -> None:
-        check_whole(self)
+        check_fields(self)
         if self.stride < 1:
             raise UsageError(f"stride {self.stride}: must be a whole number of pixels from 1")
         if not 0.0 < self.least_radius < self.greatest_radius < 0.5:

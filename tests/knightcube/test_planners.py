@@ -205,7 +205,7 @@ def test_a_slew_that_is_longer_than_a_third_of_the_longest_needs_no_limit() -> N
         ({"duration": np.array([600.0])}, r"duration: array\(\[600.\]\): give a number"),
         ({"longest": "900"}, "longest: '900': give a number"),
         ({"time_cost": True}, "time_cost: True: give a number"),
-        ({"cones": {"sun": "0.3"}}, r"cones\['sun'\]: 0.3 rad: must be"),
+        ({"cones": {"sun": "0.3"}}, r"cones\['sun'\]: '0.3' rad: must be"),
         ({"duration": NAN}, "duration is nan s, .* must satisfy 1 <= duration <= longest <= 20000 s"),
         ({"duration": 1e12}, "duration is 1000000000000.0 s"),
         ({"longest": 300.0}, "duration is 600.0 s, longest 300.0 s: must satisfy"),

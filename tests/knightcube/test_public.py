@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
+from functools import reduce
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,6 +24,8 @@ import knightcube
 from knightcube import (
     ArgumentError,
     Goal,
+    KnightCubeError,
+    Lens,
     LensCalibration,
     Pinhole,
     PointingTarget,
@@ -331,6 +334,117 @@ def test_prior_directions_can_be_lists() -> None:
     assert not find_nadir(IMAGE, CAMERA, known)
     located = LIB.HorizonKnowledge(position=[7e6, 0, 0], sun=(0, 1, 0), pole=[0, 0, 1])
     assert all(isinstance(vector, np.ndarray) for vector in (located.position, located.sun, located.pole))
+
+
+LINES = (
+    "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05",
+    "2 99999  97.4640 337.4170 0011973 295.7805  64.3547 15.24067411    09",
+)
+NOON, PLACE = datetime(2026, 3, 20, 12), [7e6, 0.0, 0.0]
+LENS: dict[str, Any] = {"columns": 64, "rows": 64, "focal_length": 300.0, "centre": (32.0, 31.0)}
+CALLS: dict[str, dict[str, Any]] = {
+    "SingleAxisPlant": {
+        "inertia": 1.0, "torque_constant": 1.0, "resistance": 1.0, "current_limit": 1.0, "stiffness": 1.0,
+        "damping": 1.0, "disturbance": 1.0,
+    },
+    "plan_step": {
+        "plant": PLANT, "start_angle": 0.0, "end_angle": 0.3, "horizon": 12.0, "start_rate": 0.0,
+        "end_rate": 0.0, "time_cost": 0.01, "minimise": "heat", "nodes": 12, "max_stretch": 2.0,
+    },
+    "plan_slew": {
+        "inertia": [1e-3] * 3, "dipole_limit": [0.1] * 3, "heat": [50.0] * 3, "elements": LINES, "time": NOON,
+        "start": PointingTarget(Goal.NADIR), "goal": PointingTarget(Goal.SUN), "duration": 600.0,
+        "longest": 700.0, "window": 0.0, "time_cost": 0.01, "pointing_axis": [0, 0, 1],
+        "across_axis": [1, 0, 0], "camera_axis": [0, 0, 1], "cones": {"moon": 0.2}, "nodes": 12,
+    },
+    "PointingTarget": {"goal": Goal.GROUND, "numbers": (0.1, 0.2), "roll": 0.1},
+    "Goal.named": {"label": "sun"},
+    "Pinhole": {"columns": 64, "rows": 64, "focal_length": 300.0},
+    "Pinhole.from_field_of_view": {"columns": 64, "rows": 64, "field_of_view": 0.3},
+    "Lens": LENS | dict.fromkeys(("k1", "k2", "aspect", "shear", "p1", "p2"), 0.0),
+    "Lens.of": {"camera": CAMERA},
+    "StarTracker": {"fov_deg": 12.0, "fov_error_deg": 0.5, "settings": None, "learn": False},
+    "calibrate_lens": {"images": [IMAGE], "fov_deg": 12.0, "progress": None},
+    "detect_objects": {
+        "image": IMAGE, "camera": CAMERA, "rate": [0, 0.1, 0], "exposure": 0.2, "settings": None,
+    },
+    "estimate_rate": {
+        "image": IMAGE, "camera": CAMERA, "exposure": 0.2, "prior_rate": [0, 0.1, 0], "prior_sigma": 0.1,
+        "settings": None,
+    },
+    "find_nadir": {
+        "image": IMAGE, "camera": CAMERA, "knowledge": None, "settings": None, "hidden": IMAGE > 0.0
+    },
+    "HorizonKnowledge": {
+        "position": PLACE, "altitude": 5e5, "sun": [1, 0, 0], "pole": [0, 0, 1], "attitude": None,
+        "sensed": (),
+    },
+    "find_sun": {"image": IMAGE, "camera": CAMERA, "settings": None},
+    "magnetic_field": {"time": NOON, "position": PLACE},
+    "magnetic_field_on_ground": {"time": NOON, "latitude": 0.1, "longitude": 0.2, "height": 0.0},
+    "orbit_state": {
+        "semi_major_axis": 7e6, "eccentricity": 0.0, "inclination": 1.0, "ascending_node": 0.0,
+        "argument_of_perigee": 0.0, "true_anomaly": 0.0,
+    },
+    "propagate_orbit": {"position": PLACE, "velocity": [0.0, 7500.0, 0.0], "seconds": [0.0]},
+    "propagate_elements": {"elements": LINES, "times": [NOON]},
+    "sun_direction": {"time": NOON, "position": PLACE, "velocity": [0.0, 7500.0, 0.0]},
+    "sunlit_fraction": {"time": NOON, "position": PLACE, "shadow": "conical"},
+    "read_image": {"path": "none.png"},
+}  # fmt: skip
+METHODS: dict[str, dict[str, Any]] = {
+    "rescaled": {"factor": 1.1},
+    "binned": {"columns": 32, "rows": 32, "size": 2},
+    "project": {"vectors": [[0.0, 0.0, 1.0]]},
+    "unit_vectors": {"points": [[3.0, 4.0]]},
+    "contains": {"points": [[3.0, 4.0]], "margin": 1.0},
+}
+WRONG: tuple[Any, ...] = ("x", object(), [[1.0, 2.0], [3.0]], 1j, 10**400, np.array(["a", "b", "c"]))
+
+
+def test_every_function_is_tested_with_wrong_types() -> None:
+    functions = {name for name in LIB.__all__ if not inspect.isclass(getattr(LIB, name))}
+    assert functions <= CALLS.keys()
+    for name, given in CALLS.items():
+        named = {*inspect.signature(reduce(getattr, name.split("."), LIB)).parameters}
+        assert named - given.keys() <= {"camera", "index", "upright"}
+
+
+@pytest.mark.parametrize(
+    "name", [*CALLS, *(f"{kind} {name}" for name in METHODS for kind in ("Pinhole", "Lens"))]
+)
+def test_an_argument_of_a_wrong_type_is_refused_by_an_error_of_the_library(name: str) -> None:
+    """The message is short and has one line."""
+    kind, _, method = name.partition(" ")
+    camera = CAMERA if kind == "Pinhole" else Lens(**LENS)
+    call = getattr(camera, method) if method else reduce(getattr, name.split("."), LIB)
+    given = METHODS[method] if method else CALLS[name]
+    for argument in given:
+        for wrong in WRONG:
+            with pytest.raises(KnightCubeError) as refused:
+                call(**given | {argument: wrong})
+            assert 0 < len(str(refused.value)) < 500
+            assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("function", "settings"),
+    [(estimate_rate, LikelihoodSettings), (detect_objects, ObjectSettings)],
+)
+@pytest.mark.parametrize("wrong", [0.0, -1.0, float("nan"), "x"])
+@pytest.mark.parametrize("name", ["gain", "psf_sigma", "saturation"])
+def test_an_impossible_detector_is_refused(
+    function: Callable[..., Any], settings: Callable[..., Any], wrong: Any, name: str
+) -> None:
+    given = {"rate": [0, 0.1, 0]} if function is detect_objects else {}
+    with pytest.raises(ArgumentError, match=f"settings.{name}: "):
+        function(IMAGE, CAMERA, exposure=1.0, settings=settings(**{name: wrong}), **given)
+
+
+@pytest.mark.parametrize("line_time", [0.02, -0.02, float("inf")])
+def test_a_line_time_in_another_unit_is_refused(line_time: float) -> None:
+    with pytest.raises(ArgumentError, match=r"settings.line_time: .* s per row"):
+        estimate_rate(IMAGE, CAMERA, 1.0, settings=LikelihoodSettings(line_time=line_time))
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.int64])

@@ -18,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 from sgp4.api import SGP4_ERRORS, WGS72, Satrec
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, brief
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.orientation import (
     ROTATION_RATE,
@@ -141,8 +141,8 @@ def elements_of(lines: Sequence[str]) -> TwoLineElements:
 
     Raises ArgumentError unless there are two lines, and UsageError for lines that `TwoLineElements` rejects.
     """
-    if isinstance(lines, str) or len(lines) != 2 or not all(isinstance(line, str) for line in lines):
-        raise ArgumentError("elements", f"{lines!r}: give the two lines of the element set as texts")
+    if not (isinstance(lines, Sequence) and len(lines) == 2 and all(isinstance(line, str) for line in lines)):
+        raise ArgumentError("elements", f"{brief(lines)}: give the two lines of the element set as texts")
     first, second = lines
     return TwoLineElements(first, second)
 

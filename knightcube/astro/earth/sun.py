@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, brief
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.errors import ArgumentError
 
@@ -100,13 +100,13 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
     """
     position, sun = np.asarray(position, dtype=float), np.asarray(sun, dtype=float)
     distance = np.linalg.norm(position, axis=-1)
+    if not (isinstance(shadow, str) and shadow in ("conical", "cylindrical")):
+        raise ArgumentError("shadow", f"{brief(shadow)}: give conical or cylindrical")
     if shadow == "cylindrical":
         towards = sun / np.linalg.norm(sun, axis=-1, keepdims=True)
         cosine = np.sum(position * towards, axis=-1) / distance
         tangent = np.sqrt(np.maximum(0.0, distance**2 - EARTH_RADIUS**2)) / distance
         return np.where(cosine <= -tangent, 0.0, 1.0)
-    if shadow != "conical":
-        raise ArgumentError("shadow", f"{shadow!r}: give conical or cylindrical")
     to_sun = sun - position
     sun_distance = np.linalg.norm(to_sun, axis=-1)
     sun_disc = np.arcsin(SUN_RADIUS / sun_distance)

@@ -26,7 +26,7 @@ no torque.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import lru_cache
 from typing import NamedTuple
@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, check_numbers
 from knightcube.astro.quaternion import about_axis_y
 from knightcube.errors import UsageError
 
@@ -86,7 +86,8 @@ class SingleAxisPlant:
     disturbance: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise UsageError for parameters out of range."""
+        """Raise UsageError for parameters that are not numbers or are out of range."""
+        check_numbers(**{field.name: getattr(self, field.name) for field in fields(self)})
         for name in ("inertia", "torque_constant", "resistance", "current_limit"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
+from knightcube.astro.arrays import brief, check_numbers
 from knightcube.errors import UsageError
 
 _ROUNDING = 1e-9  # error (rad) of an angle that was converted between degrees and radians
@@ -41,10 +42,10 @@ class Goal(IntEnum):
     def named(cls, label: str) -> Goal:
         """Return the pointing goal with the name `label`. Raises UsageError for an unknown name."""
         for goal in cls:
-            if goal.label == label:
+            if isinstance(label, str) and goal.label == label:
                 return goal
         raise UsageError(
-            f"{label!r} is not a pointing goal: choose one of {', '.join(goal.label for goal in cls)}"
+            f"{brief(label)} is not a pointing goal: choose one of {', '.join(goal.label for goal in cls)}"
         )
 
 
@@ -86,13 +87,16 @@ class PointingTarget:
         """Raise UsageError for arguments that do not define an attitude."""
         if not isinstance(self.goal, Goal):
             raise UsageError(
-                f"the goal of a pointing target is {self.goal!r}: give one of "
+                f"the goal of a pointing target is {brief(self.goal)}: give one of "
                 + ", ".join(f"Goal.{goal.name}" for goal in Goal)
             )
         try:  # a list or an array could be changed later
             object.__setattr__(self, "numbers", tuple(map(float, self.numbers)))
-        except (TypeError, ValueError):
-            raise UsageError(f"{self.goal.label}: {self.numbers!r}: give a sequence of numbers") from None
+        except (TypeError, ValueError, OverflowError):
+            text = f"{self.goal.label}: {brief(self.numbers)}: give a sequence of numbers"
+            raise UsageError(text) from None
+        if self.roll is not None:
+            check_numbers(roll=self.roll)
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))

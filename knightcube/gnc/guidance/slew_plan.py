@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 
 from knightcube.astro.arrays import (
     FloatArray,
+    brief,
     check_numbers,
     check_type,
     finite_array,
@@ -561,17 +562,18 @@ def _check_order(order: SlewOrder) -> None:
     """Raise UsageError or PlanningError, with the name of the argument of `plan_slew`, for invalid values."""
     for name, target in (("start", order.start), ("goal", order.goal)):
         if not isinstance(target, PointingTarget):
-            raise ArgumentError(name, f"{target!r}: give a PointingTarget, such as PointingTarget(Goal.SUN)")
+            raise ArgumentError(name, f"{brief(target)}: give a PointingTarget, as PointingTarget(Goal.SUN)")
         if target.goal is Goal.OBJECT:
             raise UsageError(
                 "the direction of an object is known only in flight: no slew to it can be planned"
             )
     for name, angle in order.angles.items():
         if name not in ("sun", "earth", "moon"):
-            raise ArgumentError("cones", f"unknown exclusion cone {name!r}: give sun, earth or moon")
+            raise ArgumentError("cones", f"unknown exclusion cone {brief(name)}: give sun, earth or moon")
         if not 0.0 <= real_number(angle) < math.pi:
             raise ArgumentError(
-                f"cones[{name!r}]", f"{angle} rad: must be 0 to below pi; math.radians converts degrees"
+                f"cones[{name!r}]",
+                f"{brief(angle)} rad: must be 0 to below pi; math.radians converts degrees",
             )
     low, high = HORIZON_RANGE
     if not low <= order.horizon <= order.longest <= high:
@@ -581,7 +583,7 @@ def _check_order(order: SlewOrder) -> None:
         )
     if not (isinstance(order.nodes, (int, np.integer)) and NODES_RANGE[0] <= order.nodes <= NODES_RANGE[1]):
         raise PlanningError(
-            f"nodes is {order.nodes}: must be an integer from {NODES_RANGE[0]} to {NODES_RANGE[1]}"
+            f"nodes is {brief(order.nodes)}: must be an integer from {NODES_RANGE[0]} to {NODES_RANGE[1]}"
         )
     _check_window(order.window)
 
@@ -665,7 +667,9 @@ def plan_slew(
         OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
         GeomagneticError: if the slew is outside the years 2025 to 2030 of the magnetic field model.
     """
-    check_numbers(duration=duration, longest=longest, window=window, time_cost=time_cost)
+    optional = {"longest": longest, "time_cost": time_cost}
+    given = {name: value for name, value in optional.items() if value is not None}
+    check_numbers(duration=duration, window=window, **given)
     axes = _axes(pointing_axis, across_axis)
     order = SlewOrder(
         _craft(inertia, dipole_limit, heat),

@@ -25,7 +25,7 @@ from typing import Literal
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, check_numbers, check_type
+from knightcube.astro.arrays import FloatArray, brief, check_numbers, check_type, real_number
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.plant import (
     FARTHEST,
@@ -347,8 +347,8 @@ def plan(
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
     _check(plant, states, horizon, nodes, reference, q2_limit, max_stretch)
-    if time_cost is not None and not (math.isfinite(time_cost) and time_cost > 0.0):
-        raise PlanningError(f"time_cost is {time_cost} W: it must be finite and positive")
+    if time_cost is not None and not 0.0 < real_number(time_cost) < math.inf:
+        raise PlanningError(f"time_cost is {brief(time_cost)} W: it must be finite and positive")
     boundary = BoundaryStates(
         start_q2, q2_rate_of(start_q2, start_rate), end_q2, q2_rate_of(end_q2, end_rate)
     )
@@ -513,7 +513,7 @@ def _check(
         raise PlanningError(f"reference is {reference}: it must lie beyond the range of q2, |q_r| > 1")
     if not (isinstance(nodes, (int, np.integer)) and NODES_RANGE[0] <= nodes <= NODES_RANGE[1]):
         raise PlanningError(
-            f"nodes is {nodes}: it must be an integer from {NODES_RANGE[0]} to {NODES_RANGE[1]}"
+            f"nodes is {brief(nodes)}: it must be an integer from {NODES_RANGE[0]} to {NODES_RANGE[1]}"
         )
 
 
@@ -578,8 +578,8 @@ def _q2_at(name: str, angle: float) -> float:
 def _cost(minimise: str) -> PathCost:
     """Return the kind of energy called `minimise`. Raises PlanningError for an unknown name."""
     names = [cost.value for cost in PathCost]
-    if minimise not in names:
-        raise PlanningError(f"minimise is {minimise!r}: give {' or '.join(map(repr, names))}")
+    if not (isinstance(minimise, str) and minimise in names):
+        raise PlanningError(f"minimise is {brief(minimise)}: give {' or '.join(map(repr, names))}")
     return PathCost(minimise)
 
 

@@ -36,8 +36,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import Image
-from knightcube.errors import UsageError, reason_of
+from knightcube.astro.arrays import Image, brief
+from knightcube.errors import ArgumentError, UsageError, reason_of
 from knightcube.vision.frame import LUMINANCE, grey_of_planes
 
 if TYPE_CHECKING:
@@ -229,6 +229,8 @@ def read_image(path: Path | str, *, upright: bool = True) -> Image:
     calibrated lens requires. All formats except FITS and PGM need Pillow. Raises UsageError if the file is
     missing, damaged or in an unsupported format, if pixels are not finite, or if Pillow is not installed.
     """
+    if not isinstance(path, str | Path):
+        raise ArgumentError("path", f"{brief(path)}: give the path of an image")
     path = Path(path)
     if content := _fits_content(path):
         return fits_image(content, str(path))

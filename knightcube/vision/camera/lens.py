@@ -24,7 +24,15 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.arrays import (
+    BoolArray,
+    FloatArray,
+    Image,
+    brief,
+    check_numbers,
+    checked_number,
+    float_rows,
+)
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import ArgumentError, KnightCubeError
@@ -39,7 +47,11 @@ class LensError(KnightCubeError):
 
 
 def _check_detector(columns: int, rows: int, focal_length: float) -> None:
-    """Raise LensError unless the numbers of pixels are positive integers and the focal length is positive."""
+    """Raise LensError unless the numbers of pixels are positive integers and the focal length is positive.
+
+    Raises ArgumentError for values that are not numbers.
+    """
+    check_numbers(columns=columns, rows=rows, focal_length=focal_length)
     if not (columns > 0 and rows > 0 and columns % 1 == 0 and rows % 1 == 0):
         raise LensError(f"{columns} x {rows} pixels: give positive whole numbers")
     if not 0.0 < focal_length < math.inf:
@@ -71,6 +83,7 @@ class Pinhole:
 
         Raises LensError unless the field of view lies between 0 and pi rad.
         """
+        check_numbers(columns=columns, field_of_view=field_of_view)
         if not 0.0 < field_of_view < math.pi:
             degrees = math.pi <= field_of_view < 180.0
             hint = f"; {field_of_view:g} deg are {math.radians(field_of_view):.4g} rad" if degrees else ""
@@ -84,11 +97,12 @@ class Pinhole:
 
     def rescaled(self, factor: float) -> Pinhole:
         """Return the camera with its focal length multiplied by `factor`."""
+        check_numbers(factor=factor)
         return replace(self, focal_length=self.focal_length * factor)
 
     def binned(self, columns: int, rows: int, size: int) -> Pinhole:
         """Return the camera of `columns` x `rows` bins of `size` x `size` px, centred in the image."""
-        return Pinhole(columns, rows, self.focal_length / size)
+        return Pinhole(columns, rows, self.focal_length / checked_number("size", size, "pixels"))
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -97,13 +111,13 @@ class Pinhole:
 
     def project(self, vectors: FloatArray) -> FloatArray:
         """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions with z <= 0 give NaN."""
-        v = np.asarray(vectors, dtype=float)
+        v = float_rows("vectors", vectors, 3)
         z = np.where(v[..., 2:] > 0.0, v[..., 2:], np.nan)
         return np.asarray(self.focal_length * v[..., :2] / z + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
         """Return unit vectors (n, 3) to pixels (n, 2), in the camera frame (Sease, eq. (3.20), (3.21))."""
-        offset = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
+        offset = (float_rows("points", points, 2) - np.array(self.centre)) / self.focal_length
         v = np.ones((*offset.shape[:-1], 3))
         v[..., :2] = offset
         v /= np.sqrt(np.einsum("...i,...i", v, v))[..., None]
@@ -111,6 +125,8 @@ class Pinhole:
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
         """Return which pixel positions (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
+        check_numbers(margin=margin)
+        points = float_rows("points", points, 2)
         x, y = points[..., 0], points[..., 1]
         inside_x = (x >= -0.5 - margin) & (x <= self.columns - 0.5 + margin)
         inside_y = (y >= -0.5 - margin) & (y <= self.rows - 0.5 + margin)
@@ -212,6 +228,11 @@ class Lens:
 
     def __post_init__(self) -> None:
         _check_detector(self.columns, self.rows, self.focal_length)
+        if not (isinstance(self.centre, list | tuple | np.ndarray) and len(self.centre) == 2):
+            raise ArgumentError("centre", f"{brief(self.centre)}: give the pixel (x, y) of the optical axis")
+        x, y = self.centre
+        check_numbers(**{"centre[0]": x, "centre[1]": y, "k1": self.k1, "k2": self.k2})
+        check_numbers(**{name: getattr(self, name) for name in SHAPE_TERMS})
         # Python floats are used, because numpy takes ten times as long for single numbers.
         if not all(map(math.isfinite, (*self.centre, self.k1, self.k2))):
             raise LensError(f"centre {self.centre}, k1 {self.k1}, k2 {self.k2}: must be finite")
@@ -234,6 +255,7 @@ class Lens:
     @classmethod
     def of(cls, camera: CameraModel) -> Lens:
         """Return a camera as a `Lens`; a pinhole camera becomes a lens without distortion."""
+        check_camera(camera)
         if isinstance(camera, Lens):
             return camera
         return cls(camera.columns, camera.rows, camera.focal_length, camera.centre)
@@ -257,10 +279,12 @@ class Lens:
 
     def rescaled(self, factor: float) -> Lens:
         """Return the camera with its focal length multiplied by `factor`."""
+        check_numbers(factor=factor)
         return replace(self, focal_length=self.focal_length * factor)
 
     def binned(self, columns: int, rows: int, size: int) -> Lens:
         """Return the camera of `columns` x `rows` bins of `size` x `size` px, centred in the image."""
+        check_numbers(columns=columns, rows=rows, size=checked_number("size", size, "pixels"))
         (x, y), focal_length = self.ideal.centre, self.focal_length / size
         x, y = (self.centre[0] - x) / size, (self.centre[1] - y) / size
         centre = x + 0.5 * (columns - 1), y + 0.5 * (rows - 1)
@@ -268,7 +292,7 @@ class Lens:
 
     def project(self, vectors: FloatArray) -> FloatArray:
         """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions not imaged give NaN."""
-        v = np.asarray(vectors, dtype=float)
+        v = float_rows("vectors", vectors, 3)
         z = v[..., 2:]
         tangent = v[..., :2] / np.where(z > 0.0, z, np.nan)
         square = np.sum(tangent**2, axis=-1, keepdims=True)
@@ -285,7 +309,7 @@ class Lens:
 
         A pixel beyond the fold of the distortion gives NaN.
         """
-        stretched = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
+        stretched = (float_rows("points", points, 2) - np.array(self.centre)) / self.focal_length
         if self.aspect != 0.0 or self.shear != 0.0:
             stretched = stretched @ np.linalg.inv(self._pixels())
         if self.p1 == self.p2 == 0.0:
@@ -709,7 +733,7 @@ def _corners(columns: int, rows: int) -> FloatArray:
 def check_camera(camera: CameraModel) -> None:
     """Raise ArgumentError unless `camera` is a `Pinhole` or a `Lens`."""
     if not isinstance(camera, Pinhole | Lens):
-        raise ArgumentError("camera", f"{camera!r}: give a Pinhole or a Lens")
+        raise ArgumentError("camera", f"{brief(camera)}: give a Pinhole or a Lens")
 
 
 def image_of_camera(image: Image, camera: CameraModel) -> Image:

@@ -226,7 +226,10 @@ def _given(
 
 def _mask(hidden: ArrayLike, camera: CameraModel) -> BoolArray:
     """Return the argument `hidden` of `find_nadir` as a mask (rows, columns). Raises ArgumentError."""
-    mask = np.asarray(hidden)
+    try:
+        mask = np.asarray(hidden)
+    except ValueError:
+        raise ArgumentError("hidden", "rows of different lengths: give an array of Booleans") from None
     if mask.dtype.kind not in "biu":
         raise ArgumentError("hidden", f"pixels of {mask.dtype}: give Booleans, such as hidden > 0")
     check_shape(mask, camera, "hidden")

@@ -14,10 +14,12 @@ import numpy as np
 from knightcube.astro.arrays import (
     FloatArray,
     Image,
+    brief,
+    check_fields,
     check_type,
-    check_whole,
     checked_deviation,
     finite_array,
+    real_number,
     unit_vector,
 )
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
@@ -117,10 +119,9 @@ class HorizonKnowledge:
             check_type("sensed", each, SensedDirection)
         if self.position is not None and np.linalg.norm(self.position) < SEMI_MAJOR_AXIS + LEAST_ALTITUDE:
             raise ArgumentError("position", f"{self.position}: inside the Earth, give metres from its centre")
-        if self.altitude is not None and not LEAST_ALTITUDE <= self.altitude < np.inf:
-            raise ArgumentError(
-                "altitude", f"{self.altitude}: give metres above the Earth, {LEAST_ALTITUDE:g} at least"
-            )
+        if self.altitude is not None and not LEAST_ALTITUDE <= real_number(self.altitude) < np.inf:
+            least = f"give metres above the Earth, {LEAST_ALTITUDE:g} at least"
+            raise ArgumentError("altitude", f"{brief(self.altitude)}: {least}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +177,7 @@ class EdgeSettings:
     response: LogarithmicResponse | None = None
 
     def __post_init__(self) -> None:
-        check_whole(self)
+        check_fields(self)
         if self.lines < 2:
             raise UsageError(f"lines {self.lines}: give at least 2 columns and rows")
         if self.run < 1 or self.run % 2 == 0:
@@ -224,7 +225,7 @@ class HorizonSettings:
     sphere_sigma: float = math.radians(0.1)
 
     def __post_init__(self) -> None:
-        check_whole(self)
+        check_fields(self)
         low, high = self.altitudes
         if not LEAST_ALTITUDE <= low < high < math.inf:
             raise UsageError(

@@ -40,7 +40,6 @@ from knightcube.astro.arrays import (
     FloatArray,
     Image,
     IntArray,
-    check_type,
     checked_number,
     finite_array,
 )
@@ -49,7 +48,14 @@ from knightcube.compiled import compiled_form_of
 from knightcube.errors import KnightCubeError
 from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
-from knightcube.vision.frame import gain_in_counts, line_of, positions, raw_counts, saturation_level
+from knightcube.vision.frame import (
+    check_detector,
+    gain_in_counts,
+    line_of,
+    positions,
+    raw_counts,
+    saturation_level,
+)
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     PATHS_PER_LENGTH,
@@ -834,7 +840,7 @@ def detect_objects(
     is not part of Sease's method.
     """
     settings = ObjectSettings() if settings is None else settings
-    check_type("settings", settings, ObjectSettings)
+    check_detector(settings, ObjectSettings)
     exposure = checked_number("exposure", exposure, "seconds")
     rotation = finite_array("rate", rate, (3,)) * exposure
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))

@@ -19,8 +19,18 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray, median
+from knightcube.astro.arrays import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Image,
+    IntArray,
+    brief,
+    median,
+    real_number,
+)
 from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.errors import ArgumentError
 from knightcube.vision.background import (
     Background,
     among_blocks,
@@ -437,7 +447,7 @@ class DetectionSettings:
 
     def __post_init__(self) -> None:
         if self.method not in CENTROIDS:
-            raise ValueError(f"method = {self.method!r}: use {', '.join(CENTROIDS)}")
+            raise ArgumentError("method", f"{brief(self.method)}: give {', '.join(CENTROIDS)}")
         for name, low, high in (
             ("threshold_sigmas", 1.0, 100.0),
             ("most_stars", 1, 10_000),
@@ -447,10 +457,10 @@ class DetectionSettings:
             ("search_radius", 1.0, 50.0),
         ):
             value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ValueError(f"{name} = {value!r}: give {low} .. {high}")
-        if self.window % 2 == 0 or not 5 <= self.window <= 31:
-            raise ValueError(f"window = {self.window!r}: give an odd number of pixels, 5 .. 31")
+            if value is not None and not low <= real_number(value) <= high:
+                raise ArgumentError(name, f"{brief(value)}: give {low} to {high}")
+        if not 5 <= real_number(self.window) <= 31 or self.window % 2 == 0:
+            raise ArgumentError("window", f"{brief(self.window)}: give an odd number of pixels, 5 to 31")
 
     def in_units_of(self, unit: float, zero: float = 0.0) -> DetectionSettings:
         """Return the settings for a frame from which `zero` was subtracted and that was divided by `unit`."""

@@ -25,9 +25,9 @@ from itertools import chain, islice
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_type, finite_array
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, finite_array
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
-from knightcube.vision.frame import raw_counts, saturation_count
+from knightcube.vision.frame import check_detector, raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
 from knightcube.vision.streaks.first_guess import (
@@ -674,7 +674,7 @@ def estimate_rate(
             or prior deviation is not a positive number, or if the prior rate is not three finite numbers.
     """
     settings = LikelihoodSettings() if settings is None else settings
-    check_type("settings", settings, LikelihoodSettings)
+    check_detector(settings, LikelihoodSettings)
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     settings = settings.in_units_of(unit, zero)
     prior = None if prior_rate is None else finite_array("prior_rate", prior_rate, (3,))

@@ -426,7 +426,7 @@ def test_settings_outside_their_range_are_refused(
     for value in good:
         assert getattr(DetectionSettings(**{name: value}), name) == value
     for value in bad:
-        with pytest.raises(ValueError, match=f"{name} = {value!r}"):
+        with pytest.raises(ValueError, match=f"{name}: {value!r}"):
             DetectionSettings(**{name: value})
 
 
