@@ -87,7 +87,9 @@ class SingleAxisPlant:
 
     def __post_init__(self) -> None:
         """Raise UsageError for parameters that are not numbers or are out of range."""
-        check_numbers(**{field.name: getattr(self, field.name) for field in fields(self)})
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        if not all(isinstance(value, float) for value in given.values()):
+            check_numbers(**given)
         for name in ("inertia", "torque_constant", "resistance", "current_limit"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):

@@ -95,7 +95,7 @@ class PointingTarget:
         except (TypeError, ValueError, OverflowError):
             text = f"{self.goal.label}: {brief(self.numbers)}: give a sequence of numbers"
             raise UsageError(text) from None
-        if self.roll is not None:
+        if self.roll is not None and not isinstance(self.roll, float):
             check_numbers(roll=self.roll)
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:

@@ -51,11 +51,17 @@ def _check_detector(columns: int, rows: int, focal_length: float) -> None:
 
     Raises ArgumentError for values that are not numbers.
     """
-    check_numbers(columns=columns, rows=rows, focal_length=focal_length)
+    if not (_is_count(columns) and _is_count(rows) and isinstance(focal_length, float)):
+        check_numbers(columns=columns, rows=rows, focal_length=focal_length)
     if not (columns > 0 and rows > 0 and columns % 1 == 0 and rows % 1 == 0):
         raise LensError(f"{columns} x {rows} pixels: give positive whole numbers")
     if not 0.0 < focal_length < math.inf:
         raise LensError(f"focal length {focal_length} px: must be positive and finite")
+
+
+def _is_count(value: object) -> bool:
+    """Return whether a value is an integer of a size that floats can represent."""
+    return isinstance(value, int) and abs(value) < 1 << 53
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +89,8 @@ class Pinhole:
 
         Raises LensError unless the field of view lies between 0 and pi rad.
         """
-        check_numbers(columns=columns, field_of_view=field_of_view)
+        if not (_is_count(columns) and isinstance(field_of_view, float)):
+            check_numbers(columns=columns, field_of_view=field_of_view)
         if not 0.0 < field_of_view < math.pi:
             degrees = math.pi <= field_of_view < 180.0
             hint = f"; {field_of_view:g} deg are {math.radians(field_of_view):.4g} rad" if degrees else ""
@@ -231,8 +238,10 @@ class Lens:
         if not (isinstance(self.centre, list | tuple | np.ndarray) and len(self.centre) == 2):
             raise ArgumentError("centre", f"{brief(self.centre)}: give the pixel (x, y) of the optical axis")
         x, y = self.centre
-        check_numbers(**{"centre[0]": x, "centre[1]": y, "k1": self.k1, "k2": self.k2})
-        check_numbers(**{name: getattr(self, name) for name in SHAPE_TERMS})
+        given = {"centre[0]": x, "centre[1]": y, "k1": self.k1, "k2": self.k2}
+        given |= {name: getattr(self, name) for name in SHAPE_TERMS}
+        if not all(isinstance(value, float) for value in given.values()):
+            check_numbers(**given)
         # Python floats are used, because numpy takes ten times as long for single numbers.
         if not all(map(math.isfinite, (*self.centre, self.k1, self.k2))):
             raise LensError(f"centre {self.centre}, k1 {self.k1}, k2 {self.k2}: must be finite")
