@@ -177,14 +177,15 @@ class AravisCamera:
         camera.set_pixel_format_from_string(settings.pixel_format)
         self._set_region(camera)
         self._set_gain(aravis, camera)
+        camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
+        # A frame rate limits the exposure time of many cameras, and setting the trigger disables the frame rate.
+        camera.set_trigger("Software")
         if camera.is_exposure_auto_available():
             camera.set_exposure_time_auto(aravis.Auto.OFF)
         low, high = camera.get_exposure_time_bounds()
         self._bounds = round(low * _MICROSECOND_NS), round(high * _MICROSECOND_NS)
         self.check(settings.exposure_ns)
         self._set_exposure(camera, settings.exposure_ns)
-        camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
-        camera.set_trigger("Software")
         stream = camera.create_stream(None, None)
         if stream is None:
             raise NotResponding(self.name, "cannot open a stream: does another program use the camera?")

@@ -133,7 +133,9 @@ class FakeCamera:
         return float(self.set["gain"]) + float(self.known.get("gain_error", 0.0))
 
     def get_exposure_time_bounds(self) -> tuple[float, float]:
-        return self.known["exposure_bounds"]  # type: ignore[no-any-return]  # two numbers
+        low, high = self.known["exposure_bounds"]
+        # Like many cameras, the camera has a frame rate, 30 per second, until a trigger is set.
+        return low, high if "trigger" in self.set else min(high, 33_333.0)
 
     def set_exposure_time(self, microseconds: float) -> None:
         self.set["exposure"] = microseconds
