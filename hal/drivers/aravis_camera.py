@@ -178,7 +178,7 @@ class AravisCamera:
         self._set_region(camera)
         self._set_gain(aravis, camera)
         camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
-        # A frame rate limits the exposure time of many cameras, and setting the trigger disables the frame rate.
+        # The frame rate of many cameras limits the exposure time; the trigger disables the frame rate.
         camera.set_trigger("Software")
         if camera.is_exposure_auto_available():
             camera.set_exposure_time_auto(aravis.Auto.OFF)

@@ -13,7 +13,7 @@ sensors sleep and answer with their last value or zero.
 `Adis16470` is the driver of an inertial sensor of Analog Devices on an SPI bus (data sheet, revision C). An
 SPI frame has 16 bits, and the answer to a read request comes in the next frame. The value of each axis has 32
 bits in two registers. The sample counter is read before and after all axes; equal values show that the axes
-belong to one sample.
+belong to one sample. The decimation is read as well, because a brown-out resets it.
 """
 
 from __future__ import annotations
@@ -404,6 +404,7 @@ class Adis16470:
 
     @decimation.setter
     def decimation(self, value: int) -> None:
+        self._decimation = value
         halves = (DEC_RATE, value & 0xFF), (DEC_RATE + 1, value >> 8)
         self._device.transfer([bytes((0x80 | address, byte)) for address, byte in halves])
 
@@ -419,7 +420,11 @@ class Adis16470:
 
     def _vector(self, first: int, step: float) -> tuple[float, ...]:
         for _ in range(_TRIES):
-            before, *halves, after = self._read([DATA_CNTR, *range(first, first + 12, 2), DATA_CNTR])
+            registers = [DATA_CNTR, *range(first, first + 12, 2), DATA_CNTR, DEC_RATE]
+            before, *halves, after, decimation = self._read(registers)
+            if decimation != self._decimation:
+                text = f"DEC_RATE is {decimation} instead of {self._decimation} (brown-out?)"
+                raise NotResponding("ADIS16470", text)
             if before == after:
                 words = [high << 16 | low for low, high in zip(halves[::2], halves[1::2], strict=True)]
                 return tuple((word - (word >> 31 << 32)) * step for word in words)

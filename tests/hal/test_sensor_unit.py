@@ -18,6 +18,7 @@ from flight.schema.devices import axis_matrix
 from hal.buses.linux_wires import LinuxSpiDevice, LinuxWires
 from hal.buses.system import SystemClock
 from hal.drivers.sensor_unit import (
+    DEC_RATE,
     PROD_ID,
     PRODUCT,
     Adis16470,
@@ -269,6 +270,9 @@ def test_an_adis16470_measures_negative_rates_and_averages() -> None:
     clock.sleep_until_ns(2_000_000_000)
     np.testing.assert_allclose(sensor.gyro, motion.rate, atol=5e-4)
     np.testing.assert_allclose(sensor.acceleration, motion.specific_force_body, atol=5e-3)
+    part._held[DEC_RATE] = 0  # as after a brown-out, with five times the noise
+    with pytest.raises(NotResponding, match="DEC_RATE is 0 instead of 1999"):
+        _ = sensor.acceleration
 
 
 def test_an_adis16470_never_mixes_the_axes_of_two_samples() -> None:
@@ -280,7 +284,7 @@ def test_an_adis16470_never_mixes_the_axes_of_two_samples() -> None:
         def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
             self.counter += 1
             requested = [b"\0\0", *frames[:-1]]
-            known = {PROD_ID: PRODUCT}
+            known = {PROD_ID: PRODUCT, DEC_RATE: 24}
             words = [known.get(frame[0], 16 * self.counter + index) for index, frame in enumerate(requested)]
             return [word.to_bytes(2, "big") for word in words]
 
