@@ -1,8 +1,9 @@
 """The commands `knightcube run`, which flies a configuration, and `knightcube check`.
 
 The function `probe` looks for the real devices that a configuration names. The function starts cameras and
-separate sensors, writes no settings to other devices, and drives no coil. A device that does not respond is reported together with the suggested remedy.
-The serial ports, the cameras and the separate sensors that a running flight uses are reported as busy.
+separate sensors, writes no settings to other devices, and drives no coil. A device that does not respond is
+reported together with the suggested remedy. The serial ports, the cameras and the separate sensors that a
+running flight uses are reported as busy.
 """
 
 from __future__ import annotations
