@@ -355,7 +355,7 @@ def test_a_camera_that_a_killed_program_left_acquiring_is_opened(monkeypatch: py
 
 def test_a_lost_camera_does_not_respond(rig: Rig) -> None:
     rig.camera.lost(None)
-    with pytest.raises(NotResponding, match="gone"):
+    with pytest.raises(NotResponding, match="disappeared"):
         rig.driver.collect()
     rig.camera.known["failing"] = "trigger"
     with pytest.raises(NotResponding, match="trigger failed"):
