@@ -153,7 +153,12 @@ def test_a_body_within_a_cone_slews_out_of_it() -> None:
     q = BEGIN.quaternion
     sun = attitude_matrix(q) @ ORBIT.sun_at(TIMES[:1])[0]
     inside = SlewRequest(700.0, WISH.heat, RESIDUAL, sun, {"sun": 0.3})
-    assert slew(BEGIN, inside, NADIR, AXES, ORBIT, np.inf) is not None
+    path = slew(BEGIN, inside, NADIR, AXES, ORBIT, np.inf)
+    assert path is not None
+    shown = attitude_matrix(path.quaternion) @ ORBIT.sun_at(TIMES[:1])[0]
+    apart = np.arccos(np.clip(shown @ sun, -1.0, 1.0))
+    assert apart[0] < 1e-3
+    assert apart[np.argmax(apart > 0.3) :].min() > 0.29, "the camera does not enter the cone again"
 
 
 def test_a_body_within_one_cone_still_avoids_the_other() -> None:
