@@ -95,8 +95,9 @@ class PointingTarget:
         except (TypeError, ValueError, OverflowError):
             text = f"{self.goal.label}: {brief(self.numbers)}: give a sequence of numbers"
             raise UsageError(text) from None
-        if self.roll is not None and not isinstance(self.roll, float):
-            check_numbers(roll=self.roll)
+        roll: object = self.roll
+        if roll is not None and not isinstance(roll, float):
+            check_numbers(roll=roll)
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))

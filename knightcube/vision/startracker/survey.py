@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from numbers import Real
 from typing import Literal, get_args
 
 import numpy as np
@@ -457,9 +456,15 @@ class DetectionSettings:
             ("search_radius", 1.0, 50.0),
         ):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, Real) and low <= value <= high):
+            if value is not None and not (
+                isinstance(value, int | float | np.number) and low <= value <= high
+            ):
                 raise ArgumentError(name, f"{brief(value)}: give {low} to {high}")
-        if not (isinstance(self.window, Real) and 5 <= self.window <= 31 and self.window % 2 != 0):
+        if not (
+            isinstance(self.window, int | float | np.number)
+            and 5 <= self.window <= 31
+            and self.window % 2 != 0
+        ):
             raise ArgumentError("window", f"{brief(self.window)}: give an odd number of pixels, 5 to 31")
 
     def in_units_of(self, unit: float, zero: float = 0.0) -> DetectionSettings:
