@@ -237,7 +237,7 @@ def test_every_limb_direction_lies_on_the_tangent_cone(height: float) -> None:
         p = scene.position
         left = (inertial @ form @ p) ** 2
         right = np.einsum("ij,jk,ik->i", inertial, form, inertial) * (p @ form @ p - 1.0)
-        assert left == pytest.approx(right, rel=1e-9)
+        assert left == pytest.approx(right, rel=1e-9, abs=0.0)
 
 
 def test_lines_just_inside_the_limb_hit_the_ellipsoid_and_lines_just_outside_pass_at_their_height() -> None:
