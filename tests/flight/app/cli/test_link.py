@@ -124,7 +124,7 @@ def test_authentic_frames_with_any_counter_end_no_process(
     vault = Vault(Path(lines["place"]) / "keys" / "ground")
     host, _, port = lines["udp"].partition(":")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
-        for counter in (2**96 - 1, 2**95, 2**63, 2**63 - 1, 2**32, 2**31, 0):
+        for counter in (2**96 - 1, 2**95, 2**63, 2**63 - 1, 2**48, 2**41, 0):
             ground.sendto(frame_with(vault, counter, CommandPacker().pack(Ping(3), 1)), (host, int(port)))
     assert command(lines, "udp", "ping") == 0
     assert "completed" in capsys.readouterr().out

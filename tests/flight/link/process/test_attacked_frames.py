@@ -20,14 +20,14 @@ import pytest
 
 from flight.link.commands import CommandPacker, Ping, unpack
 from flight.link.frames import close_frame
-from flight.link.security import HIGHEST_COUNTER, Gate, Refusal
+from flight.link.security import HIGHEST_COUNTER, WINDOW, Gate, Refusal
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.vaults import frame_with
 
 FRAMES, PORTION, GENUINE, LAST = 1000, 50, 30, 9999
-EDGES = (0, 2**31, 2**32, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 2**95, 2**96 - 1)
+EDGES = (0, 2**41, 2**48, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 2**95, 2**96 - 1)
 """IV values (96 bits) near limits; the lowest 64 bits are the counter."""
-STARTS = (0, 2**31 - 5, 2**32 - 5, 2**63 - 70_000, 2**63 - 20)
+STARTS = (0, 2**31 - 5, 2**32 - 5, 2**63 - WINDOW - 1000, 2**63 - 20)
 KINDS = ("repeated", "flipped", "flipped, CRC right", "cut", "joined", "edge", "noise")
 
 
