@@ -20,7 +20,8 @@ contain. The reference folder contains the newest association of each SPI and th
 keys. An association is outdated if the reference folder has the same key with a higher counter, or if its key
 was replaced. A new key that is not in the reference folder is accepted from any folder. If the association of
 the primary command SPI is outdated, its commands are refused until a command of the reserve SPI sets a new
-key. The other SPIs continue with the key and counter in the reference folder.
+key. The other SPIs continue with the key and counter in the reference folder, also if the folder of keys is
+lost.
 
 A gate checks the CRC, spacecraft, SPI, MAC and counter of a frame in this order. A refused frame has no
 effect except on the count of refusals by cause. The counter of an accepted frame is stored durably before the
@@ -161,32 +162,41 @@ def decode(data: bytes) -> Association | None:
 class Vault:
     """Folder of stored security associations, which several processes of the same user may share."""
 
-    def __init__(self, folder: Path, witness: Path | None = None) -> None:
+    def __init__(self, folder: Path, witness: Path | None = None, rebuild: bool = False) -> None:
         """Open a folder. Raises UsageError for a missing folder, or if other users may read its files.
 
-        On a satellite, `witness` is the path of the reference folder, which is created if possible.
+        On a satellite, `witness` is the path of the reference folder, which is created if possible. Other
+        users' access to the files is then removed. If `rebuild` is true, a lost folder is made again from the
+        reference folder, without the primary command SPI. Raises OSError if the lost folder cannot be made.
         """
         self._folder = folder
         self._witness = None if witness is None else _Witness(witness)
+        known = {} if self._witness is None else self._witness.known
+        if rebuild and known:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; `knightcube keys` makes keys")
         with suppress(OSError):  # the keys may be readable although the damaged folder cannot be listed
             for path in folder.glob("spi-*"):
-                if stat.S_IMODE(path.stat().st_mode) & 0o077:
+                if not stat.S_IMODE(path.stat().st_mode) & 0o077:
+                    continue
+                if self._witness is None:
                     raise UsageError(
                         f"{path}: other users may read this key: run chmod 600, or make new keys"
                     )
-        self.restored = False
-        """Whether the primary command SPI is refused because its association is outdated."""
+                path.chmod(0o600)
+        self.restored = self.rebuilt = False
+        """Whether the primary command SPI is refused because its association is outdated (`restored`), and
+        whether the folder was lost and made again (`rebuilt`)."""
         if self._witness is not None:
-            for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS):
-                stored = max(self._copies(spi), default=None)
-                if stored is None:
-                    continue
-                if not self._witness.outdates(stored):
-                    self._witness.write(stored)
-                elif spi != COMMAND_SPIS[0]:
-                    self.write(self._witness.known[spi])
+            spis = (*COMMAND_SPIS, *TELEMETRY_SPIS)
+            stored = {spi: max(self._copies(spi), default=None) for spi in spis}
+            is_lost = all(one is None for one in stored.values())
+            for spi, one in stored.items():
+                if one is not None and not self._witness.outdates(one):
+                    self._witness.write(one)
+                elif spi != COMMAND_SPIS[0] and spi in known and (rebuild or not is_lost):
+                    self.rebuilt |= self.write(known[spi]) > 0 and is_lost
             self.restored = self.copies(COMMAND_SPIS[0]) > 0 and self.read(COMMAND_SPIS[0]) is None
 
     @property
@@ -293,12 +303,13 @@ class _Witness:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.known: dict[int, Association] = {}
         self._replaced: dict[int, set[bytes]] = {}
-        self._writes = 0
+        self._older: dict[int, str] = {}  # the copy that is not the newest one
         for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS):
-            found = [self._read(f"spi-{spi}.{copy}", _RECORD.size + _CRC_BYTES) for copy in COPIES]
-            good = [one for one in map(decode, found) if one is not None and one.spi == spi]
+            found = [decode(self._read(f"spi-{spi}.{copy}", _RECORD.size + _CRC_BYTES)) for copy in COPIES]
+            good = [one for one in found if one is not None and one.spi == spi]
             if good:
                 self.known[spi] = max(good)
+                self._older[spi] = COPIES[found[0] == max(good)]
             ids = self._read(f"replaced-{spi}", _MOST_IDS_BYTES)
             self._replaced[spi] = {ids[at : at + _ID_BYTES] for at in range(0, len(ids), _ID_BYTES)}
 
@@ -326,10 +337,12 @@ class _Witness:
             self._replaced[spi].add(_id_of(known.key))
             overwrite(self._folder / f"replaced-{spi}", b"".join(sorted(self._replaced[spi])))
         self.known[spi] = association
-        # If only the counter is new, the copies are written alternately, so that a crash damages only one.
-        self._writes += 1
-        for copy in COPIES if new else (COPIES[self._writes % 2],):
+        # If only the counter is new, the older copy is written, so that a crash damages only one. If the
+        # folder of keys is lost, the reserve SPI continues with one of the copies, so both are written.
+        older = self._older.get(spi, COPIES[0])
+        for copy in COPIES if new or spi == COMMAND_SPIS[1] else (older,):
             overwrite(self._folder / f"spi-{spi}.{copy}", encode(association))
+        self._older[spi] = COPIES[older == COPIES[0]]
 
     def _read(self, name: str, most: int) -> bytes:
         with suppress(OSError):

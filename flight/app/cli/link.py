@@ -36,6 +36,7 @@ from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.directives import Listing
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import (
+    REBUILT,
     RESTORED,
     Line,
     SerialLine,
@@ -65,6 +66,8 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError, UsageError
 
 _NICE = 10
+_KEYS_WAIT_NS = 60 * SECOND_NS
+"""Time (ns) for which the start waits for the folder of keys, before it is rebuilt from the second record."""
 _WRITE_TIMEOUT_S = 0.5  # maximum wait for a radio that is slower than the configured rate
 
 
@@ -111,8 +114,9 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
     with ExitStack() as stack:
         retry = StartRetry(ended)
         stack.callback(retry.close)
-        inhibit = SeparationInhibit(SystemClock())
-        judge, attempt = partial(_judge, config, log), partial(_open, log, inhibit)
+        clock = SystemClock()
+        judge = partial(_judge, config, log)
+        attempt = partial(_open, log, SeparationInhibit(clock), clock.now_ns())
         station, names = retried_start(judge, attempt, stack, retry)
         overseer = ServiceManager(os.environ, os.getpid())
         stack.callback(overseer.close)
@@ -147,9 +151,12 @@ def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
 
 
 def _open(
-    log: Path, inhibit: SeparationInhibit, judged: tuple[Config, str], stack: ExitStack
+    log: Path, inhibit: SeparationInhibit, begun_ns: int, judged: tuple[Config, str], stack: ExitStack
 ) -> tuple[Station, str]:
-    """Open the station after the separation inhibit; return it with the names of its communication lines."""
+    """Open the station after the separation inhibit; return it with the names of its communication lines.
+
+    The start has begun at `begun_ns` by the system clock.
+    """
     (config, problem), clock = judged, SystemClock()
     section, commands = config.link, config.commands.socket
     assert section is not None
@@ -157,11 +164,12 @@ def _open(
     if problem:
         _say(problem)
     inhibit.check(Path(section.keys).absolute().parent, config.separation.inhibit)
-    vault = Vault(Path(section.keys), _witness(Path(section.keys)))
-    if vault.restored:
-        _say(f"{section.keys}: {RESTORED}")
+    keys, rebuild = Path(section.keys), clock.now_ns() - begun_ns >= _KEYS_WAIT_NS
+    vault = Vault(keys, _witness(keys), rebuild)
+    if vault.restored or vault.rebuilt:
+        _say(f"{keys}: {RESTORED if vault.restored else REBUILT}")
     if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
-        raise UsageError(f"{section.keys}: no key can be read: mount or copy the satellite's keys there")
+        raise UsageError(f"{keys}: no key can be read: mount or copy the satellite's keys there")
     stack.enter_context(vault.owned())
     coding = section.coding
     codes = LinkCodes(

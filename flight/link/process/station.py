@@ -402,7 +402,9 @@ def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Map
     return "" if done else "the key could not be stored"
 
 
-RESTORED = "the keys were restored from a backup: set a new key of SPI 1 by a command of SPI 2"
+_CURE = "set a new key of SPI 1 by a command of SPI 2"
+RESTORED = f"the keys were restored from a backup: {_CURE}"
+REBUILT = f"the folder of keys was lost: {_CURE}"
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250
 """Period (ns) of the loop while frames arrive. A Linux socket buffers about 50 ms of traffic at 10,000
@@ -493,8 +495,8 @@ class Station:
         self._playback = Playback(self._downlink, log)
         self._scheduling = Scheduling(Timetable(vault.folder, vault.restored), settings.foreign_modes)
         self._report(*self._scheduling.beginning())
-        if vault.restored:
-            self.report_problem("keys", RESTORED)
+        if vault.restored or vault.rebuilt:
+            self.report_problem("keys", RESTORED if vault.restored else REBUILT)
         self._status()
 
     @property

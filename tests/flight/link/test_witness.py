@@ -13,6 +13,7 @@ import pytest
 from flight.link.frames import TELEMETRY_MASK
 from flight.link.process.commanding import Timetable
 from flight.link.security import Association, Refusal, RefusedError, Sealer, Vault, new_key
+from knightcube.errors import UsageError
 from tests.flight.link.vaults import Ground, gate, vault
 
 KEYS = {spi: bytes([spi]) * 32 for spi in (1, 2, 3, 4)}
@@ -29,9 +30,9 @@ def keys(tmp_path: Path) -> Path:
     return vault(tmp_path / "keys", KEYS).folder
 
 
-def opened(keys: Path) -> Vault:
+def opened(keys: Path, rebuild: bool = False) -> Vault:
     """Return the satellite's security associations, as the link opens them."""
-    return Vault(keys, keys.parent / "witness")
+    return Vault(keys, keys.parent / "witness", rebuild)
 
 
 def refusal(at: Vault, frame: bytes) -> Refusal | None:
@@ -123,6 +124,86 @@ def test_a_damaged_witness_prevents_no_command(keys: Path, ground: Vault, damage
         at = opened(keys)
         assert not at.restored
         assert refusal(at, Ground(ground, 1).frame(b"command")) is None
+
+
+@pytest.mark.parametrize("left", ["nothing", "an empty folder", "damaged files"])
+def test_a_lost_folder_is_rebuilt_without_the_primary_command_key(
+    keys: Path, ground: Vault, left: str
+) -> None:
+    old = [Ground(ground, spi).frame(b"old") for spi in (1, 2, 2)]
+    assert [refusal(opened(keys), frame) for frame in old] == [None] * 3
+    used = Sealer(opened(keys), 3, TELEMETRY_MASK, 8).seal(bytes(6), b"live")[1]
+    if left == "damaged files":
+        for path in keys.glob("spi-*"):
+            path.write_bytes(b"damaged")
+    else:
+        shutil.rmtree(keys)
+    if left == "an empty folder":
+        keys.mkdir()
+    if left == "nothing":
+        with pytest.raises(UsageError, match="no such folder"):
+            opened(keys)
+    else:
+        assert all(opened(keys).read(spi) is None for spi in KEYS), "the folder may be mounted later"
+    for rebuilt in (True, False):
+        at = opened(keys, rebuild=rebuilt)
+        assert (at.rebuilt, at.restored) == (rebuilt, False)
+        assert [refusal(at, frame) for frame in old] == [Refusal.LOST] + [Refusal.REPEATED] * 2
+        assert refusal(at, Ground(ground, 2).frame(b"new")) is None
+    assert Sealer(at, 3, TELEMETRY_MASK, 8).seal(bytes(6), b"live")[1] > used
+    receiver = gate(at)
+    assert at.has_used(1, KEYS[1])
+    assert receiver.replace_key(1, 2, new_key())
+    ground.write(at.read(1) or pytest.fail("it was written"))
+    assert refusal(opened(keys), Ground(ground, 1).frame(b"new")) is None
+    assert [refusal(opened(keys), frame) for frame in old] == [Refusal.MAC] + [Refusal.REPEATED] * 2
+
+
+def test_without_a_second_record_a_lost_folder_is_not_rebuilt(keys: Path) -> None:
+    opened(keys)
+    for path in (keys, keys.parent / "witness"):
+        shutil.rmtree(path)
+    with pytest.raises(UsageError, match="no such folder"):
+        opened(keys, rebuild=True)
+
+
+@pytest.mark.parametrize("spi", [2, 3, 4])
+def test_lost_copies_of_one_association_are_restored_at_once(keys: Path, spi: int) -> None:
+    before = opened(keys).read(spi)
+    for path in keys.glob(f"spi-{spi}.*"):
+        path.unlink()
+    at = opened(keys)
+    assert (at.copies(spi), at.read(spi), at.rebuilt) == (2, before, False)
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+@pytest.mark.parametrize("damaged", ["a", "b"])
+def test_each_copy_of_the_second_record_is_at_most_one_command_old(
+    keys: Path, ground: Vault, damaged: str, restarts: bool
+) -> None:
+    """One undamaged copy suffices to detect a folder of keys that is older than one command."""
+    at = opened(keys)
+    commands, telemetry = Ground(ground, 1), Sealer(at, 3, TELEMETRY_MASK)
+    for _ in range(5):
+        at = opened(keys) if restarts else at
+        assert refusal(at, commands.frame(b"command")) is None
+        assert refusal(at, Ground(ground, 2).frame(b"command")) is None
+        (telemetry if not restarts else Sealer(at, 3, TELEMETRY_MASK)).seal(bytes(6), b"live")
+    for path in (keys.parent / "witness").glob(f"spi-*.{damaged}"):
+        path.write_bytes(b"damaged")
+    shutil.rmtree(keys)
+    shutil.copytree(keys.parent / "witness", keys)
+    left = Vault(keys)
+    assert [left.read(spi).unused >= least for spi, least in ((1, 4), (2, 5), (3, 4))] == [True] * 3  # type: ignore[union-attr]  # they were written
+
+
+def test_access_of_other_users_is_removed_on_the_satellite(keys: Path) -> None:
+    path = keys / "spi-1.a"
+    path.chmod(0o640)
+    with pytest.raises(UsageError, match="other users may read this key"):
+        Vault(keys)
+    opened(keys)
+    assert path.stat().st_mode & 0o777 == 0o600
 
 
 def test_a_restored_schedule_is_deleted_for_good(tmp_path: Path) -> None:

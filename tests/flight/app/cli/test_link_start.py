@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from flight.app.cli import main
+from flight.app.cli import link, main
+from flight.app.service import SeparationInhibit
 from flight.link.security import Vault
+from hal.buses.system import SystemClock
+from hal.interfaces.wires import SECOND_NS
+from knightcube.errors import UsageError
 from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 _LONGEST_S = 120.0
@@ -171,6 +177,25 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
     assert service.process.wait(_LONGEST_S) == 0
     assert service.process.stderr is not None
     assert "stopped before the start: link.tcp" in service.process.stderr.read()
+
+
+def test_a_lost_folder_of_keys_is_rebuilt_after_a_minute(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    judged = link._judge(write_linked_config(place, udp="127.0.0.1:0"), place)
+    clock = SystemClock()
+    inhibit = SeparationInhibit(clock)
+    with ExitStack() as stack:
+        link._open(place, inhibit, clock.now_ns(), judged, stack)
+    shutil.rmtree(place / "keys" / "satellite")
+    with ExitStack() as stack:
+        with pytest.raises(UsageError, match="no such folder"):
+            link._open(place, inhibit, clock.now_ns(), judged, stack)
+        assert "was lost" not in capsys.readouterr().err
+        _, names = link._open(place, inhibit, clock.now_ns() - 60 * SECOND_NS, judged, stack)
+    assert names == "UDP 127.0.0.1:0"
+    cure = "the folder of keys was lost: set a new key of SPI 1 by a command of SPI 2"
+    assert cure in capsys.readouterr().err
 
 
 def test_a_log_that_is_not_a_folder_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
