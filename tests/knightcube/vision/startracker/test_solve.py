@@ -132,8 +132,8 @@ def test_a_wrong_prior_does_not_change_the_solution() -> None:
     assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
 
 
-def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
-    """An attitude that is far from its prior is not changed towards the prior.
+def test_an_attitude_of_four_stars_far_from_the_prior_is_not_returned() -> None:
+    """An attitude far from the prior, on which only four stars agree, is not returned.
 
     The position of the brightest star is wrong by 1.2 px. Four stars agree on a roll that differs from the
     prior by 30 sigmas.
