@@ -507,6 +507,7 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
             hint = _description(_kinds_at(shape, f"{path}.{missing.group(1)}"))
             problem = "is missing" + (f": give the {hint}" if hint else "")
             raise document.error(join(dotted, missing.group(1)), problem) from error
+        below = " >" in message
         message = _permitted(message, shape, path)
         try:
             value = _value_at(tree, path)
@@ -514,9 +515,10 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
             pass  # msgspec writes [...] for an unknown index
         else:
             if not isinstance(value, dict):
-                text = repr(value)
+                hexadecimal = isinstance(value, int) and dotted.endswith("address")
+                text = f"{value:#04x} ({value})" if hexadecimal else repr(value)
                 cut = text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + "..."
-                message = f"is {cut}: {message}{_unit_hint(dotted, value, message)}"
+                message = f"is {cut}: {message}{_unit_hint(dotted, value, message, below)}"
         raise document.error(dotted, message) from error
 
 
@@ -556,12 +558,15 @@ _YAML_CURES = {
 """What to do about texts that are not YAML, by a part of the message of the parser."""
 
 
-def _unit_hint(dotted: str, value: Any, message: str) -> str:
-    """Return a hint if a value was written with a unit, or in rad although the key expects deg."""
+def _unit_hint(dotted: str, value: Any, message: str, below: bool) -> str:
+    """Return a hint if a value was written with a unit, or in rad although the key expects deg.
+
+    The flag `below` states whether the value is below its range.
+    """
     if isinstance(value, str) and "a number" in message and re.match(r"\s*[-+]?[0-9]", value):
         quoted = re.fullmatch(r"\s*[-+]?[0-9.]+([eE][-+]?[0-9]+)?\s*", value)
         return f": write the number without {'quotes' if quoted else 'a unit'}"
-    if dotted.endswith("_deg") and isinstance(value, int | float) and " >" in message and 0.0 < value < 6.3:
+    if below and dotted.endswith("_deg") and isinstance(value, int | float) and 0.0 < value < 6.3:
         return f": the unit is deg, and {value:g} rad are {math.degrees(value):.4g} deg"
     return ""
 
@@ -576,7 +581,7 @@ def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
             return ""
     names = [f.encode_name for f in msgspec.structs.fields(shape)]
     close = [name for name in names if name.startswith(key)]
-    close = close or difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+    close = close or difflib.get_close_matches(key, names, n=1, cutoff=0.6)
     return f", did you mean `{close[0]}`?" if close else f"; known keys: {', '.join(names)}"
 
 
@@ -601,7 +606,26 @@ def _permitted(message: str, shape: Any, path: str) -> str:
     hint = _description(kinds)
     if "matching regex" in message and hint:
         return f"expected {hint}"
-    return _plain(message) + (f" ({hint})" if hint else "")
+    limits = _limits(kinds) if re.match(r"Expected `(float|int)` [<>]", message) else ""
+    said = f"must be {limits}" if limits else _plain(message)
+    return said + (f" ({hint})" if hint and not (limits and limits in hint) else "")
+
+
+def _limits(kinds: list[inspect.Type]) -> str:
+    """Return the range of a number, such as `64 to 8192`, or an empty text if the types differ in it."""
+    found = {
+        (kind.gt, kind.ge, kind.lt, kind.le)
+        for kind in kinds
+        if isinstance(kind, inspect.FloatType | inspect.IntType)
+    }
+    if len(found) != 1:
+        return ""
+    bounds = [f"{bound:g}" if isinstance(bound, float) else bound for bound in found.pop()]
+    above, least, below, most = bounds
+    if least is not None and most is not None:
+        return f"{least} to {most}"
+    words = {"above": above, "at least": least, "below": below, "at most": most}
+    return " and ".join(f"{word} {bound}" for word, bound in words.items() if bound is not None)
 
 
 def _plain(message: str) -> str:

@@ -93,13 +93,15 @@ def check_consistency(config: Config, document: Document) -> None:
     # A reading waits for its control cycle, and the current computed from it flows until the next cycle.
     least = 1.0 / unit.rate_hz + 2.0 / CONTROL_RATE_HZ
     if unit.max_age < least:
-        problem = f"is {unit.max_age!r}: the rates of inertial unit and control loop require {least:g} s"
+        rates = f"`rate_hz` of {unit.rate_hz} and a control loop of {CONTROL_RATE_HZ:g} Hz"
+        problem = f"is {unit.max_age:g} s: must be at least {least:g} s with {rates}"
         refuse("inertial_unit.max_age", problem)
     telemetry = config.telemetry
     if telemetry.budget_bytes < 2 * telemetry.segment_bytes:
         refuse(
             "telemetry.budget_bytes",
-            f"is {telemetry.budget_bytes}: must be at least twice `telemetry.segment_bytes`",
+            f"is {telemetry.budget_bytes}: must be at least twice `telemetry.segment_bytes` "
+            f"({telemetry.segment_bytes})",
         )
     if telemetry.budget_bytes > _MOST_SEGMENTS * telemetry.segment_bytes:
         problem = f"is {telemetry.budget_bytes}: a log has at most {_MOST_SEGMENTS} segments"
@@ -107,7 +109,7 @@ def check_consistency(config: Config, document: Document) -> None:
     logs = 2 if config.simulation is None else 3
     if telemetry.archive_bytes < logs * telemetry.budget_bytes:
         problem = f"is {telemetry.archive_bytes}: must be at least {logs} times `telemetry.budget_bytes`"
-        refuse("telemetry.archive_bytes", f"{problem}, for the logs of one run")
+        refuse("telemetry.archive_bytes", f"{problem} ({telemetry.budget_bytes}), for the logs of one run")
     if config.camera is not None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)
@@ -126,7 +128,8 @@ def check_consistency(config: Config, document: Document) -> None:
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
     _check_testbed_coils(config.coils, refuse)
     if config.guidance.replan_period >= config.guidance.horizon:
-        refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
+        problem = f"is {config.guidance.replan_period:g} s: must be shorter than `guidance.horizon`"
+        refuse("guidance.replan_period", f"{problem} ({config.guidance.horizon:g} s)")
     unit = config.inertial_unit
     sensors = unit.sensors if isinstance(unit, SensorsSection) else ()
     measured = {quantity for sensor in sensors for quantity in sensor.measures}
@@ -443,12 +446,12 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
     if link.idle_rate > link.rate:
         refuse("link.idle_rate", f"is {link.idle_rate:g}: must not be above `link.rate` ({link.rate:g})")
     if link.telemetry_to is not None and link.udp is None:
-        refuse("link.telemetry_to", "goes with `link.udp`")
+        refuse("link.telemetry_to", "needs `link.udp`: add it, or omit `telemetry_to`")
     host = (link.telemetry_to or "localhost:0").rpartition(":")[0]
     try:
         IPv4Address("127.0.0.1" if host == "localhost" else host)
     except ValueError:  # resolving a host name would block the link at each frame
-        refuse("link.telemetry_to", f"{host} is not an IPv4 address")
+        refuse("link.telemetry_to", f"{host} is not an IPv4 address: give one, such as 192.0.2.7:5011")
     try:
         peer_networks(link)
     except ValueError as error:
@@ -469,7 +472,7 @@ def _check_wide_camera(dotted: str, camera: WideCamera, first: WideCamera, refus
         refuse(f"{dotted}.structure", f"is refused: {error}")
     for name in ("response", "decades", "bits", "pedestal"):
         if (value := getattr(camera, name)) != (wanted := getattr(first, name)):
-            problem = f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}"
+            problem = f"is {value!r}: must be equal for all `wide_cameras`, the first has {wanted!r}"
             refuse(f"{dotted}.{name}", problem)
 
 
@@ -491,13 +494,15 @@ def _check_lens(dotted: str, camera: Camera | WideCamera, refuse: Refuse) -> Non
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
     _check_lens("camera", camera, refuse)
     if camera.exposure >= camera.period:
-        refuse("camera.exposure", "must be shorter than `camera.period`")
+        problem = f"is {camera.exposure:g} s: must be shorter than `camera.period` ({camera.period:g} s)"
+        refuse("camera.exposure", problem)
     if camera.streak_exposure is not None:
         least, most = camera.streak_exposure
         if not least <= most < camera.period:
-            refuse("camera.streak_exposure", "must be a minimum and a maximum below `camera.period`")
+            limits = f"a minimum and a maximum below `camera.period` ({camera.period:g} s)"
+            refuse("camera.streak_exposure", f"is [{least:g}, {most:g}] s: must be {limits}")
     if camera.objects is not None and camera.objects.needed > camera.objects.within:
-        refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
+        refuse("camera.objects.needed", f"is {camera.objects.needed}: must be at most `within`")
     if camera.fine_period is not None and not camera.period <= camera.fine_period < camera.max_age:
         refuse(
             "camera.fine_period",

@@ -398,7 +398,7 @@ def test_a_request_during_which_the_program_is_killed_is_executed_three_times(bo
         board.step()
     assert checked.call_count == renewal.MOST_TRIES
     assert board.reports(request) == [
-        ("failed", "the board or the renewal program stopped 3 times during it")
+        ("failed", "the board or the renewal program stopped 3 times during this request")
     ]
     activated(board, version=2)
 

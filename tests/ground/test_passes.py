@@ -191,8 +191,8 @@ def test_stations_are_read_from_text_and_file(tmp_path: Path) -> None:
     [
         ("Berlin", "give NAME,LATITUDE,LONGITUDE"),
         ("Berlin,52.5,x", "could not convert"),
-        ("Berlin,95,13", "`latitude_deg` is 95.0: expected a number <= 90.0; give NAME,"),
-        ("Berlin,52,13,0,90", "`mask_deg` is 90.0: expected a number < 90.0"),
+        ("Berlin,95,13", "`latitude_deg` is 95.0: must be -90 to 90; give NAME,"),
+        ("Berlin,52,13,0,90", "`mask_deg` is 90.0: must be at least 0 and below 90"),
         ("Berlin,nan,13", "`latitude_deg` is nan"),
         (",52,13", "length >= 1"),
         ("Berlin,1,2,3,4,5", "give NAME,LATITUDE,LONGITUDE"),

@@ -56,7 +56,7 @@ def test_the_default_peers_are_the_network_of_the_address(lines: str, expected: 
         ("udp: '10.0.0.1:5000', peers: [ground]", "`link.peers"),
         ("udp: '10.0.0.1:5000', peers: []", "`link.peers"),
         ("spacecraft: 5", "`link` has no communication line"),
-        ("tcp: '127.0.0.1:5', telemetry_to: '127.0.0.1:6'", "`link.telemetry_to` goes with `link.udp`"),
+        ("tcp: '127.0.0.1:5', telemetry_to: '127.0.0.1:6'", "`link.telemetry_to` needs `link.udp`"),
         (
             "udp: '127.0.0.1:5', telemetry_to: 'ground.example:6'",
             "`link.telemetry_to` ground.example is not an IPv4 address",
@@ -129,7 +129,7 @@ def test_a_datagram_from_an_unknown_address_is_ignored() -> None:
         (
             "period: 10.0}\n\n",
             "period: 10.0, bits: 9}\n\n",
-            r"wide_cameras\[5\].bits` is 9: must be equal for all wide-angle cameras.*8",
+            r"wide_cameras\[5\].bits` is 9: must be equal for all `wide_cameras`.*8",
         ),
         (
             "period: 10.0}\n\n",
@@ -159,7 +159,7 @@ def test_a_datagram_from_an_unknown_address_is_ignored() -> None:
         (
             "  star_tracker: {}",
             "  star_tracker: {}\n  objects: {needed: 7}",
-            "`camera.objects.needed` is 7: must not be above `within`",
+            "`camera.objects.needed` is 7: must be at most `within`",
         ),
         (
             "  star_tracker: {}",

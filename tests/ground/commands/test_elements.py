@@ -49,7 +49,7 @@ def test_the_elements_of_an_orbit_are_those_of_the_shipped_configuration() -> No
     [
         (("--epoch", "2070-03-20T12:00:00"), "two digits: give times from 1957 to 2056"),
         (("--epoch", "1900-03-20T12:00:00"), "two digits: give times from 1957 to 2056"),
-        (("--local-time", "30"), "`local_time` is 30.0: expected a number <= 24.0"),
+        (("--local-time", "30"), "`local_time` is 30.0: must be 0 to 24"),
     ],
 )
 def test_an_orbit_that_two_lines_cannot_state_is_refused(change: tuple[str, str], reason: str) -> None:

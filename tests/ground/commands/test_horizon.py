@@ -141,7 +141,7 @@ def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--fov", "170"], "1 to 150 degrees"),
+        (["--fov", "170"], "--fov 170: must be 1 to 150 deg"),
         (["--fov", "67", "--altitude", "-3"], "not a positive number"),
         (["--fov", "67", "--altitude", "5"], "--altitude 5: this method needs at least 50 km"),
         (["--fov", "67", "--altitudes", "900", "300"], "altitudes of 900 to 300 km"),

@@ -327,7 +327,7 @@ def test_a_configuration_that_is_refused_is_one_line_and_status_2(
         (
             "simulation: {seed: 18446744073709551616}",
             2,
-            "`simulation.seed` is 18446744073709551616: expected",
+            "`simulation.seed` is 18446744073709551616: must be 0 to",
         ),
         (
             "simulation: {utc: '1999-12-31T00:00:00Z'}",
