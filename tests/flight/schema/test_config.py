@@ -102,7 +102,7 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ),
         ("camera:", "kamera:", "did you mean `camera`"),
         ("horizon: 10.0", "horizon: ten", "`guidance.horizon` is 'ten'"),
-        ("max_age: 0.1 ", "max_age: 0.06 ", r"`inertial_unit.max_age` is 0.06 s: must be at least 0.075 s with"),
+        ("max_age: 0.1 ", "max_age: 0.06 ", r"`inertial_unit.max_age` is 0.06 s: must be at least 0.075 s"),
         ("q2: 0.1}", "q2: .nan}", r"`steps\[4\].q2` is nan: must be a finite number"),
         ("q2: 0.1}", "q2: 0.9}", r"`steps\[4\].q2` is 0.9"),
         ("{at: 0.0,", "{att: 0.0,", "did you mean `at`"),
