@@ -185,11 +185,18 @@ class EmulatedSerialLine:
 
 
 class HostEnd:
-    """The host's end of a line, which implements `hal.interfaces.wires.SerialPort`."""
+    """The host's end of a line, which implements `hal.interfaces.wires.SerialPort`.
+
+    Attributes:
+        baud_rate: baud rate of this end, bits per second.
+        unplugged: whether the cable is unplugged.
+        rejected_rate: baud rate that the port does not support, or 0.
+    """
 
     def __init__(self, line: EmulatedSerialLine, now_ns: Callable[[], int], baud_rate: int) -> None:
         self.baud_rate = baud_rate
         self.unplugged = False
+        self.rejected_rate = 0
         self._line, self._now_ns = line, now_ns
 
     def receive(self) -> list[tuple[int, bytes]]:
@@ -203,8 +210,10 @@ class HostEnd:
         self._line.to_device.push(data, self._now_ns(), self.baud_rate, self._line.device.baud_rate)
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Change the baud rate of this end."""
+        """Change the baud rate of this end. Raises NotResponding if the port rejects the baud rate."""
         self.baud_rate = baud_rate
+        if baud_rate == self.rejected_rate:
+            raise NotResponding("serial line", f"does not support {baud_rate} baud")
 
     def close(self) -> None:
         """Close the port, with the same effect as unplugging the cable."""
