@@ -45,7 +45,7 @@ class Service:
                 return any(self._bus.call("currents"))
         raise TimeoutError("the emulated devices do not answer")
 
-    def hurt(self, act: Callable[[int], None]) -> dict[str, Any]:
+    def disturb(self, act: Callable[[int], None]) -> dict[str, Any]:
         """Disturb the running service; return the times until zero coil current and until the next start."""
         wait(self.driven, 20.0)
         old = self.pid()
@@ -101,11 +101,11 @@ def play(facts: Path) -> dict[str, Any]:
     seen["status"] = service.show("StatusText")
     seen["commanded"] = _flight("command", "--to", COMMANDS, "--timeout", "10", "ping")
     seen["devices_closed"] = _devices_closed()
-    seen["killed with its guardian"] = service.hurt(
+    seen["killed with its guardian"] = service.disturb(
         lambda _: void(systemctl("kill", "--kill-whom=all", "--signal=KILL", SERVICE))
     )
-    seen["killed"] = service.hurt(lambda pid: os.kill(pid, signal.SIGKILL))
-    seen["stopped"] = service.hurt(lambda pid: os.kill(pid, signal.SIGSTOP))
+    seen["killed"] = service.disturb(lambda pid: os.kill(pid, signal.SIGKILL))
+    seen["stopped"] = service.disturb(lambda pid: os.kill(pid, signal.SIGSTOP))
     seen["restarts"] = int(service.show("NRestarts"))
     seen["renewal"] = _renewal(service)
     wait(service.driven, 20.0)

@@ -208,24 +208,26 @@ def test_a_proven_release_that_no_longer_starts_is_replaced_too(board: FakeBoard
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4
 
 
-def _hurt(board: FakeBoard, link: str) -> None:
-    (board.prefix / link / "venv/lib/python3/site-packages/flight/label").write_text("hurt", encoding="ascii")
+def _damage_one_file(board: FakeBoard, link: str) -> None:
+    (board.prefix / link / "venv/lib/python3/site-packages/flight/label").write_text(
+        "damaged", encoding="ascii"
+    )
 
 
 def test_without_releases_py_a_damaged_release_is_replaced_unless_none_is_intact(
     board: FakeBoard,
 ) -> None:
     _chooser(board).unlink()
-    _hurt(board, "current")
+    _damage_one_file(board, "current")
     assert board.fly()[0] == "old"
-    _hurt(board, "previous")
+    _damage_one_file(board, "previous")
     label, said = board.fly()
-    assert label == "hurt"
+    assert label == "damaged"
     assert f"fly: release {SECOND} flies (imports): " in said
     for link in ("current", "previous"):
         PYTHONS["cannot import the flight"](_python(board, link))
     label, said = board.fly()
-    assert label == "hurt"
+    assert label == "damaged"
     assert f"fly: release {SECOND} flies (runs): " in said
 
 

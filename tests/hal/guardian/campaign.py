@@ -18,7 +18,7 @@ _PATIENCE_S = 30.0  # longest time until a new guardian is ready
 
 
 @dataclass(frozen=True)
-class Hurt:
+class ProcessFault:
     """Result of one test action, `act`: a process was stopped, hung or killed.
 
     Times are in s, and the current is in A. `recovered` is the time from the end of the action, or None if
@@ -35,14 +35,14 @@ class Hurt:
 class Campaign:
     """Results of all test actions, truth and events of the run, and the guardian processes in order."""
 
-    hurts: list[Hurt]
+    faults: list[ProcessFault]
     truth: CoilTruth
     guardians: list[int]
     guardian_lost_ns: list[int]
     left_over: list[int]
 
 
-def hurt_in_every_way(folder: Path) -> Campaign:
+def disturb_in_every_way(folder: Path) -> Campaign:
     """Stop and hang the flight process in two ways, then kill and stop the guardian, then kill the flight."""
     times: list[tuple[str, int, int | None]] = []
     guardians: list[int] = []
@@ -86,14 +86,14 @@ def hurt_in_every_way(folder: Path) -> Campaign:
         left_over = [child for child in guardians if lives(child)]
         _end_devices(children)
     truth = CoilTruth(flight.folder)
-    hurts = [_measured(truth, *act) for act in times]
-    return Campaign(hurts, truth, guardians, lost_ns, left_over)
+    faults = [_measured(truth, *act) for act in times]
+    return Campaign(faults, truth, guardians, lost_ns, left_over)
 
 
-def _measured(truth: CoilTruth, name: str, begin_ns: int, end_ns: int | None) -> Hurt:
+def _measured(truth: CoilTruth, name: str, begin_ns: int, end_ns: int | None) -> ProcessFault:
     until_ns = end_ns if end_ns is not None else begin_ns + 1_000_000_000
     recovered = None if end_ns is None else truth.driven_after(end_ns)
-    return Hurt(name, truth.before(begin_ns), truth.zero_after(begin_ns, until_ns), recovered)
+    return ProcessFault(name, truth.before(begin_ns), truth.zero_after(begin_ns, until_ns), recovered)
 
 
 def _end_devices(children: list[int]) -> None:

@@ -13,7 +13,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from tests.hal.guardian.campaign import UNGUARDED, Campaign, Hurt, hurt_in_every_way
+from tests.hal.guardian.campaign import UNGUARDED, Campaign, ProcessFault, disturb_in_every_way
 from tests.hal.guardian.live_flight import DRIVEN_A
 from tests.support.flights import event_names
 
@@ -26,7 +26,7 @@ Trials = Callable[[int], Campaign]
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> Trials:
     """Return a function that runs the trial of a number once, and returns its result."""
-    return cache(lambda _: hurt_in_every_way(tmp_path_factory.mktemp("hurt")))
+    return cache(lambda _: disturb_in_every_way(tmp_path_factory.mktemp("fault")))
 
 
 @pytest.fixture(scope="module")
@@ -44,30 +44,30 @@ def _shortest(trials: Trials, duration: Callable[[Campaign], float], limit: floa
     return shortest
 
 
-def _hurt(campaign: Campaign, act: str) -> Hurt:
-    (found,) = (hurt for hurt in campaign.hurts if hurt.act == act)
+def _fault(campaign: Campaign, act: str) -> ProcessFault:
+    (found,) = (fault for fault in campaign.faults if fault.act == act)
     assert abs(found.current) > DRIVEN_A, "the coil was driven when the act came"
     return found
 
 
 @pytest.mark.parametrize("act", ["SIGSTOP", "hang, other threads alive", "hang, interpreter held", "kill -9"])
 def test_the_coils_are_at_zero_half_a_second_after(trials: Trials, act: str) -> None:
-    assert _shortest(trials, lambda campaign: _hurt(campaign, act).zero_after, 0.5) <= 0.5
+    assert _shortest(trials, lambda campaign: _fault(campaign, act).zero_after, 0.5) <= 0.5
 
 
 def test_a_killed_flight_is_seen_at_once_and_not_after_the_time_out(trials: Trials) -> None:
-    assert _shortest(trials, lambda campaign: _hurt(campaign, "kill -9").zero_after, 0.25) <= 0.25
+    assert _shortest(trials, lambda campaign: _fault(campaign, "kill -9").zero_after, 0.25) <= 0.25
 
 
 def test_without_its_guardian_a_stopped_flight_drives_the_coils_on(campaign: Campaign) -> None:
-    after = [_hurt(campaign, act).zero_after for act in UNGUARDED]
+    after = [_fault(campaign, act).zero_after for act in UNGUARDED]
     assert inf in after, "the coil current stays, so the other tests of this file can fail"
 
 
 @pytest.mark.parametrize("act", ["SIGSTOP", "hang, other threads alive", "hang, interpreter held"])
 def test_control_comes_back_by_itself_within_two_seconds(trials: Trials, act: str) -> None:
     def recovered(campaign: Campaign) -> float:
-        found = _hurt(campaign, act).recovered
+        found = _fault(campaign, act).recovered
         return inf if found is None else found
 
     assert _shortest(trials, recovered, 2.0) <= 2.0
