@@ -15,6 +15,7 @@ import importlib.util
 import json
 import math
 import os
+import pickle
 import shutil
 import signal
 import sys
@@ -409,10 +410,28 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
             except Exception as error:  # noqa: BLE001 - raised in the process of the campaign
                 error.add_note(f"in case {case.key}:\n{traceback.format_exc()}")
                 answer = None, error
-            pipe.send(answer)
+            pipe.send(_sendable(case, answer))
             # A flight leaves reference cycles with large arrays. Because a flight suspends the collection of
             # older objects, the automatic collection would not find these cycles for dozens of flights.
             gc.collect()
+
+
+def _sendable(
+    case: Case, answer: tuple[Result | None, Exception | None]
+) -> tuple[Result | None, Exception | None]:
+    """Return result and exception of a case, or a CampaignError in place of what cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(answer))
+    except Exception as problem:  # noqa: BLE001 - any error of the methods of a foreign class
+        error = answer[1]
+        found = f"failed: {type(error).__name__}: {error}"
+        if error is None:
+            found = f"has a result that cannot be sent: {type(problem).__name__}: {problem}"
+        replaced = CampaignError(f"case {case.key} {found}")
+        for note in getattr(error, "__notes__", ()):
+            replaced.add_note(note)
+        return None, replaced
+    return answer
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import io
 import json
 import os
 import signal
+import tempfile
 import threading
 import time
 import weakref
@@ -21,6 +22,7 @@ from datetime import datetime
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -488,3 +490,57 @@ def test_the_error_of_a_case_ends_the_campaign_and_interrupts_busy_workers(
     # The second worker counts as busy because the campaign has not taken its next case from it.
     assert set(signals) == {(4711, signal.SIGINT)}
     assert (tmp_path / "results.jsonl").read_text() == ""
+
+
+class PairError(Exception):
+    """Error that can be pickled but not unpickled, because its constructor needs two arguments."""
+
+    def __init__(self, name: str, value: int) -> None:
+        super().__init__(f"{name} is {value}")
+
+
+class LockedError(Exception):
+    """Error that cannot be pickled."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.lock = threading.Lock()
+
+
+@pytest.mark.parametrize(
+    ("outcome", "text"),
+    [
+        (PairError("mass", 3), "case case-1 failed: PairError: mass is 3"),
+        (LockedError("the lock is open"), "case case-1 failed: LockedError: the lock is open"),
+        (
+            {"value": threading.Lock()},
+            "case case-1 has a result that cannot be sent: TypeError: cannot pickle",
+        ),
+    ],
+)
+def test_what_cannot_be_pickled_is_reported_with_its_case_and_text(
+    outcome: Any, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = SimpleNamespace(prctl=lambda *_: 0)
+    monkeypatch.setattr(runner, "ctypes", SimpleNamespace(CDLL=lambda _: library))
+
+    def run(case: Case) -> Result:
+        if isinstance(outcome, Exception):
+            raise outcome
+        found: Result = outcome
+        return found
+
+    ours, theirs = Pipe()
+    ours.send(Case("case-1", (1,), {}))
+    arguments = theirs, run, os.getppid(), tempfile.gettempdir()
+    worker = threading.Thread(target=runner._serve, args=arguments)
+    worker.start()
+    assert ours.poll(20.0)
+    result, error = ours.recv()
+    ours.close()
+    worker.join()
+    assert result is None
+    assert isinstance(error, CampaignError)
+    assert str(error).startswith(text)
+    if isinstance(outcome, Exception):
+        assert "in case case-1:" in error.__notes__[0]
