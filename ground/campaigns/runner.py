@@ -419,7 +419,7 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
 def _sendable(
     case: Case, answer: tuple[Result | None, Exception | None]
 ) -> tuple[Result | None, Exception | None]:
-    """Return result and exception of a case, or a CampaignError in place of what cannot be pickled."""
+    """Return result and exception of a case, or a CampaignError instead of those that cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(answer))
     except Exception as problem:  # noqa: BLE001 - any error of the methods of a foreign class
