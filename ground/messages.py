@@ -50,11 +50,11 @@ def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
-    if not len(measured) or not len(run["run"]):
+    if not len(measured):
         raise _no_object(run)
     if path.suffix == ".oem":
         raise UsageError(f"{path}: the suffix .oem is for the orbit beside the tracks: give another suffix")
-    start_ns = int(run["run"]["utc_ns"][-1])
+    start_ns = _start_ns(run)
     lines = _header("CCSDS_TDM_VERS = 2.0")
     for number in sorted(set(measured["number"].tolist())):
         lines += _segment(number, measured[measured["number"] == number], start_ns)
@@ -103,11 +103,11 @@ def write_attitudes(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
     packets = packets[np.isfinite(packets["quaternion"]).all(axis=1)]
     # Readers of the message refuse two attitudes with the same time.
     packets = packets[np.unique(packets["time_ns"], return_index=True)[1]]
-    if not len(packets) or not len(run["navigation"]) or not len(run["run"]):
+    if not len(packets) or not len(run["navigation"]):
         raise UsageError(
             f"{run.folder}: has no attitude with respect to the stars: give the run of a satellite"
         )
-    start_ns = int(run["run"]["utc_ns"][-1])
+    start_ns = _start_ns(run)
     dates = [ccsds_date(start_ns + int(time)) for time in packets["time_ns"]]
     lines = [
         *_header("CCSDS_AEM_VERS = 1.0"),
@@ -290,11 +290,19 @@ class ObjectOrbit:
 
 def orbits_of(run: Run) -> list[ObjectOrbit]:
     """Return the initial orbit of each tracked object. Raises UsageError for a run without objects."""
-    tracks, labels = run["track"], run["run"]
-    if not len(tracks) or not len(labels):
+    tracks = run["track"]
+    if not len(tracks):
         raise _no_object(run)
-    start_ns = int(labels["utc_ns"][-1])
+    start_ns = _start_ns(run)
     return [_orbit(number, tracks, start_ns) for number in sorted(set(tracks["number"].tolist()))]
+
+
+def _start_ns(run: Run) -> int:
+    """Return the UTC of mission time zero, ns since 1970. Raises UsageError if the log does not have it."""
+    known = run["run"]["utc_ns"][run["run"]["utc_ns"] > 0]
+    if not len(known):
+        raise UsageError(f"{run.folder}: the log has no packet `run` with the UTC of the flight")
+    return int(known[-1])
 
 
 def _no_object(run: Run) -> UsageError:

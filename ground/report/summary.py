@@ -29,6 +29,8 @@ from knightcube.astro.arrays import FloatArray
 Object = dict[str, Any]
 _LOST_S = 2.0
 """Time (s) from the end of the flight log to the end of the truth log above which packets count as lost."""
+_TRUE_POWER_S = 1.0
+"""Interval (s) of the packets `true_power`."""
 
 
 @np.errstate(all="ignore")  # packets may contain any numbers; results that are not finite become None
@@ -76,12 +78,22 @@ def summarise(run: Run) -> Object:
         "events": _events(run["event"]),
         "coils": _coils(run["event"]),
         "logs": _logs(run),
-        "notes": notes,
+        "notes": [*notes, *_damage(run)],
     }
     if len(run["power"]):
         summary["battery"] = _battery(run)
     plain: Object = _plain(summary)
     return plain
+
+
+def _damage(run: Run) -> list[str]:
+    """Return a note for each log from which packets are missing before its end."""
+    return [
+        f"the {stem} log is damaged: {sum(log.missing.values())} packets are missing, "
+        f"{log.skipped_bytes} bytes belong to no packet; the results are those of the packets that were found"
+        for stem, log in run.logs.items()
+        if log.skipped_bytes or sum(log.missing.values())
+    ]
 
 
 def _plain(value: Any) -> Any:
@@ -126,7 +138,7 @@ def _identity(run: Run, attitude: signals.ThreadMotion, notes: list[str]) -> Obj
     cut_short = bool(planned - identity["duration_s"] > 3.0 * period)
     if cut_short:
         notes.append(f"cut short: {identity['duration_s']:.1f} s of {planned:.1f} s")
-    if identity["duration_s"] == 0.0:
+    if identity["duration_s"] == 0.0 and not len(run["control"]):
         notes.append("stopped before the first control cycle")
     return {
         **identity,
@@ -306,8 +318,9 @@ def _battery(run: Run) -> Object:
         errors = judged["charge"] - at
         errors = errors[np.isfinite(errors)]
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
-        # The true powers (W) are recorded once a second, so their sum is the energy (J).
-        sums = [float(true[f"{name}_power"].sum()) for name in ("solar", "load", "coil")]
+        # The power (W) of each packet is that since the previous packet, which may be missing from the log.
+        spans = np.diff(signals.seconds(true), prepend=signals.seconds(true)[0] - _TRUE_POWER_S)
+        sums = [float(spans @ true[f"{name}_power"].astype(float)) for name in ("solar", "load", "coil")]
         values = [rms, float(true["charge"].min()), float(true["charge"][-1]), *sums]
         found |= dict(zip(names, values, strict=True))
     return found

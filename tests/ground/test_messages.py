@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def test_the_attitudes_are_read_by_a_reader_of_other_authors(tmp_path: Path) -> 
 
 def test_a_testbed_has_no_attitudes_in_icrs(tmp_path: Path) -> None:
     run = packed_run(run=[LABEL], attitude=[(1.0, {"quaternion": [0.0, 0.0, 0.0, 1.0]})])
-    with pytest.raises(UsageError, match="no attitudes of a satellite"):
+    with pytest.raises(UsageError, match="give the run of a satellite"):
         messages.write_attitudes(run, tmp_path / "attitude.aem")
 
 
@@ -148,6 +149,23 @@ def test_a_run_without_sightings_has_no_message(tmp_path: Path) -> None:
             messages.write_tracking_data(run, tmp_path / "tracks.tdm")
     with pytest.raises(UsageError, match="no object was tracked"):
         messages.orbits_of(packed_run(run=[LABEL]))
+
+
+@pytest.mark.parametrize("labels", [[], [(0.0, {"utc_ns": 0})]])
+def test_a_log_without_the_utc_of_the_flight_has_no_message(
+    labels: list[tuple[float, dict[str, int]]], tmp_path: Path
+) -> None:
+    attitude = [(1.0, {"quaternion": [0.0, 0.0, 0.0, 1.0]})]
+    track = [sighting(1.0, 1, 0.0, 0.0)]
+    run = packed_run(run=labels, track=track, navigation=[(0.0, {})], attitude=attitude)
+    writers: list[Callable[[], object]] = [
+        lambda: messages.write_tracking_data(run, tmp_path / "a.tdm"),
+        lambda: messages.write_attitudes(run, tmp_path / "a.aem"),
+        lambda: messages.orbits_of(run),
+    ]
+    for write in writers:
+        with pytest.raises(UsageError, match="no packet `run` with the UTC"):
+            write()
 
 
 def test_a_message_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:

@@ -34,6 +34,8 @@ def test_the_report_states_charge_energies_and_shed_loads(tmp_path: Path) -> Non
     assert (found["solar_j"], found["loads_j"], found["coils_j"]) == (12.0, 18.0, 6.0)
     late = summarise(packed_run(power=rows, true_power=true[4:]))["battery"]
     assert late["charge_error_rms"] == pytest.approx(math.sqrt((0.15**2 + 0.2**2) / 2))
+    gaps = summarise(packed_run(power=rows, true_power=[*true[:2], *true[4:]]))["battery"]
+    assert (gaps["solar_j"], gaps["loads_j"], gaps["coils_j"]) == (12.0, 18.0, 6.0)
     text = format_report(summary)
     assert "state of charge, estimated: lowest 25.0 %, at the end 60.0 %" in text
     assert "shed: coils-limited 3 s, camera-slower 1 s, safe 0 s" in text

@@ -294,6 +294,8 @@ def test_a_control_packet_that_is_missing_from_the_log_does_not_count_as_a_skipp
     (tmp_path / "flight-0001.ccsds").write_bytes(raw[:third] + raw[third + length :])
     summary = summarise(read_run(tmp_path))
     assert (summary["cycles"]["missing"], summary["cycles"]["skipped"]) == (1, 0)
+    (note,) = [note for note in summary["notes"] if "damaged" in note]
+    assert note.startswith("the flight log is damaged: 1 packets are missing, 4 bytes belong to no packet; ")
     assert summary["logs"][0]["missing_packets"] == 1
 
 
