@@ -139,7 +139,10 @@ def run(options: argparse.Namespace) -> int:
         dates, positions = _positions(section.free_body.orbit, julian_date(section.utc))
     else:
         dates, positions = _positions(*_given_orbit(options))
-    made = fit_elements(dates, positions, velocities)
+    try:
+        made = fit_elements(dates, positions, velocities)
+    except UsageError as error:
+        raise error if options.fixes is None else UsageError(f"{options.fixes}: {error}") from error
     sys.stdout.write(to_json(_facts(made, dates)) if options.json else _text(made, dates))
     return 0
 
@@ -238,8 +241,8 @@ def read_fixes(path: Path) -> Fixes:
             columns = [*_COLUMNS[1:], *(_VELOCITY if set(_VELOCITY) <= set(names) else ())]
             for row in reader:
                 place = f"{path}:{reader.line_num}"
-                numbers = (_number(row[name], place) for name in columns)
-                found.append([_date(row["utc"] or "", place), *numbers])
+                numbers = (_number(row[name], f"{place}: column {name}") for name in columns)
+                found.append([_date(row["utc"] or "", f"{place}: column utc"), *numbers])
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {reason_of(error)}") from error
     except UnicodeDecodeError as error:

@@ -238,6 +238,9 @@ def _planned(
     if not low <= options.within <= longest <= high:
         given = f"--within {options.within:g}, --longest {longest:g}"
         raise UsageError(f"{given}: must be {low:g} to {high:g} s, and --within not above --longest")
+    for name in BODIES:
+        if (cone := getattr(options, f"{name}_cone")) is not None and cone >= 180.0:
+            raise UsageError(f"--{name}-cone {cone:g}: must be above 0 and below 180 deg")
     cones: dict[Literal["sun", "earth", "moon"], float] = {
         name: math.radians(value)
         for name in BODIES

@@ -52,6 +52,8 @@ _CURES = {
     StreakStatus.SATURATED: "expose for a shorter time, or correct --saturation",
 }
 """Remedy for each reason why a picture gives no rate."""
+_LONGEST_READOUT = 1.0
+"""Longest time (s) between the exposures of the first and the last row of a picture."""
 _SHUTTER = (
     "shutter:       not described, included in the uncertainty: give --line-time, 0 for all rows at once\n"
 )
@@ -122,6 +124,9 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
         raise UsageError("the field of view is unknown: give --fov DEG or --camera CONFIG")
     if exposure is None:
         raise UsageError("the picture states no exposure time: give --exposure S or --camera CONFIG")
+    if options.line_time is not None and not 0.0 <= rows * options.line_time <= _LONGEST_READOUT:
+        limits = f"0 to {_LONGEST_READOUT / rows:.2g} s, a readout of {_LONGEST_READOUT:g} s"
+        raise UsageError(f"--line-time {options.line_time:g}: must be {limits}")
     if options.fov is None and camera is not None and camera.lens is not None:
         check_camera(options, pixels, camera.columns, camera.rows)
         return streak_camera(camera_model(camera)), exposure

@@ -86,7 +86,7 @@ def fit_elements(
     least = 4 if velocities is None else 2
     if len(dates) < least:
         wanted = f"{least} positions" if velocities is None else f"{least} fixes with velocities"
-        raise UsageError(f"{len(dates)} positions: elements need at least {wanted}")
+        raise UsageError(f"elements need at least {wanted}; given: {len(dates)}")
     states = positions if velocities is None else np.hstack([positions, velocities])
     if not (np.all(np.isfinite(states)) and np.all(np.diff(dates) > 0.0)):
         raise UsageError("the positions must be finite, and their times must ascend")

@@ -147,9 +147,13 @@ def test_wrong_use_is_reported_in_one_line(words: tuple[str, ...], complaint: st
     ("text", "complaint"),
     [
         ("utc,x,y\n", "the column z is missing: give utc, x, y, z and, if known, vx, vy, vz"),
-        ("utc,x,y,z\n2026-03-20T12:00:00,1,2,far\n", "fixes.csv:2: 'far' is not a number"),
-        ("utc,x,y,z\nnoon,1,2,3\n", "fixes.csv:2: 'noon': give a time"),
-        ("utc,x,y,z\n", "0 positions: elements need at least 4"),
+        ("utc,x,y,z\n2026-03-20T12:00:00,1,2,far\n", "fixes.csv:2: column z: 'far' is not a number"),
+        ("utc,x,y,z\nnoon,1,2,3\n", "fixes.csv:2: column utc: 'noon': give a time"),
+        (
+            "utc,x,y,z\n2026-03-20T12:00:00,7e6,0,0\n",
+            "fixes.csv: elements need at least 4 positions; given: 1",
+        ),
+        ("utc,x,y,z\n", "elements need at least 4 positions; given: 0"),
     ],
 )
 def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:

@@ -110,6 +110,11 @@ def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path)
         (["{picture}", "--fov", "20"], "states no exposure time: give --exposure S or --camera CONFIG"),
         (["{picture}", "--camera", "config/testbed.yaml"], "give a configuration with a camera"),
         (["{picture}", "--fov", "170", "--exposure", "1"], "--fov 170: must be 0.1 to 120 deg"),
+        (
+            ["{picture}", "--fov", "20", "--exposure", "1", "--line-time", "-1"],
+            "--line-time -1: must be 0 to",
+        ),
+        (["{picture}", "--fov", "20", "--exposure", "1", "--line-time", "0.1"], "a readout of 1 s"),
         (["{picture}", "--fov", "20", "--overlay", "{picture}"], "would replace a file that is read"),
         (
             ["{picture}", "--fov", "20", "--overlay", "config/testbed.yaml"],

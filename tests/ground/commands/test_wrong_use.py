@@ -45,6 +45,10 @@ PLAN = "plan --from 0.1 --to 0"
             "step_demo.yaml: `body` is testbed: this needs the",
         ),
         ("plan --orbit step_demo --from nadir --to sun --at 2026-03-01 --within 9", "`body` is testbed"),
+        (
+            "plan --orbit orbit --from nadir --to sun --at 2026-03-01 --within 600 --sun-cone 200",
+            "--sun-cone 200: must be above 0 and below 180 deg",
+        ),
         ("solve TMP/sky.pgm --camera step_demo", "64 x 64 pixels, but the camera of"),
         ("identify step_demo --run TMP/held --duration 5", "already contains a run: give another folder, or"),
     ],
