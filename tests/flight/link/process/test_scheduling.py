@@ -205,7 +205,7 @@ def test_commands_that_cannot_be_scheduled_are_refused_with_the_reason(link: Bot
 
 
 @pytest.mark.parametrize("writes", range(3))
-def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
+def test_after_a_kill_at_any_write_no_entry_is_executed_twice(
     tmp_path: Path, writes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = Timetable(tmp_path)
