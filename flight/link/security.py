@@ -583,6 +583,10 @@ class Sealer:
         self._cipher = entry.cipher
 
 
+USED_KEY = "has or had this key"
+"""Words of the satellite's report on a new key that it refuses because of `Vault.has_used`."""
+
+
 def new_key() -> bytes:
     """Return a new key from the random number generator of the operating system."""
     return secrets.token_bytes(KEY_BYTES)

@@ -27,6 +27,7 @@ from flight.link.process.filing import LISTING
 from flight.link.security import (
     COMMAND_SPIS,
     NEXT,
+    USED_KEY,
     Association,
     Gate,
     Refusal,
@@ -300,6 +301,8 @@ def change_key(
     reports = command(terminal, packet, spi, seconds, show)
     if obeyed(reports) and changed in COMMAND_SPIS:
         _promote(vault, changed)
+    elif USED_KEY in failed(reports):  # the satellite will never accept it, so the next attempt makes a key
+        vault.remove(name)
     return reports  # a new telemetry key is accepted at the first frame that uses it
 
 

@@ -161,17 +161,18 @@ class Terminal:
     def send_by(self, sealer: security.Sealer, packet: bytes) -> int:
         """Send a packet in a frame authenticated by `sealer`, and return the counter of the frame.
 
-        A packet that is too long for a frame is sent in portions; the counter is that of the last portion.
+        A packet that is too long for a frame is sent in portions; the counter is that of the last portion. No
+        other program sends between the portions, because the satellite joins only consecutive portions.
         Raises KnightCubeError if the packet is longer than any command, or if a frame cannot be sent.
         """
-        if len(packet) > self.packet_bytes:
-            return [self.send_by(sealer, portion) for portion in portions(packet, utc_ns())][-1]
-        length = FRAME_OVERHEAD_BYTES + len(packet)
-        header = frames.TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
+        is_long = len(packet) > self.packet_bytes
         with _turn_to_send(self._vault.folder):
-            body, counter = sealer.seal(header.pack(length), packet)
-            self._sequence += 1
-            self._line.send(frames.close_frame(body))
+            for part in portions(packet, utc_ns()) if is_long else (packet,):
+                length = FRAME_OVERHEAD_BYTES + len(part)
+                header = frames.TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
+                body, counter = sealer.seal(header.pack(length), part)
+                self._sequence += 1
+                self._line.send(frames.close_frame(body))
         return counter
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:

@@ -60,6 +60,7 @@ from flight.link.process.filing import STATUS, Filing, Renewal, values_of
 from flight.link.security import (
     COMMAND_SPIS,
     TELEMETRY_SPIS,
+    USED_KEY,
     Admitted,
     Gate,
     Refusal,
@@ -394,7 +395,7 @@ def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Map
     if before is not None and change.generation != before.generation + 1:
         return f"the key of SPI {change.spi} is of generation {before.generation}"
     if vault.has_used(change.spi, change.key):  # recorded frames with this key would be accepted again
-        return f"SPI {change.spi} has or had this key: make a new key"
+        return f"SPI {change.spi} {USED_KEY}: make a new key"
     if change.spi in COMMAND_SPIS:
         done = gate.replace_key(change.spi, change.generation, change.key)
     else:

@@ -8,6 +8,7 @@ import socket
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,7 +22,7 @@ from flight.link.frames import LONGEST_FRAME
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import NewKey, SendFile
-from flight.link.security import NEXT, Association, Refusal, Vault
+from flight.link.security import NEXT, USED_KEY, Association, Refusal, Vault
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Packer
 from ground.link import commanding
@@ -192,6 +193,17 @@ def test_a_refused_key_is_kept_for_the_next_attempt(vault: Vault) -> None:
     commanding.change_key(silent, vault, 1, 2, 1.0, lambda _: None)
     assert silent.names == [f"1-{NEXT}", 2], "a ping by the new key, then the same key again"
     assert bytes(sent_key(silent.sent[1]).key) == kept.key
+
+
+def test_a_key_that_the_satellite_had_is_not_sent_again(vault: Vault) -> None:
+    """A folder of the satellite that was restored or rebuilt after a key change refuses the changed key."""
+    used = replace(report(Stage.FAILED), text=f"SPI 1 {USED_KEY}: make a new key")
+    refused = terminal(vault, [used])
+    commanding.change_key(refused, vault, 1, 2, 1.0, lambda _: None)
+    again = terminal(vault, [report(Stage.COMPLETED)])
+    assert commanding.obeyed(commanding.change_key(again, vault, 1, 2, 1.0, lambda _: None))
+    assert again.names == [2], "no ping by a key that the satellite does not have"
+    assert sent_key(again.sent[0]).key != sent_key(refused.sent[0]).key
 
 
 def test_a_new_key_that_cannot_be_stored_is_not_sent(vault: Vault, monkeypatch: pytest.MonkeyPatch) -> None:

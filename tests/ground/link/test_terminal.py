@@ -108,6 +108,27 @@ def test_programs_that_share_the_keys_send_in_the_order_of_their_counters(keys: 
     assert [gate.admit(frame).data for frame in line.frames] == [b"first", b"first", b"second"]
 
 
+def test_no_other_program_sends_between_the_portions_of_a_packet(keys: Path) -> None:
+    """The satellite refuses a portion if another portion or packet of the same SPI arrived in between."""
+    slow, line = SharedLine(), SharedLine()
+    slow.frames = line.frames
+    settings = TerminalSettings(command_frame_bytes=128)
+    long, other = (Terminal(one, Vault(keys), settings) for one in (slow, line))
+    threads: list[threading.Thread] = []
+
+    def interrupt() -> None:
+        if not threads:
+            threads.append(threading.Thread(target=other.send, args=(b"second",)))
+            threads[0].start()
+        threads[0].join(0.2)
+
+    slow.before = interrupt
+    long.send(bytes(150))
+    threads[0].join()
+    gate = Gate(Vault(keys.parent / "satellite"), COMMAND_SPIS, parser_of(0x1A5), TELECOMMAND_MASK)
+    assert [gate.admit(frame).data == b"second" for frame in line.frames] == [False] * 3 + [True]
+
+
 def test_a_program_that_blocks_while_it_sends_is_not_waited_for_long(
     keys: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
