@@ -411,7 +411,7 @@ class StreamWatch:
         reason = {
             StreamState.STALE: f"{self.age(now_ns):.2f} s old, {stream.max_age:g} s allowed",
             StreamState.SLOW: f"{self.rate(now_ns):.3g} Hz, {stream.rate_hz:g} Hz nominal",
-            StreamState.INVALID: f"outside {stream.low:.3g} .. {stream.high:.3g}",
+            StreamState.INVALID: f"outside {stream.low:.3g} to {stream.high:.3g}",
         }[state]
         return True, f"{stream.name}: {state.name.lower()}, {reason}"
 

@@ -62,7 +62,7 @@ class OutOfRange(DeviceError):
     def __init__(
         self, device: str, quantity: str, value: float, low: float, high: float, unit: str, cure: str = ""
     ) -> None:
-        problem = f"{quantity} = {value!r} {unit} is outside {low!r} .. {high!r} {unit}"
+        problem = f"{quantity} = {value!r} is outside {low!r} to {high!r} {unit}".rstrip()
         super().__init__(device, f"{problem}: {cure}" if cure else problem)
         self.quantity = quantity
         self.value = value

@@ -97,8 +97,8 @@ class Ephemeris:
         position = (times - first) / step
         if not (position.min(initial=0.0) >= -1e-6 and position.max(initial=0.0) <= last + 1.0 + 1e-6):
             raise OrbitError(
-                f"{times[0]:.0f} .. {times[-1]:.0f} s: the orbit is predicted for "
-                f"{self.times[0]:.0f} .. {self.times[-1]:.0f} s"
+                f"{times[0]:.0f} to {times[-1]:.0f} s: the orbit is predicted for "
+                f"{self.times[0]:.0f} to {self.times[-1]:.0f} s"
             )
         if len(times) == 1:
             place = min(max(int(position[0]), 0), last)

@@ -442,8 +442,8 @@ def test_a_camera_on_an_exhausted_usb_bus_is_refused_with_the_cure(
     [
         ({"pixel_format": "Y12"}, "no pixel format Y12; it offers GREY, Y10, Y16"),
         ({"columns": 640}, "gives 64 x 48 pixels, not 640 x 48"),
-        ({"gain": 300}, r"gain = 300  is outside 0 \.\. 100"),
-        ({"exposure_ns": 2 * SECOND_NS}, r"exposure = 2\.0 s is outside"),
+        ({"gain": 300}, r"gain = 300 is outside 0 to 100$"),
+        ({"exposure_ns": 2 * SECOND_NS}, r"exposure = 2\.0 is outside .* s$"),
     ],
 )
 def test_settings_that_the_camera_does_not_support_are_refused(
