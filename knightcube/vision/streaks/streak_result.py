@@ -222,7 +222,9 @@ class MotionResult(FrameMotion):
 
     Attributes:
         stars: positions of the n stars at mid-exposure (n, 2), px.
-        star_covariance: covariance of each star position (n, 2, 2), px^2.
+        star_covariance: covariance of each star position (n, 2, 2), px^2, without the errors that other stars
+            near the streak cause. Positions and fluxes of stars whose streak extends beyond the frame are
+            unreliable: 81 of 135 such positions in simulated frames differed by more than 4 sigma.
         endpoint_covariance: covariance (2, 2) of both ends of each streak (n, 2, 2, 2), px^2.
         directions: unit vectors at the start, middle and end of each streak (n, 3, 3), in camera axes.
         flux: total counts of each star over the exposure (n,).
