@@ -29,6 +29,8 @@ SOURCE = "source"
 """File of a release with the SHA-256 digest of its sources and build options."""
 LOCK = "requirements.lock"
 """Name of the lock file's copy in a release; the packages of the release were installed from this file."""
+_NUMBER = ".number"
+"""File with the number in the name of the newest release."""
 SELF_TEST_S = 10
 _PARTS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"
@@ -63,6 +65,7 @@ class Build:
         if not self._options.dry_run:
             (release / SOURCE).write_text(wanted, encoding="ascii")
             shutil.copyfile(self._source / _BOARD_LOCK, release / LOCK)
+            _write(self._prefix / _NUMBER, f"{release.name.rpartition('+')[2]}\n")
             os.sync()  # the manifest is written after the files that it lists are on disk
             _write(release / MANIFEST, manifest_text(release))
         sys.stdout.write(f"{release.name}\n")
@@ -154,10 +157,15 @@ class Build:
                 _remove(release)
 
     def _name(self) -> str:
-        """Return a new release name: the version, and a number above those of the existing releases."""
+        """Return a new release name: the version, and a number above those of all earlier releases.
+
+        A removed release may have failed, so a new release of the same name would not be started.
+        """
         text = (self._source / "pyproject.toml").read_text(encoding="utf-8")
         version = next(line.split('"')[1] for line in text.splitlines() if line.startswith("version = "))
         numbers = [int(path.name.rpartition("+")[2]) for path in self.releases.glob("*+*")]
+        with suppress(OSError, ValueError):
+            numbers.append(int((self._prefix / _NUMBER).read_text(encoding="ascii")))
         return f"{version}+{max(numbers, default=0) + 1}"
 
     def _digest(self) -> str:

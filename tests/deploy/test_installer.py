@@ -126,6 +126,12 @@ def test_a_release_is_built_again_for_changed_sources_but_not_for_caches(tmp_pat
     assert build() == "1.0+1"
     (source / "knightcube/one.py").write_text("x", encoding="utf-8")
     assert build() == "1.0+2"
+    # A release that failed its trial is removed later. A new release must not have its name.
+    (prefix / "current").unlink()
+    (prefix / "current").symlink_to("releases/1.0+1")
+    shutil.rmtree(prefix / "releases/1.0+2")
+    (source / "knightcube/one.py").write_text("y", encoding="utf-8")
+    assert build() == "1.0+3"
 
 
 def test_the_checksum_is_one_that_sha256sum_checks(image: Image) -> None:
