@@ -53,7 +53,7 @@ def test_a_confirmed_configuration_stays(board: RenewedBoard) -> None:
     assert board.restarted()
     board.request("confirm")
     board.step()
-    assert board.reports(request)[-1] == ("completed", "configuration 1 stays")
+    assert board.reports(request)[-1] == ("completed", "configuration 1 is kept")
     board.step(1e6)
     assert board.flown() == "second"
     board.request("withdraw")
