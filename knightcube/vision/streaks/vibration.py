@@ -467,11 +467,23 @@ class _RotationSums:
 
     def normal_equations(self, functions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return information (3n, 3n) and gradient (3n,) of the coefficients of n `functions` (n, b, 4)."""
-        n = 3 * len(functions)
-        half = np.einsum("fbi,bikjl->fkbjl", functions, self.information, optimize=True)
-        whole = half.reshape(n, -1, 3).transpose(0, 2, 1).reshape(3 * n, -1) @ functions.reshape(n // 3, -1).T
-        information = whole.reshape(n, 3, n // 3).transpose(0, 2, 1).reshape(n, n)
-        return information, np.einsum("fbi,bik->fk", functions, self.score, optimize=True).reshape(n)
+        return self.joint_information(functions, functions), self.gradient(functions)
+
+    def gradient(self, functions: FloatArray) -> FloatArray:
+        """Return the gradient (3n,) of the coefficients of n `functions` (n, b, 4)."""
+        return np.asarray(functions.reshape(len(functions), -1) @ self.score.reshape(-1, 3)).reshape(-1)
+
+    def joint_information(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Return the information (3n, 3m) of n functions `first` (n, b, 4) and m `second` (m, b, 4)."""
+        n, m = len(first), len(second)
+        half = np.einsum("fbi,bikjl->fklbj", first, self.information, optimize=True)
+        whole = half.reshape(9 * n, -1) @ second.reshape(m, -1).T
+        return np.asarray(whole.reshape(3 * n, 3, m).transpose(0, 2, 1).reshape(3 * n, 3 * m))
+
+    def information_of_pairs(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Return the information (n, 3, 3) of each function of `first` (n, b, 4) and that of `second`."""
+        products = (first[..., None] * second[..., None, :]).reshape(len(first), -1)
+        return (products @ self.information.transpose(0, 1, 3, 2, 4).reshape(-1, 9)).reshape(-1, 3, 3)
 
 
 def _rotation_sums(
@@ -579,18 +591,33 @@ def _strongest_frequency(sums: _RotationSums, known: Vibration, highest: float) 
     grid = grid[(np.abs(grid[:, None] - known.frequency) >= _LEAST_APART).all(axis=1)]
     if not len(grid):
         return None
+    decrease = _decrease_of_chi2(sums, known, grid)
+    best = int(np.argmax(decrease))
+    return float(grid[best]) if decrease[best] > _LEAST_GAIN else None
+
+
+def _decrease_of_chi2(sums: _RotationSums, known: Vibration, frequency: FloatArray) -> FloatArray:
+    """Return the decrease (g,) of chi-square by one more sinusoid, for each of the g frequencies."""
     base = np.concatenate([_powers(sums.time), _waves(known.frequency, sums.time)])
-    waves = _waves(grid, sums.time).reshape(2, len(grid), -1, 4)
-    prior = np.diag(_precisions(sums.focal_length, len(known.frequency) + 1))
-    n = 3 * len(base)
+    n, waves = 3 * len(base), _waves(frequency, sums.time)
+    precision = _precisions(sums.focal_length, len(known.frequency) + 1)
     information, score = sums.normal_equations(base)
-    before = score @ _solved(information + prior[:n, :n], score)
-    gain = np.empty(len(grid))
-    for index in range(len(grid)):
-        information, score = sums.normal_equations(np.concatenate([base, waves[:, index]]))
-        gain[index] = score @ _solved(information + prior, score) - before
-    best = int(np.argmax(gain))
-    return float(grid[best]) if gain[best] > _LEAST_GAIN else None
+    by_function = sums.joint_information(base, waves).reshape(n, 2, len(frequency), 3)
+    joint = by_function.transpose(2, 0, 1, 3).reshape(len(frequency), n, 6)
+    sine, cosine = np.split(waves, 2)
+    mixed = sums.information_of_pairs(sine, cosine)
+    own = np.block(
+        [
+            [sums.information_of_pairs(sine, sine), mixed],
+            [mixed.transpose(0, 2, 1), sums.information_of_pairs(cosine, cosine)],
+        ]
+    )
+    # The Schur complement eliminates the coefficients of `base`.
+    gain = _solved(information + np.diag(precision[:n]), joint)
+    remaining = own + np.diag(precision[n:]) - joint.transpose(0, 2, 1) @ gain
+    asked = sums.gradient(waves).reshape(2, len(frequency), 3).transpose(1, 0, 2).reshape(len(frequency), 6)
+    asked = asked - score @ gain
+    return np.asarray(np.sum(asked * _solved(remaining, asked[..., None])[..., 0], axis=1))
 
 
 def _solved(matrix: FloatArray, right: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -225,6 +225,26 @@ def test_normal_equations_of_functions_are_sums_over_the_bins() -> None:
     assert score == pytest.approx(gradient)
 
 
+@pytest.mark.parametrize("known", [Vibration(), _TWO], ids=["none", "two"])
+def test_the_decrease_of_chi_square_is_that_of_a_fit_with_the_additional_sinusoid(known: Vibration) -> None:
+    sums, frequency = _sums(_true_rotation(_TWO), noise=1.0), np.array([1.3, 4.0, 11.0])
+    base = np.concatenate([vibration._powers(sums.time), vibration._waves(known.frequency, sums.time)])
+
+    def least(functions: FloatArray, sinusoids: int) -> float:
+        information, score = sums.normal_equations(functions)
+        prior = vibration._precisions(sums.focal_length, sinusoids)[: len(score)]
+        return float(score @ np.linalg.solve(information + np.diag(prior), score))
+
+    k = len(known.frequency)
+    expected = [
+        least(np.concatenate([base, vibration._waves(np.array([one]), sums.time)]), k + 1) - least(base, k)
+        for one in frequency
+    ]
+    found = vibration._decrease_of_chi2(sums, known, frequency)
+    # The expected values are differences of large numbers.
+    assert found == pytest.approx(expected, rel=1e-4)
+
+
 def test_rotations_are_the_derivatives_of_the_motion() -> None:
     """The derivatives are those with respect to rate, acceleration, sines, cosines and frequencies."""
     found = vibration._rotations(_TWO)(_TIME)
