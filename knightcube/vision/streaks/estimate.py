@@ -17,7 +17,7 @@ fitted rate. The covariance of the averaged rate includes the difference between
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import chain, islice
@@ -29,19 +29,18 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image, finite_array
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
 from knightcube.vision.frame import check_detector, raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
-from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
+from knightcube.vision.streaks.faint_stars import FaintStars
+from knightcube.vision.streaks.first_fits import (
+    LIGHT,
+    alike,
+    first_fits,
+    fits_near_angles,
+    has_angle,
+    likely_angles,
+    with_vibration,
+)
 from knightcube.vision.streaks.first_guess import (
-    SCANNED_STARS,
-    Circles,
-    MotionGuess,
-    find_axis,
-    frame_angles,
     guess_axis,
-    measured_rate_change,
-    motion_by_course,
-    motions_by_length,
-    motions_by_scan,
-    scan_angles,
 )
 from knightcube.vision.streaks.frame import BrightRegions, PreparedFrame, prepare_frames
 from knightcube.vision.streaks.geometry import (
@@ -52,14 +51,12 @@ from knightcube.vision.streaks.geometry import (
     azimuth_differences,
     complete_streaks,
     exposure_bounds,
-    mid_exposure_positions,
     path_lengths,
     polar_angles,
     positions,
     sensitivities,
 )
 from knightcube.vision.streaks.joint_fit import (
-    FIRST,
     LAST,
     FitProblem,
     StreakFit,
@@ -72,7 +69,6 @@ from knightcube.vision.streaks.joint_fit import (
     true_ends,
     unbroken,
 )
-from knightcube.vision.streaks.polar_grid import polar_grid
 from knightcube.vision.streaks.psf_profile import fit_profile
 from knightcube.vision.streaks.streak_result import (
     REASONS,
@@ -91,232 +87,8 @@ from knightcube.vision.streaks.uncertainty import (
 )
 from knightcube.vision.streaks.vibration import fit_vibration
 
-# Relative difference below which two rotation angles count as equal.
-_SAME_ANGLE = 0.05
-# Relative difference below which two rotation vectors count as the same motion.
-_SAME_MOTION = 0.005
-# Number of the brightest stars in a preliminary fit of the motion.
-_FIRST_STARS = 12
-# Maximum number of initial guesses of the motion that are fitted.
-_MOST_GUESSES = 5
-# Maximum number of initial guesses with an angular acceleration.
-_MOST_GROWING = 2
-# Maximum number of rotation angles that the scan of the whole frame proposes.
-_MOST_ANGLES = 2
 # Maximum number of iterations of the fit for a camera at rest.
 _STILL_ROUNDS = 12
-# Minimum number of complete streaks for a guess of the rotation angle from streak lengths alone.
-_WHOLE = 8
-# Largest accepted fraction of the flux in regions that are longer than the guessed streak length.
-_CONTRADICTED = 0.3
-# Minimum number of stars in a preliminary fit that is accepted without comparison with other fits.
-_MANY = 3
-# Minimum fraction of well-fitted stars in a preliminary fit that is accepted without comparison.
-_EXPLAINED = 0.4
-# Minimum fraction of confirmed streak ends in a preliminary fit that is accepted without comparison.
-_IN_PLACE = 0.6
-# Minimum chi-square explained by a preliminary fit that is accepted without comparison with other fits.
-_EVIDENT = 3000.0
-# Largest median chi-square per degree of freedom of a usable preliminary fit.
-_WORST_FIRST = 12.0
-# Fraction of bright pixels above which the brightest regions of a frame are assumed to be blends of stars.
-_CROWDED = 0.05
-# Minimum chi-square explained by the best fit for which a frame of blended stars is not scanned completely.
-_BEYOND_CROWD = 100_000.0
-# Largest excess chi-square of a well-fitted star, as a fraction of the star's squared significance.
-_MOST_RESIDUAL = 0.01
-# Upper limit of a star's significance (standard deviations) in the chi-square that a fit explains.
-_ENOUGH = 200.0
-# Weight of the flux in overlong regions, which may be blends of two streaks, in the comparison of guesses.
-_CONTRADICTION = 0.6
-# Median chi-square per degree of freedom of a preliminary fit above which a vibration is fitted.
-_SHAKEN = 2.5
-# Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
-_CALM = 2.0
-# Fraction of streak ends that a fit with a wrong rotation angle can match by matching one end per streak.
-_ENDS_BY_CHANCE = 0.4
-
-
-def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[StreakFit]:
-    """Yield preliminary fits of the motion to the brightest stars, in descending order of likelihood.
-
-    The argument `near` (rad) is the rotation angle expected from a prior rate, or None.
-    """
-    rivals: list[tuple[float, StreakFit]] = []
-    yielded: list[FloatArray] = []
-    for guess in islice(_guesses(camera, regions, near), _MOST_GUESSES):
-        if camera.work.exhausted:
-            break
-        tried = _tried(camera, guess)
-        if tried is None:
-            continue
-        explained, convincing, done = tried
-        if any(alike(done.scene.motion.rotation, other) for other in yielded):
-            continue
-        if convincing and all(explained > rival for rival, _ in rivals):
-            likelier = None if rivals else _likelier(camera, regions, explained, done)
-            if likelier is not None:
-                rivals.append((explained, done))
-                done = likelier
-            yielded.append(done.scene.motion.rotation)
-            yield done
-        elif misfit(done.evaluation) <= _WORST_FIRST:
-            rivals.append((explained, done))
-    if rivals and not yielded:
-        # If the bright regions do not determine the rotation angle, the whole frame is scanned.
-        axis = max(rivals, key=lambda rival: rival[0])[1].scene.motion.rotation
-        angles = _frame_angles(camera, axis)
-        for explained, convincing, done in _rescanned(camera, axis, angles):
-            rivals.append((explained, done))
-            if convincing:
-                break
-    rivals.sort(key=lambda rival: -rival[0])
-    for _, done in rivals:
-        if not any(alike(done.scene.motion.rotation, other) for other in yielded):
-            yielded.append(done.scene.motion.rotation)
-            yield done
-
-
-def _likelier(
-    camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
-) -> StreakFit | None:
-    """Return a fit from a scan of the whole frame that explains more chi-square than the fit `done`.
-
-    Returns None if the scan finds no better fit, if few pixels of the frame are bright, or if the fit `done`
-    already explains enough chi-square.
-    """
-    if regions.lit <= _CROWDED or explained >= _BEYOND_CROWD:
-        return None
-    rotation = done.scene.motion.rotation
-    size = float(np.linalg.norm(rotation))
-    angles = _frame_angles(camera, rotation)
-    if any(abs(size - angle) < _SAME_ANGLE * size for angle in angles):
-        return None
-    best = None
-    for light, convincing, fit in _rescanned(camera, rotation, angles):
-        if light <= explained:
-            continue
-        if abs(float(np.linalg.norm(fit.scene.motion.rotation)) - size) < _SAME_ANGLE * size:
-            return None
-        best, explained = fit, light
-        if convincing:
-            break
-    return best
-
-
-def _frame_angles(camera: FitProblem, rotation: FloatArray) -> list[float]:
-    """Return the likely rotation angles (rad) about the axis of `rotation` (3,) from a whole-frame scan."""
-    camera.work.passed(camera.frame.signal.size)
-    return frame_angles(camera.frame, camera.pinhole, rotation, _MOST_ANGLES)
-
-
-def _rescanned(
-    camera: FitProblem, rotation: FloatArray, angles: list[float]
-) -> Iterator[tuple[float, bool, StreakFit]]:
-    """Yield preliminary fits with rotation angles near `angles` (rad) about the axis of `rotation` (3,)."""
-    settings, pinhole = camera.settings, camera.pinhole
-    nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
-    frame = polar_grid(pinhole, CameraMotion.steady(rotation)).frame
-    for angle in angles:
-        if camera.work.exhausted:
-            return
-        camera.work.passed(camera.frame.signal.size)
-        motion = CameraMotion.steady(frame[2] * angle)
-        found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
-        bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
-        if len(bright) < settings.least_stars:
-            continue
-        x, y, z = frame @ pinhole.ideal.unit_vectors(found.stars[bright]).T
-        circles = Circles(frame, z, np.arctan2(y, x))
-        for best, stars, light in scan_angles(camera.frame, pinhole, circles, 1, angle):
-            if len(light[:_FIRST_STARS]) < settings.least_stars:
-                continue
-            motion = CameraMotion.steady(frame[2] * best)
-            tried = _tried(camera, MotionGuess(motion, stars[:_FIRST_STARS], light[:_FIRST_STARS], 0.0))
-            if tried is not None:
-                yield tried
-
-
-def alike(one: FloatArray, other: FloatArray) -> bool:
-    """Return whether two rotation vectors (3,) are equal or opposite within the tolerance `_SAME_MOTION`."""
-    apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
-    return float(apart) < _SAME_MOTION * float(np.linalg.norm(one))
-
-
-def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[MotionGuess]:
-    """Yield initial guesses of the motion, in descending order of likelihood.
-
-    The rotation angles are derived from streak lengths if many streaks are complete, otherwise from a scan.
-    """
-    guess = find_axis(regions, camera.pinhole)
-    if guess is None:
-        return
-    if camera.course is not None:
-        known = motion_by_course(camera.course, regions, camera.pinhole, _FIRST_STARS)
-        if len(known.light) >= camera.settings.least_stars:
-            yield known
-    growth = 0.0 if camera.settings.rate_model == "constant" else measured_rate_change(guess, regions)
-    if growth:
-        growing = motions_by_length(guess, regions, camera.pinhole, _FIRST_STARS, growth)
-        yield from islice(growing, _MOST_GROWING)
-    voted = motions_by_length(guess, regions, camera.pinhole, _FIRST_STARS)
-    first = list(islice(voted, 1))
-    if first and len(first[0].light) >= _WHOLE and first[0].contradicted < _CONTRADICTED:
-        yield first.pop()
-    yield from motions_by_scan(guess, camera.frame, camera.pinhole, _FIRST_STARS, near)
-    yield from chain(first, voted)
-
-
-def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakFit] | None:
-    """Return the explained chi-square of a fit to `guess`, whether the fit is convincing, and the fit.
-
-    A convincing fit is accepted without comparison with other fits. Returns None if the fit does not succeed.
-    """
-    motion = guess.motion if camera.course is None else camera.course.scaled_to(guess.motion.rotation)
-    motion = motion if camera.sense is None else motion.directed(camera.sense)
-    stars = mid_exposure_positions(camera.pinhole, motion, camera.shutter, guess.stars)
-    scene = StreakScene.of(motion, camera.sigma, stars, guess.light)
-    camera = replace(camera, growing=not motion.constant)
-    done = iterate(camera, scene, camera.free, FIRST)
-    if done is None:
-        return None
-    correct = true_ends(camera, done.scene)
-    judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
-    ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
-    if ends > _IN_PLACE and misfit(done.evaluation) > _SHAKEN:
-        done = _vibrating(camera, done) or done
-    found = _judged(done, guess, ends)
-    if not found[1] and ends > _IN_PLACE and misfit(done.evaluation) > _WORST_FIRST:
-        learned = fit_profile(camera, done)
-        found = found if learned is None else _judged(learned, guess, ends)
-    return found
-
-
-def _judged(done: StreakFit, guess: MotionGuess, ends: float) -> tuple[float, bool, StreakFit]:
-    """Return the explained chi-square of a fit, whether the fit is convincing, and the fit.
-
-    The argument `ends` is the smaller of the fractions of confirmed streak ends and of unbroken streaks.
-    """
-    # With a wrong rotation angle, the model has large residuals at one end of each streak.
-    light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
-    residual = done.evaluation.chi2 - done.evaluation.pixels
-    good = residual < _MOST_RESIDUAL * light + done.evaluation.pixels
-    calm = 1.0 if done.last_step < _CALM else 0.3
-    evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
-    explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _ENDS_BY_CHANCE, 0.02)
-    convincing = explained > _EVIDENT and share > _EXPLAINED and ends > _IN_PLACE
-    return explained, convincing and len(guess.light) >= _MANY, done
-
-
-def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
-    """Return a preliminary fit that includes a vibration, or None if the residuals show no vibration.
-
-    The tolerance is that of the final fit, because residuals of bright stars would look like faint stars.
-    """
-    limits = replace(FIRST, tolerance=LAST.tolerance)
-    return fit_vibration(
-        camera, fit, lambda scene: iterate(camera, scene, camera.free, limits, camera.windows(scene))
-    )
 
 
 def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
@@ -501,8 +273,6 @@ def _rolling_result(
 
 # Indices of rate, acceleration, x and y in the vector of shared parameters and one star's parameters.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
-# Index of the flux in the vector of the shared parameters followed by one star's parameters.
-_LIGHT = 9
 # Last step of a joint fit (standard deviations) above which the fit has not converged.
 _UNSETTLED = 2.0
 # Minimum distance (point-spread widths) from the frame's border at which the end of a streak is visible.
@@ -522,7 +292,7 @@ _SAME = 1.5
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
     """Return a copy of the result `seen` with stars, streak ends and covariances of the fit `last`."""
     settings, joint = camera.settings, last.solution.joint
-    significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
+    significance = last.scene.light / np.sqrt(np.maximum(joint[:, LIGHT, LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
     # If the fit has moved one star onto another star, only the brighter star is kept.
     stars, light = last.scene.stars[kept], last.scene.light[kept]
@@ -812,30 +582,24 @@ def _best_motion(
         return leading
     # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle.
     # If streaks are broken into fragments, the fit often finds the correct axis, but a wrong angle.
-    angles = _frame_angles(camera, leading.rotation)
-    if leading.possible and _has_angle(leading.rotation, angles):
+    angles = likely_angles(camera, leading.rotation)
+    if leading.possible and has_angle(leading.rotation, angles):
         return leading
     candidates = [leading]
-    rescanned = (fit for _, _, fit in _rescanned(camera, leading.rotation, angles))
+    rescanned = (tried.fit for tried in fits_near_angles(camera, leading.rotation, angles))
     for fit in chain(rescanned, rivals):
         if camera.work.exhausted:
             break
         candidate = _fitted(camera, seen, fit)
         again = any(other.possible and alike(candidate.rotation, other.rotation) for other in candidates)
         if candidate.verdict is StreakVerdict.CONFIRMED or (
-            candidate.possible and (again or _has_angle(candidate.rotation, angles))
+            candidate.possible and (again or has_angle(candidate.rotation, angles))
         ):
             return candidate
         candidates.append(candidate)
     reason = leading.result.reason or _NO_CONSISTENT_MOTION
     rejected = replace(leading.result, status=StreakStatus.FAILED, rate=None, covariance=None, reason=reason)
     return replace(leading, result=rejected)
-
-
-def _has_angle(rotation: FloatArray, angles: list[float]) -> bool:
-    """Return whether the angle of `rotation` (3,) equals the most likely angle in `angles` (rad)."""
-    size = float(np.linalg.norm(rotation))
-    return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
 
 
 def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candidate:
@@ -855,7 +619,7 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     camera = replace(camera, growing=bool(start.free[3]))
     # No profile of the PSF explains streaks whose ends contradict the motion.
     wrong = found.result.reason == _WRONG_ENDS
-    for fit_again in (_vibrating,) if wrong else (_vibrating, fit_profile):
+    for fit_again in (with_vibration,) if wrong else (with_vibration, fit_profile):
         again = fit_again(camera, start)
         other = None if again is None else _candidate(camera, seen, again)[1]
         if other is not None and other.possible:

@@ -12,10 +12,11 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks import estimate
+from knightcube.vision.streaks import estimate, first_fits
 from knightcube.vision.streaks.camera_motion import CameraMotion
-from knightcube.vision.streaks.estimate import StreakVerdict, alike, check_streaks, with_rate, with_stars
+from knightcube.vision.streaks.estimate import StreakVerdict, check_streaks, with_rate, with_stars
 from knightcube.vision.streaks.faint_stars import FaintStars
+from knightcube.vision.streaks.first_fits import alike
 from knightcube.vision.streaks.first_guess import MotionGuess
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import Course, Shutter, StreakScene, path_lengths, positions
@@ -52,7 +53,7 @@ _NOBODY = FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
 def test_motions_are_alike_if_they_are_equal_or_opposite_within_half_a_percent() -> None:
     one = np.array([0.0, 0.3, 0.4])
     for share, equal in ((0.9, True), (1.1, False)):
-        off = np.array([share * estimate._SAME_MOTION * 0.5, 0.0, 0.0])
+        off = np.array([share * first_fits._SAME_MOTION * 0.5, 0.0, 0.0])
         assert alike(one, one + off) == equal
         assert alike(one, -one + off) == equal
 
@@ -408,14 +409,14 @@ def test_double_images_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_scan_confirms_the_angle_of_a_motion() -> None:
     rotation = np.array([0.06, 0.0, 0.08])
-    assert estimate._has_angle(rotation, [0.104, 0.3])
-    assert not estimate._has_angle(rotation, [0.106, 0.1])
-    assert not estimate._has_angle(rotation, [0.094])
-    assert not estimate._has_angle(rotation, [])
+    assert first_fits.has_angle(rotation, [0.104, 0.3])
+    assert not first_fits.has_angle(rotation, [0.106, 0.1])
+    assert not first_fits.has_angle(rotation, [0.094])
+    assert not first_fits.has_angle(rotation, [])
 
 
 def test_a_scan_of_a_frame_without_streaks_gives_no_fit() -> None:
-    assert list(estimate._rescanned(_problem(), _MOTION.rotation, [0.4, 0.2])) == []
+    assert list(first_fits.fits_near_angles(_problem(), _MOTION.rotation, [0.4, 0.2])) == []
 
 
 def _guessed(angle: float) -> Any:
@@ -424,23 +425,40 @@ def _guessed(angle: float) -> Any:
     return SimpleNamespace(scene=SimpleNamespace(motion=motion), evaluation=None)
 
 
+def _first_fit(explained: float, convincing: bool, angle: float, *, shaken: bool = False) -> Any:
+    return SimpleNamespace(explained=explained, convincing=convincing, fit=_guessed(angle), shaken=shaken)
+
+
 def _searched(
     monkeypatch: pytest.MonkeyPatch,
     tried: list[tuple[float, bool, float] | None],
     rescanned: list[tuple[float, bool, float]],
     lit: float = 0.0,
     misfit: float = 1.0,
+    disturbed: dict[float, tuple[float, bool, float]] | None = None,
 ) -> list[float]:
-    """Return the angles of the preliminary fits for guesses with given chi-square, conviction and angle."""
-    results = iter([None if one is None else (one[0], one[1], _guessed(one[2])) for one in tried])
-    monkeypatch.setattr(estimate, "_guesses", lambda *_: iter(range(len(tried))))
-    monkeypatch.setattr(estimate, "_tried", lambda *_: next(results))
-    monkeypatch.setattr(estimate, "misfit", lambda *_: misfit)
-    monkeypatch.setattr(estimate, "_frame_angles", lambda *_: [one[2] for one in rescanned])
-    fits = [(light, convincing, _guessed(angle)) for light, convincing, angle in rescanned]
-    monkeypatch.setattr(estimate, "_rescanned", lambda *_: iter(fits))
+    """Return the angles of the preliminary fits for guesses with given chi-square, conviction and angle.
+
+    The keys of `disturbed` are the angles of the fits whose residuals may show a vibration, and its values
+    are the fits with a vibration.
+    """
+    again = disturbed or {}
+    fits = [None if one is None else _first_fit(*one, shaken=one[2] in again) for one in tried]
+    results = iter(fits)
+    monkeypatch.setattr(first_fits, "_guesses", lambda *_: iter(range(len(tried))))
+    monkeypatch.setattr(first_fits, "_tried", lambda *_: next(results))
+    monkeypatch.setattr(
+        first_fits,
+        "_disturbed",
+        lambda _, first: _first_fit(*again[float(first.fit.scene.motion.rotation[2])]),
+    )
+    monkeypatch.setattr(first_fits, "misfit", lambda *_: misfit)
+    monkeypatch.setattr(first_fits, "likely_angles", lambda *_: [one[2] for one in rescanned])
+    monkeypatch.setattr(
+        first_fits, "fits_near_angles", lambda *_: iter([_first_fit(*one) for one in rescanned])
+    )
     regions: Any = SimpleNamespace(lit=lit)
-    found = estimate.first_fits(_problem(), regions, None)
+    found = first_fits.first_fits(_problem(), regions, None)
     return [float(fit.scene.motion.rotation[2]) for fit in found]
 
 
@@ -459,6 +477,32 @@ def test_convincing_guesses_come_before_the_others_in_the_order_of_their_evidenc
     assert _searched(monkeypatch, [doubtful, other], scans) == [0.7, 0.3, 0.1, 0.6]
     assert _searched(monkeypatch, [], scans) == []
     assert _searched(monkeypatch, [None], scans) == []
+
+
+def test_a_vibration_is_fitted_only_if_no_guess_is_convincing_without_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fit with a vibration to a wrong guess would use up the work of the frame."""
+    wrong, sure = (4e3, False, 0.1), (9e3, True, 0.2)
+    asked: list[float] = []
+
+    class Asked(dict[float, tuple[float, bool, float]]):
+        def __getitem__(self, angle: float) -> tuple[float, bool, float]:
+            asked.append(angle)
+            return super().__getitem__(angle)
+
+    again = Asked({0.1: (5e3, True, 0.11), 0.3: (6e3, True, 0.31)})
+    found = _searched(monkeypatch, [wrong, sure], [], disturbed=again)
+    assert found[0] == 0.2
+    # The likeliest of the fits whose residuals may show a vibration comes first, even if it is convincing.
+    asked.clear()
+    doubtful = (5e3, True, 0.3)
+    assert _searched(monkeypatch, [wrong, doubtful], [], disturbed=again)[0] == 0.31
+    assert asked == [0.3, 0.1]
+    # A wrong guess without a vibration remains the last.
+    asked.clear()
+    none = Asked({0.1: (4e3, False, 0.1)})
+    assert _searched(monkeypatch, [wrong, (3e3, False, 0.2)], [], disturbed=none) == [0.1, 0.2]
 
 
 @pytest.mark.parametrize(
@@ -500,9 +544,9 @@ def test_the_first_confirmed_motion_is_the_best(monkeypatch: pytest.MonkeyPatch)
 
         monkeypatch.setattr(estimate, "_fitted", fitted)
         monkeypatch.setattr(estimate, "first_fits", lambda *_: iter([_guessed(angle) for _, angle in fits]))
-        monkeypatch.setattr(estimate, "_frame_angles", lambda *_: angles)
+        monkeypatch.setattr(estimate, "likely_angles", lambda *_: angles)
         monkeypatch.setattr(
-            estimate, "_rescanned", lambda *_: iter([(1.0, True, _guessed(a)) for _, a in scanned])
+            estimate, "fits_near_angles", lambda *_: iter([_first_fit(1.0, True, a) for _, a in scanned])
         )
         regions: Any = None
         return estimate._best_motion(_problem(), MotionResult(StreakStatus.FAILED, 1, 0.2), regions, None)
@@ -530,8 +574,7 @@ def _attempt(
     misfit: float = 1.0,
     chi2: float = 120.0,
     count: int = 4,
-    shaken: Any = None,
-) -> tuple[float, bool, Any]:
+) -> Any:
     """Return the evidence for a guess of four stars, of which the first is badly fitted."""
     joint = np.zeros((4, 11, 11))
     joint[:, 9, 9] = [1.0, 4.0, 1.0, 25.0]
@@ -543,13 +586,12 @@ def _attempt(
     )
     correct = np.full((10, 2), np.nan)
     correct[:, 0] = np.arange(10) < 10.0 * ends
-    monkeypatch.setattr(estimate, "iterate", lambda *_: done)
-    monkeypatch.setattr(estimate, "true_ends", lambda *_: correct)
-    monkeypatch.setattr(estimate, "unbroken", lambda *_: np.empty(0))
-    monkeypatch.setattr(estimate, "misfit", lambda *_: misfit)
-    monkeypatch.setattr(estimate, "_vibrating", lambda *_: shaken)
+    monkeypatch.setattr(first_fits, "iterate", lambda *_: done)
+    monkeypatch.setattr(first_fits, "true_ends", lambda *_: correct)
+    monkeypatch.setattr(first_fits, "unbroken", lambda *_: np.empty(0))
+    monkeypatch.setattr(first_fits, "misfit", lambda *_: misfit)
     stars, light = np.full((count, 2), 60.0), np.full(count, 900.0)
-    found = estimate._tried(_problem(), MotionGuess(_MOTION, stars, light, contradicted))
+    found = first_fits._tried(_problem(), MotionGuess(_MOTION, stars, light, contradicted))
     assert found is not None
     return found
 
@@ -560,40 +602,47 @@ def test_the_evidence_for_a_guess_is_its_explained_chi_square(monkeypatch: pytes
     Streak ends above 40 %, which a wrong angle may reach by chance, multiply the evidence.
     """
     squares = 45.0**2 + 200.0**2 + 100.0**2
-    explained, convincing, _ = _attempt(monkeypatch)
-    assert explained == pytest.approx(squares * 0.6)
-    assert convincing
+    found = _attempt(monkeypatch)
+    assert found.explained == pytest.approx(squares * 0.6)
+    assert found.convincing
     half = _attempt(monkeypatch, ends=0.7)
-    assert half[0] == pytest.approx(squares * 0.3)
-    assert half[1]
+    assert half.explained == pytest.approx(squares * 0.3)
+    assert half.convincing
     wrong = _attempt(monkeypatch, ends=0.6)
-    assert wrong[0] == pytest.approx(squares * 0.2)
-    assert not wrong[1]
-    assert _attempt(monkeypatch, ends=0.2)[0] == pytest.approx(squares * 0.02)
-    assert _attempt(monkeypatch, last_step=2.1)[0] == pytest.approx(0.3 * squares * 0.6)
-    assert _attempt(monkeypatch, last_step=1.9)[0] == pytest.approx(squares * 0.6)
-    assert _attempt(monkeypatch, contradicted=0.5)[0] == pytest.approx(squares * 0.6 * 0.7)
+    assert wrong.explained == pytest.approx(squares * 0.2)
+    assert not wrong.convincing
+    assert _attempt(monkeypatch, ends=0.2).explained == pytest.approx(squares * 0.02)
+    assert _attempt(monkeypatch, last_step=2.1).explained == pytest.approx(0.3 * squares * 0.6)
+    assert _attempt(monkeypatch, last_step=1.9).explained == pytest.approx(squares * 0.6)
+    assert _attempt(monkeypatch, contradicted=0.5).explained == pytest.approx(squares * 0.6 * 0.7)
     # A star is well fitted if its excess chi-square is at most its pixels plus 1 % of its evidence.
-    assert _attempt(monkeypatch, chi2=110.0 + 110.0 + 19.0)[0] == pytest.approx(squares * 0.6)
-    assert _attempt(monkeypatch, chi2=110.0 + 110.0 + 22.0)[0] == pytest.approx((squares - 45.0**2) * 0.6)
-    assert not _attempt(monkeypatch, count=2)[1]
-    assert _attempt(monkeypatch, count=3)[1]
+    assert _attempt(monkeypatch, chi2=110.0 + 110.0 + 19.0).explained == pytest.approx(squares * 0.6)
+    assert _attempt(monkeypatch, chi2=110.0 + 110.0 + 22.0).explained == pytest.approx(
+        (squares - 45.0**2) * 0.6
+    )
+    assert not _attempt(monkeypatch, count=2).convincing
+    assert _attempt(monkeypatch, count=3).convincing
 
 
 def test_a_poor_fit_with_correct_ends_may_be_a_vibration(monkeypatch: pytest.MonkeyPatch) -> None:
-    light = SimpleNamespace(light=np.array([100.0]))
-    joint = np.zeros((1, 11, 11))
-    joint[:, 9, 9] = 1.0
-    shaken = SimpleNamespace(
-        scene=light,
-        solution=SimpleNamespace(joint=joint),
-        evaluation=SimpleNamespace(chi2=np.array([110.0]), pixels=np.array([110.0])),
-        last_step=0.0,
+    assert _attempt(monkeypatch, misfit=2.6).shaken
+    assert not _attempt(monkeypatch, misfit=2.4).shaken
+    assert not _attempt(monkeypatch, ends=0.5, misfit=2.6).shaken
+
+
+@pytest.mark.parametrize(("misfit", "explained"), [(11.0, 50.0), (13.0, 70.0)])
+def test_a_profile_is_learned_if_a_vibration_does_not_explain_a_very_poor_fit(
+    misfit: float, explained: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first: Any = SimpleNamespace(
+        fit=SimpleNamespace(free=np.zeros(SHARED, dtype=np.bool_)), guess=0, ends=1.0
     )
-    assert _attempt(monkeypatch, misfit=2.6, shaken=shaken)[2] is shaken
-    assert _attempt(monkeypatch, misfit=2.4, shaken=shaken)[2] is not shaken
-    assert _attempt(monkeypatch, ends=0.5, misfit=2.6, shaken=shaken)[2] is not shaken
-    assert _attempt(monkeypatch, misfit=2.6)[2] is not None
+    known: Any = {"first": 20.0, "vibration": 50.0, "profile": 70.0}
+    monkeypatch.setattr(first_fits, "misfit", lambda *_: misfit)
+    monkeypatch.setattr(first_fits, "with_vibration", lambda *_: SimpleNamespace(evaluation="vibration"))
+    monkeypatch.setattr(first_fits, "fit_profile", lambda *_: SimpleNamespace(evaluation="profile"))
+    monkeypatch.setattr(first_fits, "_judged", lambda fit, *_: _first_fit(known[fit.evaluation], False, 0.1))
+    assert first_fits._disturbed(_problem(), first).explained == explained
 
 
 def test_a_rejected_motion_is_fitted_again_with_a_vibration(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -613,7 +662,7 @@ def test_a_rejected_motion_is_fitted_again_with_a_vibration(monkeypatch: pytest.
             searched.append(start)
             return start if shows else None
 
-        monkeypatch.setattr(estimate, "_vibrating", vibrating)
+        monkeypatch.setattr(estimate, "with_vibration", vibrating)
         return estimate._fitted(_problem(), MotionResult(StreakStatus.FAILED, 1, 0.2), first)
 
     whole = _fit()

@@ -11,7 +11,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, Pinhole
-from knightcube.vision.streaks import estimate
+from knightcube.vision.streaks import estimate, first_fits
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.fit_windows import cut_windows
@@ -61,7 +61,8 @@ def test_a_defocused_camera_gives_the_rate_within_its_covariance(spread: Spread,
 
 
 def test_without_a_learned_profile_rings_give_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "fit_profile", lambda *_: None)
+    for module in (first_fits, estimate):
+        monkeypatch.setattr(module, "fit_profile", lambda *_: None)
     assert _found(ring(4.0, 2.0), 1).rate is None
 
 
