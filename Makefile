@@ -82,7 +82,7 @@ house: $(TOOLS) ## check the sizes of files, classes and functions
 	$(RUN) -m tests.studies.house
 
 unit: $(TOOLS)  ## run the tests on all cores
-	$(TESTS) -rs --dist loadfile --no-loadscope-reorder --compiled-flights
+	$(TESTS) -rs --dist loadfile --no-loadscope-reorder
 
 fast: $(TOOLS)  ## run the tests that are not slow on all cores
 	$(TESTS) --dist worksteal -m "not slow"

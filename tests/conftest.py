@@ -30,8 +30,7 @@ from hypothesis import settings
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # The tests check the numpy implementations of functions that numba can compile. The compiled implementations
 # are compared with the numpy implementations. With the numpy implementations, results equal recorded results
-# byte for byte, and programs that tests start do not load numba. With the option `--compiled-flights`, the
-# tests in the folders `FLIGHTS` use the compiled implementations in their own process.
+# byte for byte, and programs that tests start do not load numba.
 os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 # While numba compiles a function, it formats messages of rejected overloads that nobody reads.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
@@ -47,13 +46,6 @@ from tests.support import compiled_forms  # noqa: E402  # after the settings abo
 
 LIMIT_S = 0.3
 LONG_S = 1.0
-FLIGHTS = "tests/scenario/", "tests/studies/checks/"
-"""Folders whose tests fly with compiled functions, if the option `--compiled-flights` is set."""
-NUMPY_FLIGHTS = {
-    "tests/scenario/test_demonstration.py",  # the flight of `make demo`, which does not compile
-    "tests/scenario/test_realtime.py",  # in real time, a flight does not use compiled functions
-    "tests/studies/checks/test_executive.py",
-}
 LIST = Path(__file__).with_name("slow.txt")
 ORDER = Path(__file__).with_name("order.txt")
 _spent: dict[str, float] = {}
@@ -69,20 +61,6 @@ def session_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     folder.mkdir(exist_ok=True)
     return folder
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_flights(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Let flights use the compiled functions, as flights do where numba is installed."""
-    if request.config.getoption("--compiled-flights") and _flies(request.node.nodeid):
-        with compiled_forms.in_this_process():
-            yield
-    else:
-        yield
-
-
-def _flies(file: str) -> bool:
-    return file.startswith(FLIGHTS) and file not in NUMPY_FLIGHTS
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -102,7 +80,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         return None
     scheduling = importlib.import_module("xdist.scheduler").LoadFileScheduling(config, log)
     file_of = scheduling._split_scope
-    compiling = _compiling(config)
+    compiling = {
+        path.relative_to(config.rootpath).as_posix()
+        for path in Path(__file__).parent.rglob("test_*.py")
+        if "compiled_forms" in path.read_text(encoding="utf-8")
+    }
 
     def scope_of(nodeid: str) -> str:
         file = str(file_of(nodeid))
@@ -110,15 +92,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     scheduling._split_scope = scope_of
     return scheduling
-
-
-def _compiling(config: pytest.Config) -> set[str]:
-    """Return the files whose tests compile functions."""
-    return {
-        path.relative_to(config.rootpath).as_posix()
-        for path in Path(__file__).parent.rglob("test_*.py")
-        if "compiled_forms" in path.read_text(encoding="utf-8")
-    }
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -137,9 +110,8 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options `--write-slow-list` and `--compiled-flights`."""
+    """Add the option `--write-slow-list`, which writes the durations of the tests."""
     parser.addoption("--write-slow-list", action="store_true", help=f"write {LIST.name} from this run")
-    parser.addoption("--compiled-flights", action="store_true", help="fly with functions compiled by numba")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -148,25 +120,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the listed tests as slow, and sort the files by decreasing duration.
-
-    Flights with compiled functions come after the files that compile most of these functions.
-    """
+    """Mark the listed tests as slow, and sort the files by decreasing duration."""
     listed, of_file = _seconds(LIST), _seconds(ORDER)
     for item in items:
         if _function(item) in listed:
             item.add_marker(pytest.mark.slow)
-    compiled = config.getoption("--compiled-flights")
-    compiling = _compiling(config) if compiled else set()
-
-    def place(item: pytest.Item) -> tuple[int, float]:
-        file = item.nodeid.partition("::")[0]
-        seconds = of_file.get(file, 0.0)
-        if not compiled:
-            return 0, -seconds
-        return 0 if file in compiling else 3 if not seconds else 2 if _flies(file) else 1, -seconds
-
-    items.sort(key=place)
+    items.sort(key=lambda item: -of_file.get(item.nodeid.partition("::")[0], 0.0))
 
 
 def _seconds(path: Path) -> dict[str, float]:

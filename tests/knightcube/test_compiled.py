@@ -12,12 +12,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.compiled import HotFunction, compiled_form_of, in_use
-from tests.support.compiled_forms import (
-    assert_forms_agree,
-    in_this_process,
-    sum_of_squares,
-    sum_of_squares_numpy,
-)
+from tests.support.compiled_forms import assert_forms_agree, sum_of_squares, sum_of_squares_numpy
 
 ROOT = Path(__file__).resolve().parents[2]
 VALUES = np.linspace(-1.0, 2.0, 1_000)
@@ -37,26 +32,6 @@ def test_the_variable_selects_the_numpy_form(monkeypatch: pytest.MonkeyPatch) ->
         raise AssertionError(f"called with {values.size} values")
 
     assert fails(VALUES) == sum_of_squares_numpy(VALUES)
-
-
-@pytest.mark.slow
-def test_flights_of_the_tests_use_the_compiled_form_and_later_tests_do_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
-    calls = []
-
-    def counted(values: FloatArray) -> float:
-        calls.append(values.size)
-        return sum_of_squares_numpy(values)
-
-    monkeypatch.setattr(sum_of_squares, "numpy_form", counted)
-    for _ in range(2):
-        with in_this_process():
-            assert sum_of_squares(VALUES) == pytest.approx(1001.5015015015, rel=1e-9)
-        assert calls == []
-    assert sum_of_squares(VALUES) == sum_of_squares_numpy(VALUES)
-    assert calls == [VALUES.size]
 
 
 @pytest.mark.parametrize(

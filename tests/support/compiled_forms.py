@@ -6,18 +6,14 @@ only the implementations with numpy and with loops are compared.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
-import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
-from unittest import mock
 
 import numpy as np
 
-from knightcube import compiled as compilation
 from knightcube.astro.arrays import FloatArray
 from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
 
@@ -25,30 +21,6 @@ compiles = True
 """Whether the implementations are compiled, and the compiled implementations are compared."""
 compiling_s = 0.0
 """Processor time (s) that the compiled implementations have taken in this process."""
-
-
-_loaded: dict[HotFunction[Any, Any], Callable[..., Any] | None] = {}
-"""Compiled implementations that `in_this_process` has used, which it uses again."""
-
-
-@contextlib.contextmanager
-def in_this_process() -> Iterator[None]:
-    """Let all functions of this process, but not of its child processes, use their compiled implementation.
-
-    The functions use numpy if numba is not installed. Compilations are not reported as warnings.
-    """
-    functions, log = compilation._functions, logging.getLogger(compilation.__name__)
-    level = log.level
-    with mock.patch.object(compilation, "in_use", compilation._numba_is_usable):
-        log.setLevel(logging.ERROR)
-        for hot in functions:
-            hot._chosen = _loaded.get(hot)
-        try:
-            yield
-        finally:
-            log.setLevel(level)
-            for hot in functions:
-                _loaded[hot], hot._chosen = hot._chosen, None
 
 
 def sum_of_squares_numpy(values: FloatArray) -> float:
