@@ -216,7 +216,7 @@ def test_sightings_without_a_position_give_no_orbit() -> None:
     track["number"] = 2
     track["middle_ns"] = [10**9, 3 * 10**9, 8 * 10**9]
     track["measured"][2] = math.nan
-    labels = np.zeros(1, dtype=[("utc_ns", "i8")])
+    labels = np.ones(1, dtype=[("utc_ns", "i8")])
     run = cast(Any, {"track": track, "run": labels})
     (found,) = messages.orbits_of(run)
     assert (found.number, found.sightings, found.span, found.orbit) == (2, 2, 2.0, None)

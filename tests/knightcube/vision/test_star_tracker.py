@@ -389,10 +389,11 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
         StarTracker(camera="lens")  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match=r"settings\.lens: .* as CameraKnowledge\(\*\*accuracy\)"):
         StarTracker(camera=lens, settings=SolveSettings(lens={"centre": 0.1}))  # type: ignore[arg-type]
-    wrong: tuple[Any, ...] = (-1.0, math.nan, "0.1")
+    deviation = "give a standard deviation of 0"
+    wrong: tuple[tuple[Any, str], ...] = ((-1.0, deviation), (math.nan, deviation), ("0.1", "give a number"))
     for name in ("focal_length", "centre", "distortion", "line_time", "psf_sigma"):
-        for value in wrong:
-            text = re.escape(f"settings.lens.{name}: {value!r}: give a standard deviation of 0")
+        for value, remedy in wrong:
+            text = re.escape(f"settings.lens.{name}: {value!r}: {remedy}")
             knowledge = replace(CameraKnowledge(), **{name: value})
             with pytest.raises(ArgumentError, match=text):
                 StarTracker(camera=lens, settings=SolveSettings(lens=knowledge))

@@ -116,7 +116,7 @@ def navigation(
     """Return the navigation of a body, its mocked feed and mocked facts; the IMU returns `polled`."""
     unit, estimation, services = Mock(), Mock(), Mock()
     unit.poll.return_value, services.recorder.epoch_ns = polled, 0
-    link = Mock(bad_checksum=0, discarded_bytes=0, out_of_range=0, not_finite=0, last_byte_ns=0)
+    link = Mock(bad_checksum=0, discarded_bytes=0, out_of_range=0, not_finite=0, last_byte_ns=0, upsets=0)
     unit.link.return_value = link
     estimation.uses_readings_without_rate, estimation.is_accurate = uses, accurate
     settings = NavigationSettings(100_000_000, 1_200_000_000, PERIOD_NS)

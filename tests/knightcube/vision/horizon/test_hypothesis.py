@@ -67,7 +67,7 @@ def test_a_small_disc_is_not_a_limb_from_low_orbit() -> None:
     assert low.nadir is None
     assert any_.nadir is not None
     assert 27e6 < any_.nadir.altitude < 30e6
-    with pytest.raises(UsageError, match="increasing range"):
+    with pytest.raises(UsageError, match="give the lower altitude first"):
         HorizonSettings(altitudes=FAR[::-1])
 
 

@@ -68,5 +68,5 @@ def test_fractions_lie_between_zero_and_one(name: str) -> None:
 def test_the_range_of_altitudes_increases_from_fifty_kilometres() -> None:
     HorizonSettings(altitudes=(50e3, 51e3))
     for wrong in ((49e3, 1e6), (6e5, 6e5), (1e5, np.inf)):
-        with pytest.raises(UsageError, match="increasing range from 50 km"):
+        with pytest.raises(UsageError, match="give the lower altitude first, and at least 50 km"):
             HorizonSettings(altitudes=wrong)
