@@ -125,9 +125,9 @@ class LogTail:
     def new(self) -> dict[str, PacketArray]:
         """Return the packets that were written since the last call, by name. Raises UsageError.
 
-        The events are sorted by time. An event that the flight held back may follow later events of an
-        earlier call. A long log is returned in portions by several calls, and `behind` is true until its end
-        is reached.
+        The events are sorted by time. An event that the flight wrote late may be older than events that an
+        earlier call returned. A long log is returned in portions by several calls, and `behind` is true until
+        its end is reached.
         """
         # After an error, the bytes that were already read remain in `_rest`.
         self._rest += self._read()

@@ -7,7 +7,7 @@ space system, one parameter per array element (`rate_1`) and per bit of a bit fi
 (`health_facts_gyro_lost`), names without `. / : [ ]`, zero-terminated texts, and a header of fixed values in
 each telecommand. A parameter is named `<packet>_<field>`. The command `point` has one form for each pointing
 goal, such as `point-ground`. The arguments of `point` are named after the goal's parameters, with angles in
-degrees. Yamcs counts mission time from the epoch in the document.
+degrees. Yamcs counts mission time from the epoch that the document states.
 """
 
 from __future__ import annotations

@@ -121,7 +121,8 @@ def assemble(
     """Build the hardware of `config` in the world of its simulation `section`, and connect it to `wires`.
 
     The function `now_ns` returns the simulation time. The functions `expose` and `expose_wide` replace the
-    camera renderers; in real time they run in another process. Raises ConfigError for an invalid world.
+    camera renderers; in real time they run in another process. Raises ConfigError if the configuration of the
+    simulated world is invalid.
     """
     # In real time, the clock advances during assembly, so all devices get the same start time.
     start_ns = now_ns()

@@ -485,7 +485,7 @@ class CoilResponse:
         sure = judged and sigma < settings.sure
         weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < _HIGHEST_FEEBLE
         exact = judged and alone and is_steady and sigma < _EXACT
-        # The dipole of a coil that was corrected before may be several times the dipole assumed at present.
+        # After an earlier correction, the dipole of a coil may be several times the dipole assumed now.
         corrected = float(self.largest[axis]) > LARGEST_GAIN
         wrong = is_reversed or (corrected and exact and gain + 3.0 * sigma < -LEAST_GAIN)
         holds = (  # in the order of `Finding`

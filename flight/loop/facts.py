@@ -395,7 +395,7 @@ class StreamWatch:
             return StreamState.STALE
         if not self._valid:
             return StreamState.INVALID
-        # The fraction is rounded so that exactly 80 % is not slow. NaN, an unknown rate, compares false.
+        # The ratio is rounded so that exactly 80 % is not slow. A stream of unknown rate (NaN) is not slow.
         if round(self.rate(now_ns) / self.stream.rate_hz, 9) < LEAST_RATE:
             return StreamState.SLOW
         return StreamState.GOOD

@@ -542,8 +542,9 @@ class StateKeeper:
         """Load the state, increase its boot count, and store it as running.
 
         The digest `devices` identifies the present devices; parameters learned for other devices are
-        discarded. The argument `boots` is the highest boot number that `note_boot` has written. If the state
-        has a smaller boot count, the state is outdated or lost, and the last boot counts as unclean.
+        discarded. The argument `boots` is the highest boot number that `note_boot` has written. If the boot
+        count of the state is smaller than `boots`, the state is outdated or lost, and the last boot counts as
+        unclean.
         """
         self._store, self._notices, self._clock = store, notices, clock
         self._begun_ns = clock.now_ns()

@@ -410,7 +410,7 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     while the attitude is fine and the body rotates slowly. An instant is unobstructed if the true body rate
     is below `camera.max_rate` and the true boresight is outside `pointing.cones` of Sun and Earth. An instant
     is measured if a frame exposed between this instant and the next gives an attitude or a rate. The longest
-    gap is the longest total time of consecutive unobstructed instants without a measurement. Returns None
+    gap is the longest time without a measurement, in which obstructed instants do not count. Returns None
     without a star camera or a truth log.
     """
     camera = config.camera

@@ -27,7 +27,7 @@ class ImuReading(NamedTuple):
     """One sample of the inertial unit, in the body frame and the mission's reference frame.
 
     Attributes:
-        time_ns: host time of the sample, ns, computed as arrival time minus transmission time of the packet.
+        time_ns: host time of the sample, ns: the packet's time of arrival minus its transmission's duration.
         arrival_ns: host time at which the last byte of the packet was received, ns.
         device_time_ns: time of the unit's own clock since the unit was started, ns.
         quaternion: (4,) rotation of the reference frame into the body frame, scalar last.

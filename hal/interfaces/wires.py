@@ -17,7 +17,7 @@ from hal.interfaces.guardian import CoilReach
 
 SECOND_NS = 1_000_000_000
 LATE_NS = 25_000_000
-"""Lateness (ns) of an emulated device that affects a flight: the period of a control cycle."""
+"""Lateness (ns) from which a late emulated device affects a flight: the period of a control cycle."""
 
 
 class Ticker(Protocol):

@@ -251,7 +251,7 @@ class PointingTargets:
         return Target(KEPT, PointingTargetLaw(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return True, because the coils can hold every attitude on average over one orbital revolution."""
+        """Return True: averaged over an orbit, the coils can produce the torque that holds any attitude."""
         return True
 
     def speed(self, estimate: Estimate) -> float:

@@ -164,7 +164,7 @@ class _Fit:
 
 
 def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return the distances (n,), m, between positions (n, 3), ICRS, and elements at Julian dates (n,).
+    """Return the distances (n,), m, of positions (n, 3), ICRS, from those by elements at Julian dates (n,).
 
     Raises UsageError for elements that are not valid or that SGP4 cannot propagate to the given dates.
     """

@@ -42,8 +42,8 @@ from knightcube.errors import UsageError
 def supply_power(current: FloatArray, voltage: float) -> FloatArray:
     """Return the power V |I|, W, that coils take from the supply for mean currents over a PWM period, A.
 
-    With the voltage across a driven coil (`coils.supply_voltage`), the result is the power at the coils. With
-    the bus voltage before the H-bridge, the result is the power taken from the bus.
+    If `voltage` is that across a driven coil (`coils.supply_voltage`), the power at the coils is returned. If
+    it is the voltage of the bus before the H-bridge, the power taken from the bus is returned.
     """
     return np.asarray(voltage * np.abs(current))
 

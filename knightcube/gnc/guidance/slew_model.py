@@ -566,7 +566,7 @@ class SlewTask:
         time_cost: weight of the duration in the cost, W. If the time cost is None, the duration is fixed; if
             it is MINIMUM_TIME, only the duration is minimised.
         cones: exclusion cones that are avoided throughout the slew.
-        nodes: number of collocation intervals.
+        nodes: number of collocation intervals, which is one less than the number of nodes.
     """
 
     craft: SlewCraft

@@ -142,8 +142,8 @@ _ROOM = math.radians(0.005)
 the camera axis approaches a cone by less than this angle, and therefore does not enter the cone."""
 
 _RESERVE = 0.3
-"""Fraction of the deviation of a clearance from its chord that is added to the margin (see `_margins`). A
-larger fraction means fewer corrections of paths, but a larger distance from the cones and more heat."""
+"""Part of the deviation described in `_margins` that is added to the margin. A larger part means fewer
+corrections of paths, but a larger distance from the cones and more heat."""
 
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
@@ -259,7 +259,8 @@ def _margins(task: SlewTask, path: SlewPath) -> FloatArray:
 
     Between two points, the camera axis may be closer to a cone than at both points. The difference depends on
     where between the points the axis is closest to the cone, and is at most the deviation of the clearance
-    from its chord. The margin is the difference on the given path plus a part of this deviation.
+    from the straight line through its values at both points. The margin is the difference on the given path
+    plus a part of this deviation.
     """
     clear = _clearances(task, path)
     ends, middles = clear[:, ::_DENSE], clear[:, _DENSE // 2 :: _DENSE]
@@ -311,7 +312,7 @@ def _excess(task: SlewTask, least: float) -> float:
 
 
 def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
-    """Return the plan of a path, or None if the integration along the path fails."""
+    """Return the plan that follows a path, or None if the integration of the motion along the path fails."""
     equations, scale = found.equations, found.equations.scale
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging integration may overflow
         try:

@@ -97,7 +97,7 @@ class HorizonSearch:
 
         The current of a rest-to-rest slew of duration T scales with 1/T^2, so solutions without limits give
         an estimate of the shortest feasible duration. The nonlinear program with a free duration starts from
-        this estimate. If the program has no solution, the search is repeated from a longer duration.
+        this estimate. If it has no solution, the search is repeated from a longer duration.
         """
         if self.warm is not None:
             program = self.program_at(asked)

@@ -79,7 +79,7 @@ class ObjectPatch:
     ceiling: float
 
     def image(self, middle: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the image (rows, columns) of a trail of one count with a midpoint and half extent (2,)."""
+        """Return the image (rows, columns), whose sum is 1, of a trail with midpoint and half extent (2,)."""
         rows, columns = self.light.shape
         return spread_over(_trail(middle - self.corner, half)[0], columns, rows, self.psf)
 

@@ -45,7 +45,7 @@ from knightcube.vision.startracker.verification import VerificationSettings, not
 
 
 def scale_steps(field: StarField, tolerance: float) -> FloatArray:
-    """Return the limits of s steps of the image scale and the scales in their middles (2 s + 1,), ascending.
+    """Return the image scales (2 s + 1,) at the s + 1 limits and s middles of s steps, in ascending order.
 
     Side ratios in a step differ from the ratios in its middle by at most `tolerance`. At a field angle of
     tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2 / 2 across the radius.

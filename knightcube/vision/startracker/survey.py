@@ -191,8 +191,8 @@ def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
 def without_hot_pixels(pixels: Image, most: int) -> tuple[Image, Background]:
     """Return a frame and its background; if more than `most` pixels are hot, the hot pixels are replaced.
 
-    A few hot pixels are kept, because they are measured as sources and flagged. The thousands of hot pixels
-    of a damaged sensor would fill the list of sources instead of stars, and would increase the noise.
+    A few hot pixels are kept: each is measured as a source, which is then flagged. The thousands of hot
+    pixels of a damaged sensor would fill the list of sources instead of stars, and would increase the noise.
     """
     background = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
     row, column = hot_pixels_above(pixels, background, most)

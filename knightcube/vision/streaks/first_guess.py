@@ -562,7 +562,7 @@ def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float
         return [(float(np.max(reach[cut])), 0.0)] if cut.any() else []
     nearness = np.exp(-0.5 * ((candidates[:, None] - candidates) / np.hypot(spread[:, None], spread)) ** 2)
     votes = nearness @ weight
-    # A region that is longer than the rotation angle contradicts this angle, or is a blend of two stars.
+    # A region whose arc is longer than the rotation angle contradicts this angle, or is a blend of two stars.
     long = guess.agree & (guess.speed * reach > 20.0)
     longer = (reach - 10.0 / guess.speed)[long] > candidates[:, None] + 3.0 * spread[:, None]
     doubted = votes - longer @ np.sqrt(regions.flux[long])

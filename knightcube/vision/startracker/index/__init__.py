@@ -218,7 +218,7 @@ def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
 CELLS = 128
 """Number of cells (bins) into which the range 0 to 1 of a triangle's side ratio is divided."""
 FINE = 256
-"""Number of positions within a cell."""
+"""Number of steps into which a cell is divided, for the stored side ratio of a triangle."""
 SIZES = 1 << 16
 OCTAVE = SIZES // 8
 """Number of steps of a triangle's longest side per factor of two; `SIZES` steps end at the chord 1."""
@@ -259,7 +259,7 @@ class TriangleIndex:
         return len(self.entry)
 
     def __repr__(self) -> str:
-        """Return the number of triangles, without the arrays."""
+        """Return the number of triangles; the arrays are not read."""
         return f"<TriangleIndex: {len(self)} triangles>"
 
     @cached_property
