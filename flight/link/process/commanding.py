@@ -10,10 +10,9 @@ otherwise.
 The schedule of time-tagged commands is stored in two copies, so that one valid copy exists even if the
 process is killed while writing. A schedule entry is deleted from disk before its command is executed, so that
 no command is executed twice. A command that is more than ten seconds late, for example because the flight
-computer was off, is reported as failed and not executed. It stays in the schedule for a day, and is scheduled
-again if the clock, which was wrong, is set back to a time before that of the command. A scheduled command
-also fails in mode SAFE, because only the ground may decide how to leave SAFE. After a start, no scheduled
-command is executed until telemetry has shown the current mode.
+computer was off, is reported as failed and not executed. A scheduled command also fails in mode SAFE, because
+only the ground may decide how to leave SAFE. After a start, no scheduled command is executed until telemetry
+has shown the current mode.
 """
 
 from __future__ import annotations
@@ -378,8 +377,6 @@ _PAST_ENTRIES = 8
 """Number of executed or failed entries whose results `list-schedule` reports."""
 LATEST_NS = 10 * SECOND_NS
 """Maximum delay (ns) with which a scheduled command is still executed."""
-KEPT_NS = 86_400 * SECOND_NS
-"""Time (ns) for which a late command is kept, because the clock may be wrong."""
 
 _WITH_MODE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big"): LAYOUTS[packet.name] for packet in (MODE, HEALTH)
@@ -393,7 +390,6 @@ class Scheduling:
         """Execute the entries of a timetable; commands to the `foreign` modes are refused."""
         self._timetable, self._foreign = timetable, foreign
         self._mode: int | None = None
-        self._late_ns: dict[int, int] = {}  # times at which entries were found late, by number
         # Texts of the newest entries that were due and their results, by SPI and counter.
         self._past: dict[tuple[int, int], tuple[str, str]] = {}
 
@@ -427,37 +423,20 @@ class Scheduling:
                     return [done]
                 case Listing():
                     texts = [f"{own}: past entry {text}" for text, own in self._past.values()]
-                    late = [entry.number in self._late_ns for entry in self._timetable.entries]
-                    texts += [
-                        f"not executed, late: {text_of(entry)}" if is_late else text_of(entry)
-                        for is_late, entry in zip(late, self._timetable.entries, strict=True)
-                    ]
+                    count = len(self._timetable.entries)
+                    texts += [text_of(entry) for entry in self._timetable.entries]
                     lines = [replace(done, stage=Stage.STARTED, text=text) for text in texts]
-                    return [*lines, replace(done, text=f"{late.count(False)} scheduled")]
+                    return [*lines, replace(done, text=f"{count} scheduled")]
         except (CommandError, TimetableError) as error:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
 
-    def due(self, utc_ns: int, now_ns: int) -> Iterator[Report | Sent]:
-        """Yield each due command after its entry was removed, or a report why it is not executed.
-
-        `now_ns` is the time of a clock that is never set. The entry of a late command is removed later.
-        """
+    def due(self, utc_ns: int) -> Iterator[Report | Sent]:
+        """Yield each due command after its entry was removed, or a report why it is not executed."""
         for entry in self._timetable.entries:
-            known, spi, counter = entry.number in self._late_ns, entry.spi, entry.counter
-            if entry.at_ns > utc_ns:
-                if known:
-                    del self._late_ns[entry.number]
-                    text = f"the clock was set back, scheduled again: {text_of(entry)}"
-                    yield Report(spi, counter, Stage.ACCEPTED, SCHEDULE.name, text)
-                continue
-            is_late = known or utc_ns - entry.at_ns > LATEST_NS
-            problem = f"it is {_utc(utc_ns)}" if is_late else self._problem(entry)
-            if is_late and not known:
-                self._late_ns[entry.number] = now_ns
-                text = f"not executed, {problem}: {text_of(entry)}"
-                yield Report(spi, counter, Stage.FAILED, SCHEDULE.name, text)
-            if (now_ns - self._late_ns[entry.number] < KEPT_NS) if is_late else self._mode is None:
-                continue
+            unknown = self._mode is None and utc_ns - entry.at_ns <= LATEST_NS
+            if entry.at_ns > utc_ns or unknown:
+                return
+            problem = self._problem(entry, utc_ns)
             try:
                 self._timetable.remove(entry.number)
             except TimetableError as error:  # the entry is still on disk, so a restart could execute it again
@@ -466,16 +445,17 @@ class Scheduling:
             while len(self._past) >= _PAST_ENTRIES:
                 del self._past[next(iter(self._past))]
             result = f"not executed, {problem}" if problem else "sent to the flight"
-            self._past[spi, counter] = text_of(entry), result
-            if self._late_ns.pop(entry.number, None) is not None:
-                continue  # was reported when it was found late
+            self._past[entry.spi, entry.counter] = text_of(entry), result
             if problem:
-                yield Report(spi, counter, Stage.FAILED, SCHEDULE.name, f"{result}: {text_of(entry)}")
+                text = f"{result}: {text_of(entry)}"
+                yield Report(entry.spi, entry.counter, Stage.FAILED, SCHEDULE.name, text)
             else:
-                yield Sent(spi, counter, command_of_words(entry.command, stored=True))
+                yield Sent(entry.spi, entry.counter, command_of_words(entry.command, stored=True))
 
-    def _problem(self, entry: Entry) -> str:
+    def _problem(self, entry: Entry, utc_ns: int) -> str:
         """Return why a due command must not be executed, or an empty text if it may be executed."""
+        if utc_ns - entry.at_ns > LATEST_NS:
+            return f"it is {_utc(utc_ns)}"
         if self._mode == Mode.SAFE:
             return "the flight is in mode SAFE"
         try:
@@ -491,10 +471,6 @@ class Scheduling:
             raise CommandError(f"{scheduled.words}: this body has no mode {mode.label}")
         if at_ns <= utc_ns:
             raise TimetableError(f"{scheduled.at} has passed: it is {_utc(utc_ns)}")
-        entries = self._timetable.entries
-        late = [entry.number for entry in entries if entry.number in self._late_ns]
-        if late and len(entries) >= MOST_ENTRIES:
-            self._timetable.remove(late[0])
         return text_of(self._timetable.add(at_ns, done.spi, done.counter, scheduled.words))
 
 

@@ -638,7 +638,7 @@ class Station:
         if self._utc_offset_ns is None and waits:
             return
         utc_ns = self._utc_ns()
-        entries = self._scheduling.due(utc_ns, now_ns)
+        entries = self._scheduling.due(utc_ns)
         while not self._control.is_full and (due := next(entries, None)) is not None:
             if isinstance(due, Sent):
                 self._hand_over(due, self._commands.pack(due.command, utc_ns), now_ns)

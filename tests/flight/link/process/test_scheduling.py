@@ -28,7 +28,6 @@ from flight.link.files.store import overwrite
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import (
     AT_MOST,
-    KEPT_NS,
     LATEST_NS,
     MOST_ENTRIES,
     Report,
@@ -323,8 +322,8 @@ def test_a_command_is_due_from_its_time_on_for_ten_seconds(
     mode: Mode | None, delay_ns: int, outcome: str, tmp_path: Path
 ) -> None:
     scheduling, at_ns = _scheduling(tmp_path, mode)
-    found = list(scheduling.due(at_ns + delay_ns, 0))
-    assert len(Timetable(tmp_path).entries) == (outcome in {"waits", "late"})
+    found = list(scheduling.due(at_ns + delay_ns))
+    assert len(Timetable(tmp_path).entries) == (outcome == "waits")
     if outcome == "waits":
         assert found == []
         return
@@ -337,45 +336,6 @@ def test_a_command_is_due_from_its_time_on_for_ten_seconds(
     assert isinstance(one, Report)
     assert one.stage is Stage.FAILED
     assert {"late": "not executed, it is", "safe": "the flight is in mode SAFE"}[outcome] in one.text
-
-
-def test_a_late_command_is_scheduled_again_only_if_the_clock_is_set_back_before_its_time(
-    tmp_path: Path,
-) -> None:
-    scheduling, at_ns = _scheduling(tmp_path)
-    year_ns = 365 * 86_400 * 10**9
-
-    def reports(utc_ns: int) -> list[tuple[Stage, str]]:
-        found = list(scheduling.due(utc_ns, 0))
-        return [(one.stage, one.text.partition(",")[0]) for one in found if isinstance(one, Report)]
-
-    assert reports(at_ns + year_ns) == [(Stage.FAILED, "not executed")]
-    done = Report(1, 12, Stage.COMPLETED, "list-schedule", "")
-    listed = [one.text for one in scheduling.obey(Listing(), done, 0)]
-    assert listed == ["not executed, late: 1: 2027-01-15T08:00:00Z ping 3", "0 scheduled"]
-    for utc_ns in (at_ns + year_ns, at_ns + LATEST_NS, at_ns):
-        assert reports(utc_ns) == [], "reported once, and not executed after that"
-    assert reports(at_ns - 1) == [(Stage.ACCEPTED, "the clock was set back")]
-    assert reports(at_ns - 1) == []
-    (sent,) = scheduling.due(at_ns, 0)
-    assert isinstance(sent, Sent)
-    assert Timetable(tmp_path).entries == ()
-
-
-def test_a_late_command_is_kept_for_a_day_or_until_its_place_is_needed(tmp_path: Path) -> None:
-    scheduling, at_ns = _scheduling(tmp_path)
-    late_ns = at_ns + LATEST_NS + 1
-    assert len(list(scheduling.due(late_ns, 5))) == 1
-    assert list(scheduling.due(late_ns, 4 + KEPT_NS)) == []
-    assert len(Timetable(tmp_path).entries) == 1
-    assert list(scheduling.due(late_ns, 5 + KEPT_NS)) == []
-    assert Timetable(tmp_path).entries == ()
-    for number in range(MOST_ENTRIES):
-        scheduling._timetable.add(at_ns, 1, number, "ping 3")
-    assert len(list(scheduling.due(late_ns, 0))) == MOST_ENTRIES
-    done = Report(1, 99, Stage.COMPLETED, "schedule", "")
-    (answer,) = scheduling.obey(Scheduled("2099-01-01T00:00:00", "ping 4"), done, late_ns)
-    assert (answer.stage, len(Timetable(tmp_path).entries)) == (Stage.COMPLETED, MOST_ENTRIES)
 
 
 @pytest.mark.parametrize(("early_ns", "scheduled"), [(1, True), (0, False), (-1, False)])
@@ -456,20 +416,3 @@ def test_the_schedule_follows_the_utc_of_the_flight(link: BothEnds, days: int) -
     link.record(label(link, link.clock.utc_ns() + round(simulated.total_seconds()) * 10**9))
     fly(link, 16)
     assert [unpack(data) for data in link.obeyed] == [Ping(5), Ping(6)], texts(link, later)
-
-
-def test_a_wrong_clock_of_the_flight_loses_no_scheduled_command(link: BothEnds) -> None:
-    begun_ns, years_ns = link.clock.utc_ns(), 10 * 365 * 86_400 * 10**9
-    link.record(label(link, begun_ns))
-    fly(link, 2)
-    counter = send(link, Scheduled(in_seconds(link, 60), "ping 5"))
-    link.record(label(link, link.clock.utc_ns() + years_ns))
-    fly(link, 3)
-    assert link.stages(counter)[-1] == "failed"
-    link.restart()
-    fly(link, 3)
-    assert link.obeyed == []
-    link.record(label(link, link.clock.utc_ns()))
-    fly(link, 60)
-    assert [unpack(data) for data in link.obeyed] == [Ping(5)]
-    assert link.stages(counter)[-3:] == ["accepted", "started", "completed"]
