@@ -186,8 +186,8 @@ class Vault:
                     )
                 path.chmod(0o600)
         self.restored = self.rebuilt = False
-        """Whether the primary command SPI is refused because its association is outdated (`restored`), and
-        whether the folder was lost and made again (`rebuilt`)."""
+        """Whether the primary command SPI is refused because its association is outdated (`restored`), or
+        because its association was lost (`rebuilt`)."""
         if self._witness is not None:
             spis = (*COMMAND_SPIS, *TELEMETRY_SPIS)
             stored = {spi: max(self._copies(spi), default=None) for spi in spis}
@@ -196,7 +196,8 @@ class Vault:
                 if one is not None and not self._witness.outdates(one):
                     self._witness.write(one)
                 elif spi != COMMAND_SPIS[0] and spi in known and (rebuild or not is_lost):
-                    self.rebuilt |= self.write(known[spi]) > 0 and is_lost
+                    self.write(known[spi])
+            self.rebuilt = COMMAND_SPIS[0] in known and self.copies(COMMAND_SPIS[0]) == 0
             self.restored = self.copies(COMMAND_SPIS[0]) > 0 and self.read(COMMAND_SPIS[0]) is None
 
     @property

@@ -21,7 +21,7 @@ from flight.app.devices import open_camera
 from flight.schema.devices import driver_of, fitted_devices
 from flight.schema.sections import Config
 from ground.bringup.diagnosis import Finding, Samples
-from hal.drivers.current_monitors import config_for
+from hal.drivers.current_monitors import BUS_32_V, config_for
 from hal.drivers.gps import BAUD_RATES as GPS_BAUD_RATES
 from hal.drivers.vn100 import BAUD_RATES
 from hal.drivers.vn100_protocol import StreamParser
@@ -280,8 +280,9 @@ class Session:
 
 _PCA9685 = [0xE2, 0xE4, 0xE8, 0xE0]
 """Registers 2 to 5 (SUBADR1 to ALLCALLADR) of a PCA9685, which our drivers leave at their power-on values."""
-_INA219 = {0x399F, *(config_for(bits) for bits in range(4))}
-"""Values of an INA219's configuration register after power-on (0x399F), and as set by our driver."""
+_INA219 = {0x399F, *(config_for(bits) & ~bus for bits in range(4) for bus in (0, BUS_32_V))}
+"""Values of an INA219's configuration register after power-on (0x399F), and as set by our driver. Earlier
+versions of our driver set the range of the bus voltage to 16 V."""
 _ADDRESSES = [address for address in range(0x08, 0x78) if address != 0x70]
 """7-bit addresses without the reserved ones and without 0x70, to which every PCA9685 answers."""
 _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}

@@ -522,10 +522,16 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
     return layout
 
 
-def set_exactly(device: VideoDevice, path: str, what: str, control: int, value: int) -> None:
-    """Set a control. Raises Refused if the camera keeps another value, for example because of its step."""
+_GAIN_STEPS = 16
+"""Smallest number of steps of a gain control; a gain that differs by more than a step is refused."""
+
+
+def set_checked(
+    device: VideoDevice, path: str, what: str, control: int, value: int, tolerance: int = 0
+) -> None:
+    """Set a control. Raises Refused if the resulting value differs by more than the tolerance."""
     actual = device.set_control(control, value)
-    if actual != value:
+    if abs(actual - value) > tolerance:
         cure = "`v4l2-ctl --list-ctrls` lists the values of each control and its step"
         raise Refused(path, f"{what} is {actual} after {value} was set: {cure}")
 
@@ -533,7 +539,7 @@ def set_exactly(device: VideoDevice, path: str, what: str, control: int, value: 
 def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
     """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange."""
     if device.control_range(AUTO_GAIN) is not None:
-        set_exactly(device, settings.path, "automatic gain", AUTO_GAIN, 0)
+        set_checked(device, settings.path, "automatic gain", AUTO_GAIN, 0)
     gain = settings.gain
     if gain is None:
         return
@@ -542,7 +548,9 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
         if known is not None:
             if not known[0] <= gain <= known[1]:
                 raise OutOfRange(settings.path, "gain", gain, *known, "")
-            set_exactly(device, settings.path, "gain", control, gain)
+            # Many cameras round the gain to their steps.
+            tolerance = max(1, (known[1] - known[0]) // _GAIN_STEPS)
+            set_checked(device, settings.path, "gain", control, gain, tolerance)
             return
     raise Refused(settings.path, "has no adjustable gain: omit `gain`")
 
@@ -556,7 +564,7 @@ def manual_exposures(name: str, device: VideoDevice, card: str) -> tuple[int, in
     if exposures is None:
         raise Refused(name, f"{card} has no exposure control in units of time (exposure_absolute)")
     if device.control_range(EXPOSURE_AUTO) is not None:
-        set_exactly(device, name, "automatic exposure", EXPOSURE_AUTO, EXPOSURE_MANUAL)
+        set_checked(device, name, "automatic exposure", EXPOSURE_AUTO, EXPOSURE_MANUAL)
     return exposures
 
 

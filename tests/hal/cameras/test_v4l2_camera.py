@@ -373,7 +373,7 @@ def test_the_camera_is_set_to_manual_with_its_gain_and_time_between_frames(
 @pytest.mark.parametrize(
     ("control", "kept", "message"),
     [
-        (v4l2.GAIN, 40, "gain is 40 after 42 was set"),
+        (v4l2.GAIN, 35, "gain is 35 after 42 was set"),
         (v4l2.AUTO_GAIN, 1, "automatic gain is 1 after 0 was set"),
         (v4l2.EXPOSURE_AUTO, 3, "automatic exposure is 3 after 1 was set"),
     ],
@@ -385,6 +385,11 @@ def test_a_camera_that_does_not_keep_a_control_is_refused(
     kernel.stubborn[control] = kept
     with pytest.raises(Refused, match=message):
         video_rig(kernel, clock, gain=42)
+
+
+def test_a_camera_may_round_its_gain_to_a_step(kernel: IoctlCamera, clock: ManualClock) -> None:
+    kernel.stubborn[v4l2.GAIN] = 48
+    video_rig(kernel, clock, gain=42).camera.close()
 
 
 @pytest.mark.parametrize(
