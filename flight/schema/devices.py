@@ -47,6 +47,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, coil_field, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
+from knightcube.vision.frame import LONGEST_LINE_TIME
 from knightcube.vision.horizon_camera_job import polygon_mask
 from knightcube.vision.startracker.survey import PSF_SIGMAS
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
@@ -512,7 +513,7 @@ class Camera(Section, frozen=True, kw_only=True):
     read_noise: Positive = 10.0
     saturation: Positive | None = None
     psf_sigma: Annotated[float, Meta(ge=PSF_SIGMAS[0], le=PSF_SIGMAS[1])] = 1.0
-    line_time: NotNegative | None = None
+    line_time: Annotated[float, Meta(ge=0.0, le=LONGEST_LINE_TIME)] | None = None
     estimator: Estimator = "likelihood"
     star_tracker: StarTrackerSection | None = None
     objects: ObjectTracking | None = None

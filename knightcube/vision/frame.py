@@ -502,7 +502,7 @@ def count_of_floats(image: Image) -> float:
     return (spread or float(sample.std()) or 1.0) / _FLOATING_NOISE
 
 
-_LONGEST_LINE_TIME = 0.01
+LONGEST_LINE_TIME = 0.01
 """Largest accepted line time of a rolling shutter, s per row."""
 
 
@@ -517,8 +517,8 @@ def check_detector(settings: Any, kind: type[object]) -> None:
     if settings.saturation is not None and not settings.saturation > 0.0:
         raise ArgumentError("settings.saturation", f"{settings.saturation}: give a positive number of counts")
     line_time = getattr(settings, "line_time", None)
-    if line_time is not None and not abs(line_time) <= _LONGEST_LINE_TIME:
-        raise ArgumentError("settings.line_time", f"{line_time}: give at most {_LONGEST_LINE_TIME} s per row")
+    if line_time is not None and not abs(line_time) <= LONGEST_LINE_TIME:
+        raise ArgumentError("settings.line_time", f"{line_time}: give at most {LONGEST_LINE_TIME} s per row")
 
 
 def gain_in_counts(gain: float, unit: float) -> float:

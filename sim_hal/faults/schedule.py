@@ -67,7 +67,7 @@ def parse(text: str) -> ScheduledFault:
         same = [other for other in CATALOGUE if other.startswith(f"{device}:")]
         near = difflib.get_close_matches(name.lower(), same or list(CATALOGUE), n=1, cutoff=0.0)
         rest = f" ({device} has {', '.join(other.partition(': ')[2] for other in same)})" if same else ""
-        raise UsageError(f"fault {text!r}: there is no fault {name!r}, did you mean {near[0]!r}?{rest}")
+        raise UsageError(f"fault {text!r}: {name!r} is an unknown fault, did you mean {near[0]!r}?{rest}")
     at = _seconds(found["at"], "@", text) if found["at"] is not None else 0.0
     span = _seconds(found["span"], "for", text) if found["span"] is not None else None
     if span == 0.0:

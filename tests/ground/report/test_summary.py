@@ -306,7 +306,7 @@ def test_a_control_packet_that_is_missing_from_the_log_does_not_count_as_a_skipp
 def test_missing_cycles_and_skipped_slots_in_one_gap_are_distinguished(
     lost: int, slots: int, expected: tuple[int, int]
 ) -> None:
-    """Of `slots` slots without a packet, the loop ran a cycle in `lost` slots, whose packets are missing."""
+    """The log has no packet of `slots` slots: `lost` packets are missing, and the loop skipped the others."""
     packer, zero = Packer(), {f.name: [0] * f.count if f.count > 1 else 0 for f in CONTROL.fields}
     packets = [packer.pack(CONTROL, k, {**zero, "cycle": k}) for k in range(lost + 1)]
     packets.append(packer.pack(CONTROL, lost + 1, {**zero, "cycle": slots + 1}))
