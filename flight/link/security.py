@@ -278,16 +278,20 @@ class Vault:
     def _copies(self, name: int | str) -> list[Association]:
         found = []
         for copy in COPIES:
-            try:
-                data = read_regular(self._path(name, copy), _RECORD.size + _CRC_BYTES)
-            except OSError:
-                continue
+            data = None
+            # A copy that one failed access to the disk hides would be replaced by an older association.
+            for _ in range(_READ_TRIES):
+                with suppress(OSError):
+                    data = read_regular(self._path(name, copy), _RECORD.size + _CRC_BYTES)
+                    break
             association = None if data is None else decode(data)
             if association is not None and str(association.spi) == str(name).partition("-")[0]:
                 found.append(association)
         return found
 
 
+_READ_TRIES = 3
+"""Number of attempts to read a stored association."""
 _ID_BYTES = 8
 _MOST_IDS_BYTES = 1 << 16
 

@@ -5,11 +5,16 @@ The satellite detects the backup by the reference folder (`witness`), which back
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from flight.link import security
+from flight.link.files.store import read_regular
 from flight.link.frames import TELEMETRY_MASK
 from flight.link.process.commanding import Timetable
 from flight.link.security import Association, Refusal, RefusedError, Sealer, Vault, new_key
@@ -167,6 +172,24 @@ def test_without_a_second_record_a_lost_folder_is_not_rebuilt(keys: Path) -> Non
         shutil.rmtree(path)
     with pytest.raises(UsageError, match="no such folder"):
         opened(keys, rebuild=True)
+
+
+def test_a_failed_access_to_the_disk_does_not_replace_keys_by_older_ones(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = opened(keys).read(2)
+    assert before is not None
+    newer = replace(before, unused=before.unused + 7)
+    Vault(keys).write(newer)  # the second record could not be written
+    failures = iter([True, True] * 2)
+
+    def read(path: Path, most: int) -> bytes | None:
+        if path.parent == keys and path.name.startswith("spi-2") and next(failures, False):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return read_regular(path, most)
+
+    monkeypatch.setattr(security, "read_regular", read)
+    assert opened(keys).read(2) == newer
 
 
 @pytest.mark.parametrize("spi", [2, 3, 4])
