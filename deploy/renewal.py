@@ -480,15 +480,20 @@ class Renewal:
 
     def accept(self, what: str) -> None:
         """Store the accepted configuration, and end a trial or return that would undo what was installed."""
-        state, trial, ended = self._state, self._state.trial, self._state.returning[3:5]
+        state, trial, ended = self._state, self._state.trial, list[str]()
         if not self._board.keep(GROUND):
             raise OSError(f"{self._board.configuration} cannot be read")
+        if state.returning and (what == "release" or state.returning[0] != "release"):
+            ended, state.returning = state.returning[3:5], []
         if trial is not None and what in {"release", trial.what}:
-            state.trial, ended = None, [trial.request, "activate"]
-            state.previous = trial.old if trial.what == "configuration" else state.previous
+            ended, state.trial = [trial.request, "activate"], None
+            if trial.what == "configuration":
+                state.previous = trial.old
+            elif trial.stage == "fly" and trial.old:
+                # install.sh keeps the current release as the fallback, which must not be an unconfirmed one.
+                self._board.point("current", trial.old)
         if ended:
             self._report(ended[0], "failed", ended[1], "install.sh was run: its version stays")
-            state.returning = []
             self._save()
 
     def _next_request(self) -> str:

@@ -593,10 +593,14 @@ def test_an_accepted_configuration_is_not_replaced_at_the_end_of_a_trial(board: 
     assert board.flown() == before, "the configuration before the trial is kept for the ground"
 
 
-@pytest.mark.parametrize(("accepted", "stays"), [("release", "third"), ("configuration", "first")])
+@pytest.mark.parametrize(
+    ("accepted", "stays", "stored"),
+    [("release", "third", ["first", "third"]), ("configuration", "first", ["first", "old", "second"])],
+)
 def test_a_trial_is_ended_by_an_installation_but_not_by_an_accepted_configuration(
-    board: RenewedBoard, accepted: str, stays: str
+    board: RenewedBoard, accepted: str, stays: str, stored: list[str]
 ) -> None:
+    """The fallback of an installed release is the confirmed release, not the release on trial."""
     board.files.install("first")
     board.activate(board.bundle("release", board.source("second"), 1), "release")
     board.step()
@@ -607,6 +611,24 @@ def test_a_trial_is_ended_by_an_installation_but_not_by_an_accepted_configuratio
         board.run("--accepted", accepted)
     board.step(4000.0)
     assert board.release() == stays
+    labels = [path.read_text() for path in board.files.prefix.glob("releases/*/venv/**/flight/label")]
+    assert sorted(labels) == stored
+
+
+def test_an_accepted_configuration_does_not_end_a_return_to_the_earlier_release(
+    board: RenewedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board.files.install("first")
+    board.files.install("second")
+    request = board.request("withdraw", "release")
+    first = Path("releases") / (board.files.prefix / "previous").readlink().name
+    _fail_once(monkeypatch, renewal.os, "symlink", first)
+    board.step()
+    board.run("--accepted", "configuration")
+    assert board.release() == "second"
+    board.step()
+    assert board.release() == "first"
+    assert board.reports(request)[-1][0] == "completed"
 
 
 def test_one_failed_read_loses_no_state(board: RenewedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
