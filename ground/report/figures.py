@@ -629,8 +629,12 @@ def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patc
     level = np.cos(latitude)
     grid = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2)
     for cone in cones:
-        colour, label = _CONES[cone.name], f"{cone.name} cone, {np.degrees(cone.angle):.0f} deg"
-        first, last = (grid @ towards - np.cos(cone.angle) for towards in cone.direction(ends))
+        angles = cone.half_angles(ends)
+        colour, label = _CONES[cone.name], f"{cone.name} cone, {np.degrees(angles[0]):.0f} deg"
+        first, last = (
+            grid @ towards - np.cos(angle)
+            for towards, angle in zip(cone.direction(ends), angles, strict=True)
+        )
         ax.contourf(longitude, latitude, first, [0.0, 9.0], colors=[colour], alpha=0.3)
         ax.contour(longitude, latitude, last, [0.0], colors=[colour], linestyles="dashed", linewidths=1.2)
         yield Patch(facecolor=colour, alpha=0.4, label=label)

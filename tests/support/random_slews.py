@@ -98,5 +98,5 @@ def clearance(task: SlewTask, plan: SlewPlan) -> float:
     nearest = np.inf
     for cone in task.cones:
         cosine = np.einsum("i,nij,nj->n", cone.axis, turned, cone.direction(times))
-        nearest = min(nearest, float((np.arccos(np.clip(cosine, -1.0, 1.0)) - cone.angle).min()))
+        nearest = min(nearest, float((np.arccos(np.clip(cosine, -1.0, 1.0)) - cone.half_angles(times)).min()))
     return nearest

@@ -38,7 +38,7 @@ from knightcube.astro.earth.disturbance import AIR, CONSTANT, LIGHT, Pressures, 
 from knightcube.astro.earth.ephemeris import Ephemeris
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orientation import terrestrial_time
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.attitude_law import AttitudeReferences
@@ -361,16 +361,23 @@ class SlewPath:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cone:
-    """An exclusion cone: body `axis` (3,) stays at least `angle` rad away from a direction.
+    """An exclusion cone: body `axis` (3,) stays at least `angle` rad away from a celestial body.
 
     The function `direction` returns unit vectors (n, 3) along the axis of the cone, ICRS, for times (n,), s,
-    after the start of the slew.
+    after the start of the slew. The angle is measured from this direction or, if `radius` is given, from the
+    edge of a disc about it. The function `radius` returns the angular radii (n,) of the disc, rad.
     """
 
     name: str
     axis: FloatArray
     direction: Callable[[FloatArray], FloatArray]
     angle: float
+    radius: Callable[[FloatArray], FloatArray] | None = None
+
+    def half_angles(self, times: FloatArray) -> FloatArray:
+        """Return the half angles (n,) of the cone, rad, at times (n,), s."""
+        angles = np.full(len(times), self.angle)
+        return angles if self.radius is None else np.asarray(angles + self.radius(times))
 
     def clearance(self, q: FloatArray, times: FloatArray) -> FloatArray:
         """Return the angles (n,), rad, from the cone to the axis at attitudes (n, 4).
@@ -378,7 +385,7 @@ class Cone:
         The angle is negative if the axis lies inside the cone.
         """
         cosine = shown(q, self.direction(times)) @ self.axis / np.sum(q * q, axis=1)
-        return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)) - self.angle)
+        return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)) - self.half_angles(times))
 
 
 class ConeConstraints:
@@ -393,7 +400,7 @@ class ConeConstraints:
 
         The margin (rad) is a scalar or an array (cones, n).
         """
-        angles = np.array([cone.angle for cone in cones]).reshape(-1, 1) + margin
+        angles = np.array([cone.half_angles(times) for cone in cones]).reshape(-1, len(times)) + margin
         self._limits = np.cos(np.clip(angles, 0.0, np.pi))
         self.count, size = len(cones), len(times)
         found = [
@@ -514,29 +521,31 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
     """Return the exclusion cones of a body `axis` (3,), one for each of `angles`, rad.
 
     The angles `sun` and `moon` are measured from the centre of the disc, and `earth` from the Earth's limb.
-    The position of the Moon relative to the Earth is that at the start; it changes by 0.6 deg per hour.
+    The Moon is assumed to move on a straight line; after six hours, its direction is wrong by 0.1 deg.
     """
-    date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
-    moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)
+    date = float(terrestrial_time(ephemeris.julian_date + begin / DAY))
+    moon = erfa.moon98(date, 0.0)
 
     def towards_earth(times: FloatArray) -> FloatArray:
         position = ephemeris.position_at(begin + times)
         return np.asarray(-position / np.linalg.norm(position, axis=1, keepdims=True))
 
+    def limb(times: FloatArray) -> FloatArray:
+        distance = np.linalg.norm(ephemeris.position_at(begin + times), axis=1)
+        return np.asarray(np.arcsin(np.minimum(1.0, EARTH_RADIUS / distance)))
+
     def towards_moon(times: FloatArray) -> FloatArray:
-        away = moon - ephemeris.position_at(begin + times)
+        at = ASTRONOMICAL_UNIT * (moon["p"] + times[:, None] / DAY * moon["v"])
+        away = at - ephemeris.position_at(begin + times)
         return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
 
-    distance = float(np.linalg.norm(ephemeris.position_at(np.array([begin]))[0]))
-    limb = math.asin(min(1.0, EARTH_RADIUS / distance))
     known = {
-        "sun": (lambda times: ephemeris.sun_at(begin + times), 0.0),
+        "sun": (lambda times: ephemeris.sun_at(begin + times), None),
         "earth": (towards_earth, limb),
-        "moon": (towards_moon, 0.0),
+        "moon": (towards_moon, None),
     }
     return tuple(
-        Cone(name.capitalize(), axis, known[name][0], known[name][1] + angle)
-        for name, angle in angles.items()
+        Cone(name.capitalize(), axis, known[name][0], angle, known[name][1]) for name, angle in angles.items()
     )
 
 
@@ -545,9 +554,10 @@ NODES = 24
 intervals, and the shortest duration by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
-_DEEP, _STILL = math.radians(5.0), 1e-4
-"""Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected (first value),
-and rate (rad/s) below which an end attitude counts as inertially fixed (second value)."""
+_DEEP, _STILL, _CHECKED_ENDS = math.radians(5.0), 1e-4, 65
+"""Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected if the end is
+that deep for all of `_CHECKED_ENDS` durations, and rate (rad/s) below which an end attitude counts as
+inertially fixed."""
 MINIMUM_TIME = math.inf
 """Value of `time_cost` that requests a minimum-time slew, for which only the duration is minimised."""
 
@@ -628,11 +638,11 @@ def _check_cones(task: SlewTask) -> None:
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}: choose "
                 "another start or time, or a smaller cone"
             )
-        # The cones move by only a few degrees during a slew.
-        # An end attitude deep inside a cone is therefore inside for any duration of the slew.
         if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
-            clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
-            if float(clearance[0]) >= -_DEEP:
+            shortest = task.horizon if task.time_cost is None else HORIZON_RANGE[0]
+            times = np.linspace(shortest, task.longest, _CHECKED_ENDS)
+            clearance = cone.clearance(np.tile(end.quaternion, (len(times), 1)), times)
+            if float(clearance.max()) >= -_DEEP:
                 continue
             raise PlanningError(
                 f"the end lies inside the exclusion cone of the {cone.name}: choose another goal or a "
@@ -655,6 +665,6 @@ def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
         # of their angles from the axis.
         pairs = ((end.axis, cone.axis), (end.direction, cone.direction(time)[0]))
         apart = sum(math.acos(min(max(float(one @ other), -1.0), 1.0)) for one, other in pairs)
-        if min(apart, 2.0 * math.pi - apart) < cone.angle:
+        if min(apart, 2.0 * math.pi - apart) < float(cone.half_angles(time)[0]):
             return cone
     return None

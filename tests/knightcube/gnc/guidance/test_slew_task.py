@@ -6,11 +6,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import erfa
 import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply, normalise
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.attitude_law import (
@@ -148,8 +150,8 @@ def test_cones_of_an_orbit_point_to_sun_earth_and_moon_with_their_angles() -> No
     np.testing.assert_allclose(sun.direction(times), np.tile(X, (2, 1)), atol=1e-4)
     down = -ORBIT.position_at(100.0 + times) / RADIUS
     np.testing.assert_allclose(earth.direction(times), down, atol=1e-9)
-    assert (sun.angle, moon.angle) == (0.4, 0.1)
-    assert earth.angle == pytest.approx(math.asin(EARTH_RADIUS / RADIUS) + 0.2)
+    for cone, angle in ((sun, 0.4), (earth, math.asin(EARTH_RADIUS / RADIUS) + 0.2), (moon, 0.1)):
+        np.testing.assert_allclose(cone.half_angles(times), angle)
     towards = moon.direction(times)
     np.testing.assert_allclose(np.linalg.norm(towards, axis=1), 1.0)
     # From low orbits in opposite positions, the Moon has a parallax of about 2 deg.
@@ -157,6 +159,35 @@ def test_cones_of_an_orbit_point_to_sun_earth_and_moon_with_their_angles() -> No
     assert abs(towards[0][2]) < math.sin(math.radians(29.0)), "the Moon is near the ecliptic"
     (only,) = cones(ORBIT, 0.0, Z, earth=0.0)
     assert only.axis is Z
+
+
+def test_the_cone_of_the_earth_follows_the_limb_along_an_eccentric_orbit() -> None:
+    """A satellite that approaches from 20,000 km to 500 km sees the Earth's limb grow from 14 to 68 deg."""
+    times = np.linspace(0.0, 3000.0, 301)
+    distance = EARTH_RADIUS + np.linspace(20e6, 500e3, 301)
+    approaching = replace(ORBIT, times=times, position=distance[:, None] * X, velocity=np.zeros((301, 3)))
+    (earth,) = cones(approaching, 0.0, X, earth=0.1)
+    at = np.array([0.0, 1000.0, 2900.0])
+    towards_space = 0.2
+    limb = np.arcsin(EARTH_RADIUS / distance[[0, 100, 290]])
+    turned = np.tile(from_rotation_vector(towards_space * Z), (3, 1))
+    np.testing.assert_allclose(earth.clearance(turned, at), math.pi - towards_space - limb - 0.1, atol=1e-3)
+    constraints = ConeConstraints((earth,), np.zeros(1), at)
+    expected = np.cos(limb + 0.1) + math.cos(towards_space)
+    np.testing.assert_allclose(constraints.values(turned), [expected], atol=1e-3)
+
+
+def test_the_cone_of_the_moon_follows_the_moon_during_a_long_slew() -> None:
+    """The Moon moves by 3 deg in six hours; the error of its direction is below 0.1 deg."""
+    long = replace(
+        ORBIT, times=np.array([0.0, 21_600.0]), position=np.zeros((2, 3)), velocity=np.zeros((2, 3))
+    )
+    (moon,) = cones(long, 0.0, X, moon=0.1)
+    start, end = moon.direction(np.array([0.0, 21_600.0]))
+    date = float(terrestrial_time(ORBIT.julian_date + 0.25))
+    expected = normalise(np.asarray(erfa.moon98(date, 0.0)["p"]))
+    assert math.acos(float(end @ expected)) < math.radians(0.1)
+    assert math.acos(float(start @ end)) > math.radians(2.5)
 
 
 def cone_about(q: FloatArray, angle: float) -> Cone:
@@ -203,7 +234,7 @@ def test_values_at_the_limits_are_accepted(changes: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("deep", "refused"), [(0.085, False), (0.089, True)])
 def test_an_end_at_rest_deep_inside_a_cone_is_refused(deep: float, refused: bool) -> None:
-    """An end more than 5 deg (0.0873 rad) inside a cone cannot be reached, whatever the duration."""
+    """An end more than 5 deg (0.0873 rad) inside a cone cannot be reached, unless the cone moves away."""
     still = AttitudeEnd(TARGET, np.zeros(3))
     task = small_slew(cones=(cone_about(TARGET, deep),), end=lambda _: still)
     moving = replace(task, end=lambda _: AttitudeEnd(TARGET, np.array([0.0, 2e-4, 0.0])))
@@ -215,6 +246,8 @@ def test_an_end_at_rest_deep_inside_a_cone_is_refused(deep: float, refused: bool
             check(task)
     else:
         check(task)
+    leaving = replace(task.cones[0], radius=lambda times: -1e-5 * times)
+    check(replace(task, cones=(leaving,)))
     found = blocking_cone(task, 240.0)
     assert found is not None
     assert found.name == "Moon"
