@@ -62,7 +62,7 @@ from flight.schema.reader import parse, peer_networks
 from flight.schema.sections import Config, Link
 from hal.buses.linux_wires import PySerialPort
 from hal.buses.system import ServiceManager, SystemClock
-from hal.interfaces.wires import SECOND_NS
+from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import KnightCubeError, UsageError
 
 _NICE = 10
@@ -110,28 +110,27 @@ def link(options: argparse.Namespace) -> int:
 
 
 def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
-    """Retry the start of the link until it succeeds, and run the link until `ended` returns true."""
+    """Run the link until `ended` returns true; start it again if lost keys are found again."""
     with ExitStack() as stack:
-        retry = StartRetry(ended)
-        stack.callback(retry.close)
-        clock = SystemClock()
+        retry, overseer = StartRetry(ended), ServiceManager(os.environ, os.getpid())
+        for callback in (retry.close, overseer.close, overseer.stopping):
+            stack.callback(callback)
+        clock, release = SystemClock(), FlownRelease(os.environ)
         judge = partial(_judge, config, log)
-        attempt = partial(_open, log, SeparationInhibit(clock), clock.now_ns())
-        station, names = retried_start(judge, attempt, stack, retry)
-        overseer = ServiceManager(os.environ, os.getpid())
-        stack.callback(overseer.close)
-        stack.callback(overseer.stopping)
-        status = f"link open on {names}"
-        _say("; ".join(filter(None, (status, retry.summary()))))
-        with suppress(OSError):  # a damaged disk of the flight must not end the link
-            if not find_segments((find_runs(log) or [log])[-1], "flight"):
-                _say(f"--log {log}: no flight log yet: telemetry begins with the flight log in this folder")
-        overseer.ready(status)
-        release = FlownRelease(os.environ)
-        if release.note:
-            station.report_problem("release", release.note)
-        release.serve(SystemClock(), stack)
-        station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
+        attempt = partial(_open, log, SeparationInhibit(clock), KeysFolder(clock))
+        while not ended():
+            with ExitStack() as opened:
+                station, names = retried_start(judge, attempt, opened, retry)
+                status = f"link open on {names}"
+                _say("; ".join(filter(None, (status, retry.summary()))))
+                with suppress(OSError):  # a damaged disk of the flight must not end the link
+                    if not find_segments((find_runs(log) or [log])[-1], "flight"):
+                        _say(f"--log {log}: no flight log yet: telemetry begins with the log in this folder")
+                overseer.ready(status)
+                if release.note:
+                    station.report_problem("release", release.note)
+                release.serve(clock, opened)
+                station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
         release.end()
 
 
@@ -150,13 +149,37 @@ def _judge(config_path: Path, log: Path) -> tuple[Config, str]:
     return config, chosen.problem
 
 
-def _open(
-    log: Path, inhibit: SeparationInhibit, begun_ns: int, judged: tuple[Config, str], stack: ExitStack
-) -> tuple[Station, str]:
-    """Open the station after the separation inhibit; return it with the names of its communication lines.
+class KeysFolder:
+    """Opens the satellite's folder of keys, and measures for how long no key could be read."""
 
-    The start has begun at `begun_ns` by the system clock.
-    """
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._missing_ns: int | None = None  # time of the first attempt that found no key
+
+    def open(self, folder: Path) -> Vault:
+        """Open the folder. A minute after the first attempt without a key, a lost folder is rebuilt.
+
+        Raises UsageError if no key can be read.
+        """
+        now_ns = self._clock.now_ns()
+        rebuild = self._missing_ns is not None and now_ns - self._missing_ns >= _KEYS_WAIT_NS
+        try:
+            vault = Vault(folder, _witness(folder), rebuild)
+            if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
+                raise UsageError(f"{folder}: no key can be read: mount or copy the satellite's keys there")
+        except UsageError:
+            self._missing_ns = now_ns if self._missing_ns is None else self._missing_ns
+            raise
+        self._missing_ns = None
+        if vault.restored or vault.rebuilt:
+            _say(f"{folder}: {RESTORED if vault.restored else REBUILT}")
+        return vault
+
+
+def _open(
+    log: Path, inhibit: SeparationInhibit, keys: KeysFolder, judged: tuple[Config, str], stack: ExitStack
+) -> tuple[Station, str]:
+    """Open the station after the separation inhibit; return it with the names of its communication lines."""
     (config, problem), clock = judged, SystemClock()
     section, commands = config.link, config.commands.socket
     assert section is not None
@@ -164,12 +187,7 @@ def _open(
     if problem:
         _say(problem)
     inhibit.check(Path(section.keys).absolute().parent, config.separation.inhibit)
-    keys, rebuild = Path(section.keys), clock.now_ns() - begun_ns >= _KEYS_WAIT_NS
-    vault = Vault(keys, _witness(keys), rebuild)
-    if vault.restored or vault.rebuilt:
-        _say(f"{keys}: {RESTORED if vault.restored else REBUILT}")
-    if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
-        raise UsageError(f"{keys}: no key can be read: mount or copy the satellite's keys there")
+    vault = keys.open(Path(section.keys))
     stack.enter_context(vault.owned())
     coding = section.coding
     codes = LinkCodes(

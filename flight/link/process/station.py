@@ -400,6 +400,8 @@ def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Map
         done = gate.replace_key(change.spi, change.generation, change.key)
     else:
         done = sealers[change.spi].replace_key(change.generation, change.key)
+    if done and change.spi == COMMAND_SPIS[0]:
+        vault.rebuilt = False
     return "" if done else "the key could not be stored"
 
 
@@ -490,6 +492,7 @@ class Station:
         self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
         self._problem = ""
+        self._keys_returned = False
         self._unpacked, self._unpacked_text = 0, ""
         self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
@@ -522,7 +525,10 @@ class Station:
     def run(
         self, ended: Callable[[], bool], complain: Callable[[str], object], alive: Callable[[], object]
     ) -> None:
-        """Run until `ended` returns true.
+        """Run until `ended` returns true, or until the lost key of the primary command SPI can be read again.
+
+        In the second case the folder of keys was mounted late, and a new station must read the keys, the
+        schedule and the file transfers of this folder.
 
         The function `complain` is called once for each problem with sending, and at most once a second while
         reports are lost. The function `alive` is called once a second while the loop makes progress, also
@@ -530,7 +536,7 @@ class Station:
         """
         self._alive = alive
         due_ns, complained, lost, lost_ns = self._clock.now_ns(), "", 0, 0
-        while not ended():
+        while not ended() and not self._keys_returned:
             pause_ns = _BUSY_NS if self.turn() else TURN_NS
             if self._problem and self._problem != complained:
                 complain(self._problem)
@@ -540,6 +546,8 @@ class Station:
                 complain(f"{lost} reports could not be sent: {self._unpacked_text or 'too many at once'}")
             due_ns = max(due_ns + pause_ns, self._clock.now_ns())
             self._clock.sleep_until_ns(due_ns)
+        if self._keys_returned:
+            complain("the lost keys can be read again: the link is started again")
         self._control.close()
         self._filing.close(self._clock.now_ns())
 
@@ -670,9 +678,15 @@ class Station:
             case Activate() | Confirm() | Withdraw() | Restart():
                 return self._renew(directive, done)
             case Scheduled() | Deletion() | Listing():
-                return self._scheduling.obey(directive, done, self._utc_ns())
+                return self._schedule(directive, done)
             case _:
                 return self._filing.obey(directive, done, self._utc_ns(), self._clock.now_ns())
+
+    def _schedule(self, directive: Scheduled | Deletion | Listing, done: Report) -> list[Report]:
+        """Change or list the schedule. Nothing is scheduled while the folder of keys may be mounted late."""
+        if isinstance(directive, Scheduled) and self._vault.rebuilt:  # the late folder has another schedule
+            return [replace(done, stage=Stage.FAILED, text=REBUILT)]
+        return self._scheduling.obey(directive, done, self._utc_ns())
 
     def _renew(self, directive: Privileged, done: Report) -> list[Report]:
         """Hand a directive over to the privileged `deploy/renewal.py`, which reports its completion."""
@@ -742,6 +756,7 @@ class Station:
     def _status(self) -> None:
         gate, vault = self._gate, self._vault
         known = {spi: vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
+        self._keys_returned = vault.rebuilt and known[COMMAND_SPIS[0]] is not None
         gates = [gate.association(spi) for spi in COMMAND_SPIS]
         values = {
             "received": self._received,

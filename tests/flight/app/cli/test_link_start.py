@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -17,10 +18,13 @@ import pytest
 
 from flight.app.cli import link, main
 from flight.app.service import SeparationInhibit
+from flight.link.process.commanding import Timetable
+from flight.link.process.station import Station
 from flight.link.security import Vault
 from hal.buses.system import SystemClock
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
+from tests.manual_clock import ManualClock
 from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 _LONGEST_S = 120.0
@@ -179,23 +183,53 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
     assert "stopped before the start: link.tcp" in service.process.stderr.read()
 
 
-def test_a_lost_folder_of_keys_is_rebuilt_after_a_minute(
+def test_a_lost_folder_of_keys_is_rebuilt_a_minute_after_it_was_found_missing(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     judged = link._judge(write_linked_config(place, udp="127.0.0.1:0"), place)
-    clock = SystemClock()
-    inhibit = SeparationInhibit(clock)
+    clock = ManualClock()
+    inhibit, keys = SeparationInhibit(SystemClock()), link.KeysFolder(clock)
     with ExitStack() as stack:
-        link._open(place, inhibit, clock.now_ns(), judged, stack)
+        link._open(place, inhibit, keys, judged, stack)
     shutil.rmtree(place / "keys" / "satellite")
+    clock.advance(3600 * SECOND_NS)  # for example a separation inhibit
+    for seconds in (0, 59):
+        clock.advance(seconds * SECOND_NS)
+        with ExitStack() as stack, pytest.raises(UsageError, match="no such folder"):
+            link._open(place, inhibit, keys, judged, stack)
+    assert "was lost" not in capsys.readouterr().err
+    clock.advance(SECOND_NS)
     with ExitStack() as stack:
-        with pytest.raises(UsageError, match="no such folder"):
-            link._open(place, inhibit, clock.now_ns(), judged, stack)
-        assert "was lost" not in capsys.readouterr().err
-        _, names = link._open(place, inhibit, clock.now_ns() - 60 * SECOND_NS, judged, stack)
+        _, names = link._open(place, inhibit, keys, judged, stack)
     assert names == "UDP 127.0.0.1:0"
     cure = "the folder of keys was lost: set a new key of SPI 1 by a command of SPI 2"
     assert cure in capsys.readouterr().err
+
+
+def test_a_folder_of_keys_that_is_mounted_late_is_read_by_a_new_start(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The stored schedule of a folder that is mounted after the rebuilding is executed."""
+    config = write_linked_config(place, udp="127.0.0.1:0")
+    keys, away, hidden = place / "keys" / "satellite", place / "away", place / "hidden"
+    opened = list[tuple[bool, int]]()
+    run, turns = Station.run, itertools.count()
+
+    def run_shortly(self: Station, ended: Callable[[], bool], *callbacks: Callable[..., object]) -> None:
+        opened.append((self._vault.rebuilt, len(self._scheduling._timetable.entries)))
+        if len(opened) == 1:  # the folder is mounted while the link with rebuilt keys runs
+            keys.rename(hidden)
+            away.rename(keys)
+        run(self, lambda: ended() or next(turns) >= 100, *callbacks)
+
+    Vault(keys, place / "keys" / "witness")
+    Timetable(keys).add(2**62, 1, 0, "ping 1")
+    keys.rename(away)
+    monkeypatch.setattr(link, "_KEYS_WAIT_NS", 0)
+    monkeypatch.setattr(Station, "run", run_shortly)
+    link._run(config, place, lambda: len(opened) > 1)
+    assert opened == [(True, 0), (False, 1)]
+    assert "the lost keys can be read again" in capsys.readouterr().err
 
 
 def test_a_log_that_is_not_a_folder_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

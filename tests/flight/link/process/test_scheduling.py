@@ -38,6 +38,8 @@ from flight.link.process.commanding import (
     TimetableError,
 )
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
+from flight.link.process.station import REBUILT
+from flight.link.security import new_key
 from flight.link.telemetry.definitions import RUN
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
@@ -64,6 +66,24 @@ def in_seconds(link: BothEnds, seconds: float) -> str:
 
 def texts(link: BothEnds, counter: int) -> list[str]:
     return [report.text for report in link.reports() if report.counter == counter]
+
+
+def test_nothing_is_scheduled_while_the_folder_of_keys_may_be_mounted_later(link: BothEnds) -> None:
+    """A folder that is mounted late has a schedule of its own, which an entry would overwrite."""
+    link.sky.remove(1)
+    link.sky.rebuilt = True
+    scheduled = directives.pack(Scheduled(in_seconds(link, 9.0), "ping 1"), link.clock.utc_ns())
+    refused = link.terminal.send(scheduled, spi=2)
+    link.turn()
+    assert texts(link, refused)[1:] == [REBUILT]
+    assert not list(link.sky.folder.glob("schedule.*"))
+    change = directives.pack(directives.NewKey(1, 2, new_key()), link.clock.utc_ns())
+    link.terminal.send(change, spi=2)
+    link.turn()
+    accepted = link.terminal.send(scheduled, spi=2)
+    link.turn()
+    assert texts(link, accepted)[1:] != [REBUILT]
+    assert link.stages(accepted, 2) == ["accepted", "completed"]
 
 
 @pytest.mark.parametrize(
