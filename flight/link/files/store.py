@@ -120,6 +120,9 @@ _TRIES = 3
 """Number of attempts to list a folder, because a single failed disk access does not mean damage."""
 _FREE_BYTES = 64 << 20
 """Free disk space (bytes) that received files must not use."""
+_COPY_FREE_BYTES = 1 << 20
+"""Free disk space (bytes) that a selected copy must not use. It is smaller than `_FREE_BYTES`, so that a
+received file can be selected while the disk has too little space for further files."""
 _LONGEST_RECORD = 4 << 20
 """Maximum length (bytes) of a stored record. The record of a 64 MiB file of which every second segment is
 missing needs less than 1 MB."""
@@ -270,9 +273,9 @@ class Store:
         except OSError as error:
             raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
 
-    def room(self) -> int:
-        """Return the disk space (bytes) available for received files."""
-        return max(0, shutil.disk_usage(self._folder).free - _FREE_BYTES)
+    def room(self, copy: bool = False) -> int:
+        """Return the disk space (bytes) available for a received file, or for a selected `copy` of one."""
+        return max(0, shutil.disk_usage(self._folder).free - (_COPY_FREE_BYTES if copy else _FREE_BYTES))
 
     def _records(self, pattern: str, shape: type[T]) -> list[T]:
         for _ in range(_TRIES):

@@ -175,7 +175,7 @@ class Filing:
             path = self._received(use.name)
             if len(self._checks) >= MOST_WAITING:
                 raise FileError(f"{MOST_WAITING} files wait for their check: send the command again later")
-            if path.stat().st_size > self._store.room():
+            if path.stat().st_size > self._store.room(copy=True):
                 raise FileError("the disk has no room for the selected copy: delete files")
         except (FileError, OSError) as error:
             return [replace(done, stage=Stage.FAILED, text=str(error))]

@@ -8,12 +8,13 @@ import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from flight.link import events
 from flight.link.events import Mode
-from flight.link.files.store import Store
+from flight.link.files import store
 from flight.link.process import filing
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
@@ -189,12 +190,15 @@ def test_checks_of_bundles_are_limited_in_number_and_by_the_disk(
     ends.turn(2.0)
     failures = [text for stage, text in stages(ends, "activate") if stage == "failed"]
     assert failures == ["16 files wait for their check: send the command again later"]
-    monkeypatch.setattr(Store, "room", lambda _: len(DATA) - 1)
-    ends.ask(directive)
-    ends.turn(2.0)
-    assert stages(ends, "activate")[-1] == (
-        "failed", "the disk has no room for the selected copy: delete files"
-    )  # fmt: skip
+    problem = "the disk has no room for the selected copy: delete files"
+    for path in (ends.place / "keys/renewal").glob("1-*"):
+        path.unlink()
+    for missing, end in ((1, ("failed", problem)), (0, ("started", f"{directive}: handed over"))):
+        usage = SimpleNamespace(free=(1 << 20) + len(DATA) - missing)
+        monkeypatch.setattr(store, "shutil", SimpleNamespace(disk_usage=lambda _, usage=usage: usage))
+        ends.ask(directive)
+        ends.turn(2.0)
+        assert stages(ends, "activate")[-1] == end
 
 
 def test_a_copy_for_a_check_that_fails_leaves_no_file(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
