@@ -22,7 +22,7 @@ from flight.app.run import utc_ns
 from flight.app.service import EndingSignals
 from flight.link import commands
 from flight.link.events import Mode
-from flight.link.files.store import Store
+from flight.link.files.store import FileError, Store
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage, final_mode, utc_of
 from flight.link.process.downlink import LIVE
@@ -530,7 +530,7 @@ class _FileWork:
     ) -> None:
         self._session, self._terminal = session, terminal
         self._patience_s, self._ended = patience_s, ended
-        self._shown_s = 0.0
+        self._shown_s, self._said = 0.0, ""
 
     def obey(self, options: argparse.Namespace) -> Object:
         """Return the result of the file command. Raises KnightCubeError."""
@@ -595,12 +595,25 @@ class _FileWork:
             self._turn("")
         return {"text": f"completed: {directive}"}
 
+    def _transmit(self, now_ns: int) -> None:
+        """Send what is due. A failure of the network is reported once, and ends the work if it lasts."""
+        try:
+            self._session.transmit(now_ns)
+        except FileError:
+            raise
+        except KnightCubeError as error:
+            if self._terminal.failing > self._patience_s:
+                raise
+            if str(error) != self._said:
+                self._said = str(error)
+                sys.stderr.write(f"knightcube: frames are not sent: {error}; tried again\n")
+
     def _turn(self, name: str) -> None:
         """Receive and send what is due. Raises KnightCubeError after a signal or a long silence."""
         if select.select([self._terminal], [], [], _TURN_S)[0]:
             self._session.take(self._terminal.take(), time.monotonic_ns())
         now_ns = time.monotonic_ns()
-        self._session.transmit(now_ns)
+        self._transmit(now_ns)
         kept = "; the received data is kept: run the same command again to continue" if name else ""
         if self._ended():
             raise KnightCubeError(f"ended by a signal{kept}")

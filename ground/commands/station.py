@@ -86,9 +86,7 @@ def run_gateway(options: argparse.Namespace) -> int:
     """Relay packets until a signal arrives."""
     token = new_token()
     with contextlib.closing(terminal_of(options)) as terminal:
-        gateway = Gateway(
-            terminal, options.serve, token, lambda text: sys.stderr.write(f"knightcube: gateway: {text}\n")
-        )
+        gateway = Gateway(terminal, options.serve, token, _complain)
         path = token_path(options.keys, gateway.port)
         with contextlib.closing(gateway), EndingSignals() as signals, token_file(path, token):
             sys.stdout.write(f"packets on 127.0.0.1:{gateway.port}, token in {path} (Ctrl-C ends)\n")
@@ -96,6 +94,12 @@ def run_gateway(options: argparse.Namespace) -> int:
             gateway.run(lambda: signals.received)
         sys.stdout.write(f"{terminal.reception()}\n")
     return 0
+
+
+def _complain(text: str) -> None:
+    """Write a problem of the gateway to standard error; a full disk does not end the gateway."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"knightcube: gateway: {text}\n")
 
 
 def configure_watch(parser: argparse.ArgumentParser) -> None:
@@ -132,7 +136,10 @@ def run_watch(options: argparse.Namespace) -> int:
         from ground.console.commanding import LinkFeed  # noqa: PLC0415 - not needed by the other commands
 
         with contextlib.closing(LinkFeed(terminal_of(options))) as feed:
-            return _watch(options, feed, options.patience, "over the link")
+            status = _watch(options, feed, options.patience, "over the link")
+            if feed.problem:
+                sys.stderr.write(f"knightcube: pings are not sent: {feed.problem}\n")
+            return status
     folder = Path(options.flight)
     if folder.is_socket() or (":" in options.flight and not folder.exists()):
         return _watch_socket(options)
@@ -373,9 +380,11 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
         by_link = CommandForms(feed.send, TELECOMMANDS)
         files = LinkFiles(feed, ground_files_folder(options.keys))
         kept = FrameFolder(options.frames)
-        return Console(
+        shown = Console(
             options.link, feed, history, place, by_link, frames=kept, files=files, stations=stations
         )
+        shown.doubts = (lambda: feed.problem,)
+        return shown
     to: str | None = options.to
     flight_trouble: Callable[[], str] = str  # returns an empty text
     if to is not None:

@@ -21,7 +21,7 @@ import numpy as np
 from flight.app.run import utc_ns
 from flight.link import commands
 from flight.link.events import EVENTS, Mode
-from flight.link.files.store import Store, problem_of_name
+from flight.link.files.store import FileError, Store, problem_of_name
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage, utc_of
 from flight.link.process.directives import KINDS, LIST, SCHEDULE, ListFiles, SendFile
@@ -224,24 +224,42 @@ class LinkFeed:
         self.restarts = 0
 
     @property
+    def problem(self) -> str:
+        """Reason why the newest packet could not be sent, or an empty text."""
+        return self._terminal.problem
+
+    @property
+    def failing(self) -> float:
+        """Time (s) since the first failure to send after the last success, or 0."""
+        return self._terminal.failing
+
+    @property
     def silence(self) -> float:
         """Time (s) since the last telemetry."""
         return time.monotonic() - self._received
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name received since the last call. Raises KnightCubeError.
+        """Return the packets by name received since the last call.
 
-        If the flight software was restarted since then, only the packets after the restart are returned.
+        If the flight software was restarted since then, only the packets after the restart are returned. A
+        failure to send is stored in `problem`, because telemetry may still arrive. Raises KnightCubeError if
+        the line is lost.
         """
         with self.lock:
             now = time.monotonic()
             if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
                 self._asked = now
-                self._terminal.send(self._packer.pack(commands.Ping(), utc_ns()), _SPI)
+                with contextlib.suppress(KnightCubeError):
+                    self._terminal.send(self._packer.pack(commands.Ping(), utc_ns()), _SPI)
             packets = list(self._terminal.packets(_LISTEN_S))
             if self._session is not None:
                 self._session.take(packets, time.monotonic_ns())
-                self._session.transmit(time.monotonic_ns())
+                try:
+                    self._session.transmit(time.monotonic_ns())
+                except FileError:
+                    raise
+                except KnightCubeError:  # stored in `problem`; CFDP sends lost segments again
+                    pass
             live = [packet for channel, packet in packets if channel == LIVE]
         if live:
             self._received = time.monotonic()
@@ -509,11 +527,13 @@ class LinkFiles:
             return work(session)
 
     def _wait(self, done: Callable[[], bool]) -> None:
-        """Wait until `done` returns true. Raises KnightCubeError after a long silence."""
+        """Wait until `done` returns true. Raises KnightCubeError after a long silence or failure to send."""
         while True:
             with self._feed.lock:
                 if done():
                     return
+            if self._feed.failing > _SILENCE_S:
+                raise KnightCubeError(f"{self._feed.problem}; the received data is kept")
             if self._feed.silence > _SILENCE_S:
                 raise KnightCubeError(f"no telemetry for {_SILENCE_S:g} s; the received data is kept")
             time.sleep(_POLL_S)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import get_type_hints
@@ -262,7 +263,8 @@ def _followed(
             if ended(found) or report.stage.final or report.stage is Stage.REPEATED:
                 return found
         if terminal.gate.admitted == heard and left > 0.0:
-            terminal.send(packer.pack(Ping(), utc_ns()), spi)
+            with suppress(KnightCubeError):  # the reports may still arrive
+                terminal.send(packer.pack(Ping(), utc_ns()), spi)
     if not found:
         raise no_answer(terminal.gate, seconds)
     return found

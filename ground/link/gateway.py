@@ -10,12 +10,14 @@ sends it in a protected frame. The gateway keeps the sequence count of a command
 from __future__ import annotations
 
 import hmac
+import math
 import os
 import secrets
 import select
 import socket
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -45,6 +47,8 @@ _SPI, _BLOCK = 1, 64
 _READ_BYTES = 1 << 16
 _PING_PERIOD_S = 20.0
 """Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""
+_KEPT_PINGS = 64  # number of the gateway's newest pings whose reports are not relayed
+_UNSENT_S = 60.0  # time (s) without a failure after which the same failure to send is reported again
 _TOKEN_S = 5.0  # time (s) after which a connection without the token is closed
 _MOST_WITHOUT_TOKEN = 256
 """Maximum number of connections that have not sent the token; a further connection closes the oldest."""
@@ -209,7 +213,8 @@ class Gateway:
         self._complain = complain
         self._packer = CommandPacker()
         self._asked_at: float | None = None
-        self._own: set[int] = set()  # counters of the gateway's own pings under the present key
+        self._own: deque[int] = deque(maxlen=_KEPT_PINGS)  # counters of the gateway's own pings
+        self._unsent, self._unsent_at = "", -math.inf  # reason and time of the last failure to send
         self._connections: dict[socket.socket, _StationConnection] = {}
         self.down = self.up = self.refused = 0
         try:
@@ -243,7 +248,9 @@ class Gateway:
         """Relay the packets that are received within `seconds` s."""
         if self._asked_at is None or time.monotonic() - self._asked_at > _PING_PERIOD_S:
             self._asked_at = time.monotonic()
-            self._own.add(self._terminal.send_by(self._sealer, self._packer.pack(Ping(), utc_ns())))
+            counter = self._send(self._packer.pack(Ping(), utc_ns()))
+            if counter is not None:
+                self._own.append(counter)
         waiting = [line for line, connection in self._connections.items() if connection.unsent]
         reading: list[Terminal | socket.socket] = [self._terminal, self._listener, *self._connections]
         ready, writable, _ = select.select(reading, waiting, [], seconds)
@@ -265,6 +272,21 @@ class Gateway:
         for line in list(self._connections):
             self._drop(line)
         self._listener.close()
+
+    def _send(self, packet: bytes) -> int | None:
+        """Send a packet and return its frame counter, or None for a packet that cannot be sent now.
+
+        The network or the disk of the counters may fail for a while. Each reason is reported once, and again
+        if it returns after a minute.
+        """
+        try:
+            return self._terminal.send_by(self._sealer, packet)
+        except KnightCubeError as error:
+            now = time.monotonic()
+            if str(error) != self._unsent or now - self._unsent_at > _UNSENT_S:
+                self._complain(f"commands and pings are not sent: {error}")
+            self._unsent, self._unsent_at = str(error), now
+            return None
 
     def _hand_over(self, packet: bytes) -> None:
         if packet[:2] == _VERIFIED:
@@ -304,8 +326,11 @@ class Gateway:
                 most = max(self._terminal.packet_bytes, LONGEST_IN_PORTIONS)
                 if len(packet) > most:
                     raise StreamError(f"{len(packet)} bytes: the link carries {most}")
-                counter = self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
-                self._own.discard(counter)  # after a change of the key the counters begin again at 0
+                counter = self._send(finished(packet, utc_ns()))
+                if counter is None:
+                    continue
+                if counter in self._own:  # after a change of the key the counters begin again at 0
+                    self._own.remove(counter)
                 self.up += 1
         except StreamError as error:
             self._refuse(line, str(error))

@@ -118,6 +118,7 @@ class Terminal:
         idle_frames: number of received frames of idle data.
         packet_bytes: longest packet that a telecommand frame can carry, bytes.
         lost_spis: SPIs of commands whose counter the satellite has lost, according to the newest telemetry.
+        problem: reason why the newest packet could not be sent, or an empty text.
     """
 
     def __init__(
@@ -137,6 +138,8 @@ class Terminal:
         self._expected: dict[int, int] = {}  # next counter of each SPI
         self._codes = codes or settings.codes()
         self._learned = False
+        self.problem = ""
+        self._failing: float | None = None  # time of the first failure to send since the last success
         self.lost_spis: tuple[int, ...] = ()
         self.lost_frames = self.idle_frames = 0
         self.packet_bytes = settings.command_frame_bytes - FRAME_OVERHEAD_BYTES
@@ -165,6 +168,21 @@ class Terminal:
         other program sends between the portions, because the satellite joins only consecutive portions.
         Raises KnightCubeError if the packet is longer than any command, or if a frame cannot be sent.
         """
+        try:
+            counter = self._send_parts(sealer, packet)
+        except KnightCubeError as error:
+            self.problem = str(error)
+            self._failing = time.monotonic() if self._failing is None else self._failing
+            raise
+        self.problem, self._failing = "", None
+        return counter
+
+    @property
+    def failing(self) -> float:
+        """Time (s) since the first failure to send after the last success, or 0."""
+        return 0.0 if self._failing is None else time.monotonic() - self._failing
+
+    def _send_parts(self, sealer: security.Sealer, packet: bytes) -> int:
         is_long = len(packet) > self.packet_bytes
         with _turn_to_send(self._vault.folder):
             for part in portions(packet, utc_ns()) if is_long else (packet,):

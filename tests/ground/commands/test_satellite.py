@@ -497,6 +497,32 @@ def ending(name: str, number: int = 5, condition: int = 0) -> Any:
 
 
 @pytest.mark.usefixtures("quiet")
+@pytest.mark.parametrize("failing", [5.0, 50.0])
+def test_a_network_that_fails_is_reported_once_and_ends_a_transfer_only_if_it_lasts(
+    tmp_path: Path, failing: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Unreachable(Session):
+        def transmit(self, _: int) -> None:
+            if len(self.turns) > 1:
+                self.turns.pop(0)
+                raise KnightCubeError("192.0.2.7:5010: cannot be reached: Network is unreachable")
+            super().transmit(_)
+
+    path = tmp_path / "tle.txt"
+    path.write_bytes(b"x")
+    session = Unreachable(tmp_path, *[([], [])] * 4, ([], [ending("elements/tle.txt")]))
+    terminal = SimpleNamespace(failing=failing)
+    work = satellite._FileWork(cast(Any, session), cast(Any, terminal), 10.0, lambda: False)
+    options = argparse.Namespace(what="put", kind="elements", path=path, replace=False)
+    if failing > 10.0:
+        with pytest.raises(KnightCubeError, match="unreachable"):
+            work.obey(options)
+        return
+    assert work.obey(options)["bytes"] == 1
+    assert capsys.readouterr().err.count("Network is unreachable") == 1
+
+
+@pytest.mark.usefixtures("quiet")
 def test_the_name_that_a_satellite_gives_a_file_does_not_control_the_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

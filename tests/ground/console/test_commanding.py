@@ -25,7 +25,7 @@ from ground.console.surroundings import UNKNOWN
 from ground.xtce import TELECOMMANDS
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError, UsageError
-from tests.flight.link.process.both_ends import BothEnds
+from tests.flight.link.process.both_ends import BothEnds, GroundWire
 from tests.flight.link.process.filed_ends import FiledEnds
 from tests.support.places import ROOT
 
@@ -66,6 +66,25 @@ def test_the_console_requests_telemetry_once_and_returns_what_the_flight_records
     assert sum(len(packets["link"]) for packets in came) >= 1
     assert len(ends.obeyed) == 1, "the ping that asks for telemetry"
     assert feed.silence < 60.0
+
+
+def test_telemetry_arrives_while_the_network_refuses_the_pings(
+    satellite: Satellite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends, feed = satellite.ends, satellite.feed
+
+    def fail(*_: object) -> int:
+        raise KnightCubeError("192.0.2.7:5010: cannot be reached: Network is unreachable")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(GroundWire, "send", fail)
+        ends.record(ends.mode_packet(Mode.HOLD, "ready"))
+        assert len(feed.new()["mode"]) == 1
+    assert "Network is unreachable" in feed.problem
+    assert feed.failing > 0.0
+    feed._asked = -1.0
+    feed.new()
+    assert (feed.problem, feed.failing) == ("", 0.0)
 
 
 def test_after_a_restart_of_the_flight_the_console_shows_the_new_flight_only(satellite: Satellite) -> None:
@@ -270,6 +289,24 @@ def test_a_file_is_uplinked_listed_and_downlinked_again(
     assert (name, len(data)) in {(file["name"], file["bytes"]) for file in listed}
     assert during(feed, lambda: files.get(name)).read_bytes() == data
     assert "no such" in str(during(feed, lambda: files.get("received/elements/other.txt"))).lower()
+
+
+def test_a_transfer_ends_with_the_reason_if_the_ground_cannot_send_for_long(
+    console: tuple[Ends, LinkFeed, LinkFiles], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, feed, files = console
+
+    def fail(*_: object) -> None:
+        raise KnightCubeError("192.0.2.7:5010: cannot be reached: Network is unreachable")
+
+    feed.new()
+    monkeypatch.setattr(GroundWire, "send", fail)
+    monkeypatch.setattr(commanding, "_SILENCE_S", 0.2)
+    monkeypatch.setattr(LinkFeed, "silence", 0.0)
+    put = during(feed, lambda: files.put("elements", "tle.txt", b"x" * 5000))
+    assert str(put) == (
+        "192.0.2.7:5010: cannot be reached: Network is unreachable; the received data is kept"
+    )
 
 
 @pytest.mark.parametrize("name", ["../key", "/etc/passwd", "a b", ""])

@@ -122,6 +122,39 @@ def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
     assert station.satellite.up[-1][:2] == ping[:2]
 
 
+def test_a_network_or_disk_that_fails_for_a_while_is_reported_once_and_ends_nothing(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_PING_PERIOD_S", 0.0)
+    problem = "192.0.2.7:5010: cannot be reached: Network is unreachable"
+
+    def fail(sealer: object, packet: bytes) -> int:
+        raise KnightCubeError(problem)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(station.satellite, "send_by", fail)
+        line = station.connect(station.line + SAFE)
+        station.satellite.say(TELEMETRY)
+        station.turn()
+        assert line.recv(4096) == TELEMETRY
+    assert station.complaints == [f"commands and pings are not sent: {problem}"]
+    assert (station.satellite.commands, station.gateway.up) == ([], 0)
+    line.sendall(SAFE)
+    station.turn()
+    assert [packet[:2] for packet in station.satellite.commands] == [SAFE[:2]]
+
+
+def test_the_gateway_keeps_the_counters_of_its_newest_pings_only(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_PING_PERIOD_S", 0.0)
+    for _ in range(200):
+        station.gateway.turn(0.0)
+    assert len(station.satellite.up) >= 200
+    assert len(station.gateway._own) < 100
+    assert station.gateway._own[-1] == len(station.satellite.up)
+
+
 def closed(line: socket.socket) -> bool:
     """Return whether the gateway has closed a connection without sending any byte."""
     try:
