@@ -25,8 +25,8 @@ from itertools import combinations
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.errors import KnightCubeError, UsageError
+from knightcube.astro.arrays import BoolArray, FloatArray, brief, finite_array, float_rows
+from knightcube.errors import ArgumentError, KnightCubeError, UsageError
 
 _PERMEABILITY = 1e-7
 """Vacuum permeability divided by 4 pi, T m/A."""
@@ -44,9 +44,9 @@ fraction of the moment."""
 _SATURATED = 1e-4
 """Weight in the Newton matrix of a coil at its current limit, relative to a coil below its limit."""
 _WEAKEST = 0.15
-"""Torque per unit current below which a torque direction is discarded, as a fraction of the largest torque
-per unit current of any direction. A torque in a discarded direction would need the full current, and scaling
-all currents to the limit would then reduce the torque in the other directions."""
+"""Torque, with the currents at their limits, below which a torque direction is discarded, as a fraction of
+the largest such torque of any direction. A torque in a discarded direction would need the full current, and
+scaling all currents to the limit would then reduce the torque in the other directions."""
 
 
 def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None) -> FloatArray:
@@ -104,7 +104,22 @@ class CoilMap:
     """
 
     def __init__(self, dipoles: FloatArray, current_limits: FloatArray, resistance: FloatArray) -> None:
-        """Raise UsageError if the coils cannot produce a dipole moment in every direction."""
+        """Raise UsageError if the coils cannot produce a dipole moment in every direction.
+
+        Raises ArgumentError for arrays of another shape, limits or resistances that are not positive, and a
+        coil without dipole moment.
+        """
+        dipoles = float_rows("dipoles", finite_array("dipoles", dipoles).T, 3).T
+        if dipoles.ndim != 2 or not np.any(dipoles, axis=0).all():
+            raise ArgumentError(
+                "dipoles", f"{brief(dipoles.tolist())}: give one column (3,), not zero, for each coil"
+            )
+        counts = dipoles.shape[1:]
+        current_limits = finite_array("current_limits", current_limits, counts)
+        resistance = finite_array("resistance", resistance, counts)
+        for name, values in (("current_limits", current_limits), ("resistance", resistance)):
+            if not (values > 0.0).all():
+                raise ArgumentError(name, f"{values.tolist()}: all must be above zero")
         normal = missing_direction(dipoles)
         if normal is not None:
             axis = ", ".join(f"{component:.2f}" for component in normal)
@@ -313,14 +328,18 @@ def allocate(
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):
         raise KnightCubeError(f"allocation: torque {wanted} or field {field} is not finite")
     turns = np.ones(3) if free is None else np.asarray(free, dtype=np.float64)
-    usable = np.ones(dipoles.shape[1]) if available is None else np.asarray(available, dtype=np.float64)
+    limits = np.asarray(limits, dtype=np.float64)
+    usable = np.ones(len(limits)) if available is None else np.asarray(available, dtype=np.float64)
+    usable = usable * (limits > 0.0)
     # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.
     effect = turns[:, None] * np.cross(dipoles.T, field).T * usable
     wanted = wanted * turns
+    directions, torques, _ = np.linalg.svd(effect * limits)
+    kept = directions[:, : len(torques)][:, torques > _WEAKEST * torques[0]]
     # The pseudo-inverse minimises the sum of (weights * currents)^2, which is proportional to the heat.
     weights = np.ones(len(usable)) if resistance is None else np.sqrt(resistance / resistance.max())
-    currents = np.linalg.pinv(effect / weights, rcond=_WEAKEST) @ wanted / weights * usable
-    excess = float(np.max(np.abs(currents) / limits))
+    currents = np.linalg.pinv(kept.T @ effect / weights) @ (kept.T @ wanted) / weights * usable
+    excess = float(np.max(np.abs(currents) / np.where(limits > 0.0, limits, 1.0)))
     if excess > 1.0:
         currents = currents / excess
     made = effect @ currents

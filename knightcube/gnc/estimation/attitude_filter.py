@@ -32,8 +32,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.astro.quaternion import exponential, twist
+from knightcube.astro.arrays import FloatArray, IntArray, finite_array
+from knightcube.astro.quaternion import compose, exponential, twist
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import ErrorState, StateBlock, gate_bounds, joined
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
@@ -86,6 +87,8 @@ of their mean square. The expected fraction is one for white noise (von Neumann 
 drift."""
 _SCALE_OVER = 64.0
 """Number of gyro samples over which the scale factor of the gyro noise is averaged."""
+LONGEST_GAP_NS = 3_600_000_000_000
+"""Longest time (ns) after the newest measurement to which the filter propagates its estimate."""
 _SHARE_ERROR = 0.15
 """Largest deviation of the fitted response g from 1 that an error of the modelled coil gain can explain."""
 
@@ -314,13 +317,20 @@ def first_checkpoint(
 ) -> Checkpoint:
     """Return the filter's first checkpoint, at the time of the later of the two measurements.
 
-    For a suspended body, the measured attitude is reduced to the angle about the thread.
+    An attitude that is older than the rate is rotated to the time of the rate. For a suspended body, the
+    measured attitude is reduced to the angle about the thread. Raises ArgumentError for an attitude that is
+    not a unit quaternion, and for values that are not finite.
     """
+    for measured in (attitude.quaternion, attitude.covariance, rate.rate, rate.covariance):
+        finite_array("measurement", measured)
     suspended, free = model.body.suspended, free_axes(model.body)
     a, b, c, d = attitude.quaternion.tolist()
     quaternion = exponential(0.0, twist((a, b, c, d)), 0.0) if suspended else (a, b, c, d)
     x, y, z = (free * (rate.rate - prior.bias)).tolist()
     bx, by, bz = prior.bias.tolist()
+    since = max(rate.time_ns - attitude.time_ns, 0) * 1e-9
+    if since:
+        quaternion = compose(exponential(since * x, since * y, since * z), quaternion)
     none = (0.0, 0.0, 0.0)
     state = FilterState(quaternion, (x, y, z), (bx, by, bz), none, prior.parameters, latency=prior.latency)
     newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
@@ -330,6 +340,10 @@ def first_checkpoint(
     by_states = np.zeros((6, SIZE))
     # The gyro measures the sum of rate and bias, so the errors of the estimated rate and bias are opposite.
     by_states[RATE, BIAS] = -np.eye(3)
+    if since:  # the error of the rate also changes the attitude
+        by_states[ATTITUDE, BIAS] = -since * np.eye(3)
+        alone[ATTITUDE, RATE] = alone[RATE, ATTITUDE] = since * alone[RATE, RATE]
+        alone[ATTITUDE, ATTITUDE] += since**2 * alone[RATE, RATE]
     # The body moves during the age of the samples, so the errors of attitude, rate and age are correlated.
     change = model.rate_change(state, np.zeros((SIZE, SIZE)), newest.time_ns)
     by_states[ATTITUDE, LATENCY], by_states[RATE, LATENCY] = (x, y, z), change.acceleration
@@ -420,7 +434,8 @@ class AttitudeFilter:
     def start(self, attitude: AttitudeMeasurement, rate: RateMeasurement) -> None:
         """Start from an attitude and a gyro rate.
 
-        For a suspended body, only the components of attitude and rate about the thread are used.
+        For a suspended body, only the components of attitude and rate about the thread are used. Raises
+        ArgumentError for values that are not finite.
         """
         first = first_checkpoint(self._model, self._layout, self._prior, attitude, rate)
         self._history.restart(first)
@@ -439,8 +454,14 @@ class AttitudeFilter:
         return self._history.newest_used.time_ns
 
     def measure(self, measurement: Measurement) -> bool:
-        """Apply a measurement at its own time, and return False if it failed the gate or was too late."""
+        """Apply a measurement at its own time, and return False if it failed the gate or was too late.
+
+        A measurement that follows the newest one by more than `LONGEST_GAP_NS` also fails the gate.
+        """
         self.nis = math.nan
+        if self._history and measurement.time_ns - self._history.newest.time_ns > LONGEST_GAP_NS:
+            self._count(type(measurement), used=False)
+            return False
         if self._branch is not None:
             if self._is_newest(measurement) and not isinstance(measurement, MeanRateMeasurement):
                 self._branch.replay.add(measurement)
@@ -524,7 +545,19 @@ class AttitudeFilter:
         return min(max(found, 0.0), LONGEST_LATENCY)
 
     def at(self, time_ns: int) -> Estimate:
-        """Return the newest estimate propagated to `time_ns`, without changing the filter."""
+        """Return the newest estimate propagated to `time_ns`, without changing the filter.
+
+        Raises ArgumentError if the filter has not started, or for a time more than `LONGEST_GAP_NS` after the
+        newest measurement.
+        """
+        if not self._history:
+            raise ArgumentError("time_ns", f"{time_ns}: the filter has not started: call start first")
+        if time_ns - self._history.newest.time_ns > LONGEST_GAP_NS:
+            raise ArgumentError(
+                "time_ns",
+                f"{time_ns}: more than an hour after the newest measurement at "
+                f"{self._history.newest.time_ns} ns: give a time in ns near the measurements",
+            )
         return self._model.estimate(self._history.newest, time_ns, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:

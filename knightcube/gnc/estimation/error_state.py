@@ -115,6 +115,21 @@ def weigh(covariance: FloatArray, value: FloatArray, rows: FloatArray, noise: Fl
     return Weighed(float(value.dot(weight).dot(value)), cross.dot(weight), cross, spread)
 
 
+def direction_error(observed: FloatArray, expected: FloatArray, across: FloatArray) -> FloatArray:
+    """Return the deviation (2,), rad, of an observed direction (3,) from an expected direction (3,).
+
+    The components are along the rows of `across` (2, 3), which are normal to the expected direction. Up to a
+    right angle, the length of the deviation is the sine of the angle between the directions. Beyond, it is
+    the angle, because the sine would make an opposite direction appear correct.
+    """
+    error = np.asarray(across @ observed)
+    if float(expected @ observed) < 0.0:
+        sine = math.hypot(*error.tolist())
+        angle = math.atan2(sine, float(expected @ observed))
+        return error * (angle / sine) if sine > 0.0 else np.array((angle, 0.0))
+    return error
+
+
 def updated(covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the covariance (n, n) of the states after a correction with any gain (n, k).
 

@@ -7,15 +7,35 @@ from the time stamp to give `time_ns`. The latency is None if the exact time of 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, float_rows
 from knightcube.astro.quaternion import Quaternion, Vector
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import slices
+
+
+def _check_arrays(measurement: Measurement, **shapes: tuple[int, ...]) -> None:
+    """Convert the attributes named in `shapes` to arrays of floats. Raises ArgumentError for other shapes.
+
+    Values that are not finite are permitted, because the filter rejects them.
+    """
+    for name, shape in shapes.items():
+        value = getattr(measurement, name)
+        if not isinstance(value, np.ndarray) or value.dtype != float:
+            value = float_rows(name, value, shape[-1])
+            object.__setattr__(measurement, name, value)
+        if value.shape != shape:
+            raise ArgumentError(name, f"an array of shape {value.shape}: give numbers of shape {shape}")
+
+
+_LENGTH = 0.1
+"""Largest accepted difference between the length of a measured quaternion and one."""
 
 
 class _AtOneTime:
@@ -44,6 +64,15 @@ class AttitudeMeasurement(_AtOneTime):
     latency: float | None = None
     by_stars: bool = False
 
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for arrays of another shape, and for a quaternion whose length is not one."""
+        _check_arrays(self, quaternion=(4,), covariance=(3, 3))
+        length = math.hypot(*self.quaternion.tolist())
+        if abs(length - 1.0) > _LENGTH:
+            raise ArgumentError(
+                "quaternion", f"{self.quaternion.tolist()}: length {length:g}: give a quaternion of length 1"
+            )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateMeasurement(_AtOneTime):
@@ -53,6 +82,10 @@ class RateMeasurement(_AtOneTime):
     rate: FloatArray
     covariance: FloatArray
     latency: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for arrays of another shape."""
+        _check_arrays(self, rate=(3,), covariance=(3, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +99,14 @@ class MeanRateMeasurement:
     time_ns: int
     rate: FloatArray
     covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for arrays of another shape, and for an exposure without duration."""
+        _check_arrays(self, rate=(3,), covariance=(3, 3))
+        if not self.since_ns < self.time_ns:
+            raise ArgumentError(
+                "since_ns", f"{self.since_ns}: the exposure must begin before its end at {self.time_ns} ns"
+            )
 
     @property
     def begin_ns(self) -> int:
@@ -88,6 +129,10 @@ class DirectionMeasurement(_AtOneTime):
     covariance: FloatArray
     sun_cameras: int = 0
 
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for arrays of another shape."""
+        _check_arrays(self, observed=(3,), reference=(3,), covariance=(3, 3))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldMeasurement(_AtOneTime):
@@ -101,6 +146,10 @@ class FieldMeasurement(_AtOneTime):
     field: FloatArray
     reference: FloatArray
     covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for arrays of another shape."""
+        _check_arrays(self, field=(3,), reference=(3,), covariance=(3, 3))
 
 
 Measurement = (

@@ -42,8 +42,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, IntArray, cross_matrix, cross_product, tangent_basis
+from knightcube.astro.arrays import (
+    FloatArray,
+    IntArray,
+    cross_matrix,
+    cross_product,
+    finite_array,
+    tangent_basis,
+)
 from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas
+from knightcube.astro.inertia import inertia_problem
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -51,10 +59,12 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import (
     ErrorState,
     Role,
     StateBlock,
+    direction_error,
     gate_bounds,
     joined,
     keep_scale,
@@ -142,8 +152,13 @@ class FreeMotion:
     """Euler's equation of a satellite in orbit, whose inertia differs from the assumed inertia."""
 
     def __init__(self, inertia: FloatArray) -> None:
-        """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes."""
-        self._assumed: FloatArray = np.asarray(inertia, dtype=float)
+        """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
+
+        Raises UsageError for an impossible tensor, with which a body in a tumble is predicted wrongly.
+        """
+        self._assumed: FloatArray = finite_array("inertia", inertia, (3, 3))
+        if problem := inertia_problem(self._assumed):
+            raise ArgumentError("inertia", f"{self._assumed.tolist()} {problem}")
         self.trace = float(np.trace(self._assumed))
         """Trace of the assumed inertia, kg m^2."""
         self.elements: FloatArray = self._assumed[_ROWS, _COLUMNS] / self.trace
@@ -690,7 +705,8 @@ class FreeFilter:
         misaligned = SUN_CAMERA if sun_cameras else HORIZON
         rows[:, ATTITUDE] = rows[:, misaligned] = across @ cross_matrix(expected)
         offset = rows[:, misaligned] @ self._constants[misaligned]
-        return self._update(across @ observed - offset, rows, across @ covariance @ across.T)
+        value = direction_error(observed, expected, across) - offset
+        return self._update(value, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
         """Apply a measured magnetic field (3,) T in body axes, with its covariance (3, 3) T^2.

@@ -49,7 +49,7 @@ from knightcube.astro.quaternion import (
     twist,
 )
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.gnc.estimation.error_state import reset, updated, weigh
+from knightcube.gnc.estimation.error_state import direction_error, reset, updated, weigh
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     FIELD_BIAS,
@@ -173,7 +173,7 @@ def _direction(state: FilterState, measurement: DirectionMeasurement, size: int)
     across = tangent_basis(expected)
     rows = np.zeros((2, size))
     rows[:, ATTITUDE] = across @ np.array(skew(expected))
-    first, second = (across @ measurement.observed).tolist()
+    first, second = direction_error(measurement.observed, np.array(expected), across).tolist()
     return Innovation((first, second), rows, across @ measurement.covariance @ across.T)
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize
 
+from knightcube.astro.arrays import FloatArray
 from knightcube.errors import KnightCubeError, UsageError
 from knightcube.gnc.control.coil_map import CoilMap, allocate, coil_field, limited
 
@@ -280,3 +281,41 @@ def test_redundant_coils_make_a_torque_with_the_least_heat() -> None:
     idle = np.eye(4) - np.linalg.pinv(effect) @ effect  # projects onto currents that cause no torque
     for change in rng.normal(scale=1e-3, size=(20, 4)) @ idle:
         assert ohms @ (found.currents + change) ** 2 > ohms @ found.currents**2
+
+
+@pytest.mark.parametrize("resistance", [None, np.array([10.0, 10.0, 100.0])])
+def test_a_coil_with_few_turns_and_a_large_current_makes_its_torque(resistance: FloatArray | None) -> None:
+    """An air coil makes a tenth of the dipole per ampere of two rods, but carries ten times their current."""
+    torque, field = np.array([0.0, 5e-6, 0.0]), np.array([3e-5, 0.0, 0.0])
+    limits = np.array([0.1, 0.1, 1.0])
+    found = allocate(torque, field, np.diag([3.0, 3.0, 0.3]), limits, resistance=resistance)
+    np.testing.assert_allclose(found.torque, torque, atol=1e-15)
+    assert found.share == pytest.approx(1.0)
+    assert found.currents[2] == pytest.approx(5e-6 / (0.3 * 3e-5))
+
+
+def test_a_coil_with_a_limit_of_zero_is_not_used() -> None:
+    torque = np.cross([1e-2, 0.0, 0.0], FIELD)
+    found = allocate(torque, FIELD, COILS, np.array([0.0, 10.0, 10.0]))
+    assert found.currents[0] == 0.0
+    assert found.share > 0.5
+    assert allocate(torque, FIELD, COILS, np.zeros(3)).currents.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"current_limits": np.ones(2)}, "current_limits: an array of shape"),
+        ({"current_limits": np.array([1.0, 0.0, 1.0])}, "current_limits: .* above zero"),
+        ({"resistance": np.array([1.0, -1.0, 1.0])}, "resistance: .* above zero"),
+        ({"resistance": np.array([1.0, np.nan, 1.0])}, "resistance: .* finite"),
+        ({"dipoles": np.diag([1.0, 1.0, 0.0])}, "dipoles: .* not zero"),
+        ({"dipoles": np.ones((2, 3))}, "dipoles: an array of shape"),
+    ],
+)
+def test_impossible_coils_are_refused_with_the_name_of_the_argument(
+    changes: dict[str, FloatArray], message: str
+) -> None:
+    given_coils = {"dipoles": TILTED, "current_limits": LIMITS, "resistance": OHMS}
+    with pytest.raises(UsageError, match=message):
+        CoilMap(**{**given_coils, **changes})

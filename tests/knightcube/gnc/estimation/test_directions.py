@@ -21,10 +21,11 @@ from knightcube.gnc.estimation.estimate import (
     FilterState,
     Measurement,
 )
+from knightcube.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
 from knightcube.gnc.estimation.mekf import correct, innovation
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow
-from tests.support.consistency_worlds import CYCLE_NS
+from tests.support.consistency_worlds import CYCLE_NS, INERTIA
 
 SIGMA = 1e-3
 REFERENCE: FloatArray = np.array([0.6, -0.48, 0.64])
@@ -193,3 +194,19 @@ def test_without_a_bias_of_the_magnetometer_none_is_estimated() -> None:
     estimate = filter_.at(CYCLE_NS)
     np.testing.assert_array_equal(estimate.field_bias, np.zeros(3))
     assert not np.any(estimate.covariance[FIELD_BIAS])
+
+
+def test_a_direction_opposite_to_the_expected_direction_is_refused() -> None:
+    """Across an opposite direction, the deviation is zero, so only its angle shows the error."""
+    flight = fly(11, 3, False)
+    for off in (0.0, 1e-3, 1.0):
+        estimate = begin(flight, False)
+        seen = direction(flight.attitudes[0], off=off)
+        opposite = replace(seen, observed=-seen.observed)
+        assert not estimate.measure(opposite)
+        assert estimate.nis > 100.0
+    satellite = FreeFilter(INERTIA, FreeFilterSettings())
+    satellite.start(flight.attitudes[0], 1e-4 * np.eye(3), np.zeros(3))
+    seen = direction(flight.attitudes[0])
+    assert not satellite.direction(-seen.observed, seen.reference, seen.covariance)
+    assert satellite.direction(seen.observed, seen.reference, seen.covariance)

@@ -16,6 +16,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_filter import (
     ATTITUDE,
@@ -285,3 +286,9 @@ def test_a_coil_that_is_known_exactly_stays_known() -> None:
     found = FreeFilter(INERTIA, EXACT)
     found.renew_coil(np.eye(3)[0], np.eye(3)[0], 0.3)
     assert not found.covariance[COILS, COILS].any()
+
+
+@pytest.mark.parametrize("inertia", [np.diag([0.21, 0.19, 0.004]), np.diag([1.0, -1.0, 1.0]), np.eye(2)])
+def test_an_impossible_inertia_is_refused(inertia: FloatArray) -> None:
+    with pytest.raises(ArgumentError, match="inertia"):
+        FreeFilter(inertia, FreeFilterSettings())
