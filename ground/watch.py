@@ -78,7 +78,7 @@ class PacketSource(Protocol):
         """Time (s) since the last packet."""
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name that arrived since the last call.
+        """Return the packets that arrived since the last call, by their names.
 
         Raises KnightCubeError or UsageError.
         """

@@ -330,7 +330,8 @@ def class_path() -> str:
 def compile_link(folder: Path) -> None:
     """Write the source of the data link into a folder and compile it.
 
-    Raises UsageError if the folder cannot be written, and KnightCubeError with the compiler's text.
+    Raises UsageError if the folder cannot be written, and KnightCubeError with the compiler's messages if the
+    compilation fails.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

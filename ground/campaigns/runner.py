@@ -412,7 +412,7 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
                 answer = None, error
             pipe.send(_sendable(case, answer))
             # A flight leaves reference cycles with large arrays. Because a flight suspends the collection of
-            # older objects, the automatic collection would not find these cycles for dozens of flights.
+            # older objects, the automatic collection would find these cycles only after dozens of flights.
             gc.collect()
 
 

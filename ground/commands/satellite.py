@@ -74,7 +74,7 @@ _SILENCE_S = 60.0  # default time (s) without a packet after which a file comman
 _TURN_S = 0.01  # longest time (s) to wait for packets before the protocol data units that are due are sent
 _SHOW_S = 1.0  # time (s) between two lines of progress
 _LINGER_S = 0.5
-"""Time (s) after a transfer in which the satellite may request a repetition of the last answer."""
+"""Time (s) after a transfer during which the satellite may ask again for the last answer."""
 
 
 def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:

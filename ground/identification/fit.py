@@ -373,7 +373,7 @@ def first_guess(record: Record) -> MotionConstants:
 
 
 def _gated(record: Record, constants: MotionConstants, noise: MotionNoise, gate: float) -> frozenset[int]:
-    """Return the samples beyond the gate, at which the filter restarts.
+    """Return the indices of the samples at which the filter restarts, because they lie beyond the gate.
 
     Raises IdentificationError if there are too many such samples.
     """

@@ -259,7 +259,7 @@ class Timeline:
 
     @classmethod
     def of(cls, record: Record, delay: float) -> Timeline:
-        """Return the events from the first to the last sample, with current changes delayed by `delay` s.
+        """Return the events from the first to the last sample; the coil currents change `delay` s late.
 
         The current before the first switch time is zero. Intervals longer than `MAX_STEP` are divided.
         """

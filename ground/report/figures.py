@@ -671,7 +671,7 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
 def day_figure(
     prediction: OrbitPrediction, stations: Sequence[Station], targets: Sequence[tuple[float, str]]
 ) -> Figure:
-    """Return the figure of a day: elevations above the stations, their passes, eclipses and targets.
+    """Return the figure of a day: the elevation at each station, passes, eclipses and targets.
 
     The `targets` are pairs of a start (s after the start of the span) and a name.
     """

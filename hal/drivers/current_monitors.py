@@ -11,8 +11,8 @@ An A/D converter ADS1115 (TI SBAS444) has four inputs. The current of a string f
 voltage is amplified; the output voltage per current is `volt_per_ampere`. A periodic job reads the completed
 conversion of one channel and starts the conversion of the next channel, on all converters at once. No call
 waits for a conversion, because a conversion takes 7.8 ms and the job runs at intervals of at least 10 ms. A
-current outside the measuring range is reported as the limit of the range, and the text `error` names its
-string.
+current outside the measuring range is reported as the limit of the range, and the text `error` names the
+string of solar cells.
 """
 
 from __future__ import annotations

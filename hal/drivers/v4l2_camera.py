@@ -419,7 +419,7 @@ class ExposureTiming:
     """Computation of exposure start times, and detection of exposures that are shorter than reported."""
 
     def __init__(self, settings: V4l2Settings, clock: Clock, counts: CameraCounts) -> None:
-        """Use the camera's settings and clock, and count contradictory frames in `counts`."""
+        """Use the camera's settings and clock, and count frames that contradict the settings in `counts`."""
         self._name = settings.path
         self._settings, self._clock, self._counts = settings, clock, counts
         self._arrival_stamps = False

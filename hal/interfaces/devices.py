@@ -258,7 +258,7 @@ class TorqueCoils(Protocol):
     def start(self, patient: bool = False) -> None:
         """Configure the chips with all outputs off.
 
-        Raises DeviceError if a chip does not answer, unless `patient` is true. A patient driver keeps trying.
+        Raises DeviceError if a chip does not answer. If `patient` is true, the driver keeps trying instead.
         """
 
     def command(self, currents: FloatArray) -> None:

@@ -317,7 +317,7 @@ def _is_uneven(background: Background) -> bool:
 
 
 def _share_uneven_numpy(level: FloatArray, noise: FloatArray) -> float:
-    """Return the fraction of blocks whose level (down, across) changes smoothly by more than the noise."""
+    """Return the fraction of blocks in which the level (rows, columns) has a smooth slope above the noise."""
     steep = np.zeros(level.shape, dtype=np.bool_)
     for values, floor, found in ((level, noise, steep), (level.T, noise.T, steep.T)):
         slope, bend = 0.5 * (values[2:] - values[:-2]), values[2:] - 2.0 * values[1:-1] + values[:-2]

@@ -322,8 +322,7 @@ LEARNED = (*PARAMETERS[:5], "line_time", "psf_sigma")
 """Names of the parameters estimated from frames, in the units px, px, px, none, none, s and px."""
 _LINE_TIME, _PSF = 9, 10
 _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
-"""Indices of the parameters LEARNED in an array that contains PARAMETERS, line time and point-spread width.
-"""
+"""Indices of the parameters in `LEARNED`, in an array of `PARAMETERS`, line time and point-spread width."""
 _SECOND_TERM = 1.0 / 3.0
 """Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
 _FOURTH_AS = -0.3, 1.2

@@ -431,7 +431,7 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
 def _turned(solution: StarSolution, back: FloatArray) -> StarSolution:
     """Return a solution in the axes of the given camera, into which `back` (4,) rotates the used lens's axes.
 
-    The axes of an estimated lens change from image to image, and the axes of the given camera do not.
+    The axes of the estimated lens change from image to image, whereas those of the given camera are fixed.
     """
     matrix, quaternion = attitude_matrix(back), multiply(back, solution.quaternion)
     pointing, rates = Pointing.of(quaternion), solution.rate_covariance

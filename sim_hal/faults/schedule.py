@@ -204,7 +204,7 @@ def other_driver(device: str, config: Config) -> str:
 
 
 def fitted(device: str, config: Config) -> bool:
-    """Return whether a configuration has the device of a fault."""
+    """Return whether a configuration contains the device of a fault."""
     if device == "planner":
         return config.replan_period() is not None
     if device.startswith(("coil-", "bridge-")):

@@ -8,8 +8,8 @@ axes of T at theta = 0. The coil on body x gives the torque n A B I cos(theta) (
 body z gives n A B I sin(theta), and the coil on body y has no effect because its axis lies along the thread.
 
 The body held by hand on a bench is the world of `knightcube bringup` with emulated devices. The body stands
-with its z axis up until it is rotated by hand. For devices that need an orbit, a satellite has the orbit of
-its configuration, as if a signal simulator were connected to the GPS receiver.
+with its z axis up until it is rotated by hand. The receiver and other devices that need an orbit are on the
+configured orbit, as if a signal simulator were connected to the GPS receiver.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ class StepReplay:
             self.free.renew(block, self.free.layout.prior[block, block], self._memories)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat the dipoles since a time as unknown, if the gate then accepts a rejected attitude.
+        """Treat the dipoles since `since_ns` as unknown if the gate then accepts the attitude `refused`.
 
         Dipole errors that are too small to be measured by the gyro accumulate in the attitude.
         """

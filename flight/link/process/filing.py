@@ -360,7 +360,7 @@ class Renewal:
             values["kind"] = KINDS[directive.kind]
         with suppress(OSError, FileError):
             self._folder.mkdir(mode=0o700, exist_ok=True)
-            # The other files of the folder are `contact`, `reported` and remains of interrupted writes.
+            # The other files of the folder are `contact`, `reported` and files of interrupted writes.
             if sum(other[-1:].isdigit() for other in os.listdir(self._folder)) >= MOST_WAITING:
                 return f"{MOST_WAITING} requests wait for the renewal program, which executes one every 10 s"
             write_whole(self._folder / name, encoded(values))  # the program never reads an incomplete request

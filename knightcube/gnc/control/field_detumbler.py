@@ -418,7 +418,7 @@ class FieldDetumbler:
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole moment (3,), A m^2: zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
-        if self._filter.started:  # before its start, only samples advance the filter's time
+        if self._filter.started:  # until the filter has started, its time is that of the newest sample
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()

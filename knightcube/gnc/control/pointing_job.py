@@ -9,8 +9,8 @@ From a distant attitude, the body can approach the commanded attitude by a slew 
 `slew_plan`, or `slew_vmc` on request, plans the slew with the disturbance torques that the attitude filter
 estimates. The planned dipole moments of the slew are used as feedforward. During the slew, the remaining slew
 is replanned from the newest estimates of motion, body and torques, with the present path as the initial guess
-(`rest_table`). The feedback gains are computed by linear-quadratic tracking along the slew and the following
-attitude law, and errors at the end of the slew have the highest cost. The pointing table also contains the
+(`rest_table`). The feedback gains are computed by linear-quadratic tracking along the slew and the attitude
+law after it, and errors at the end of the slew have the highest cost. The pointing table also contains the
 derivatives of the dipole moment with respect to the estimated torques.
 """
 
@@ -248,7 +248,7 @@ def slew_table(
     expected: PointingPreview,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the pointing table for a slew and the following attitude law.
+    """Return the pointing table for a slew and for the attitude law after it.
 
     The time step of the returned table is a fifth of the time step of `begin.times`.
 
@@ -410,10 +410,10 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Durations and steps of tables for permanent targets (first value), and for a passing object (second
+"""Durations and steps of tables for targets without an end (first value), and for a passing object (second
 value)."""
 _COVERED = 1.25
-"""Shortest prediction for a permanent target, in revolutions of the orbit."""
+"""Minimum length of the prediction for a target without an end, in revolutions of the orbit."""
 _LONGEST = 10_000.0
 """Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0

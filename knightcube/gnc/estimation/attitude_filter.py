@@ -540,7 +540,7 @@ class AttitudeFilter:
 
     @property
     def latency(self) -> float:
-        """Estimated age (s) of the inertial unit's samples at their time stamps, between plausible limits."""
+        """Estimated age (s) of the inertial unit's samples at their time stamps, within plausible limits."""
         found = self._history.newest.state.latency if self._history else self._prior.latency
         return min(max(found, 0.0), LONGEST_LATENCY)
 

@@ -711,7 +711,7 @@ class FreeFilter:
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
         """Apply a measured magnetic field (3,) T in body axes, with its covariance (3, 3) T^2.
 
-        The field model gives the field `reference` (3,) T in ICRS.
+        The field `reference` (3,), T, in ICRS axes is that of the field model.
         """
         expected = attitude_matrix(self.quaternion) @ reference
         matrix = _EYE + self._matrix(FIELD_MATRIX)

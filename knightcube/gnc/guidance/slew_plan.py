@@ -151,7 +151,7 @@ _ASTRAY = 1.05
 """Ratio of the dipole to the dipole limit that is assumed for a path whose integration fails."""
 
 _ENDS = 9
-"""Number of durations for which the error message checks whether the slew would end inside a cone."""
+"""Number of durations of a failed slew for which its end is checked, to name a cone in the error message."""
 
 
 _HOPELESS = 10.0

@@ -9,8 +9,8 @@ control parameters per axis are free.
 The torque that a path needs is computed by inverse dynamics. Coils cause no torque along the magnetic field,
 so an equality constraint sets the component of the needed torque along the field to zero on all nodes. Of all
 dipole moments that cause the needed torque, the dipole moment of least heat is used, and the cost is the
-heat. Limits of the dipole moment and exclusion cones are imposed at those quadrature points at which the
-previous solution exceeded a limit. When the dipole limit is reached, the planner does not reduce the largest
+heat. The dipole limits and the exclusion cones are imposed at those quadrature points at which the previous
+solution violated one of them. When the dipole limit is reached, the planner does not reduce the largest
 component by adding a dipole moment along the field.
 
 The initial guesses are the smooth rotation about the eigenaxis and the guesses of `slew_search`. The module

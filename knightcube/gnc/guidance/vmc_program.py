@@ -13,10 +13,11 @@ Each column of the matrix M is a change of the path that preserves the values an
 changes are combined so that the energy has about a unit Hessian (whitening). Paths are therefore affine
 functions of the optimisation variables, and the optimisation is well conditioned.
 
-Two programs have the same energy and limits: one minimises the energy for a fixed duration, the other
-minimises the energy plus the time cost of a free duration. The limits hold at every time and not only at the
-nodes. The limits are imposed at those points of a dense grid at which the previous solution exceeded a limit,
-until no limit is exceeded (the exchange method of semi-infinite programming).
+There are two optimisation problems with the same function of the energy and the same limits: one has a fixed
+duration and minimises the energy, the other has a free duration and minimises energy plus time cost. The
+limits hold at every time and not only at the nodes. The limits are imposed at those points of a dense grid at
+which the previous solution exceeded a limit, until no limit is exceeded (the exchange method of semi-infinite
+programming).
 """
 
 from __future__ import annotations

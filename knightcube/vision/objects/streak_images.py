@@ -334,7 +334,7 @@ _NODES = 33
 _LEAST_AHEAD = 0.85
 # Distance from a path, in standard deviations, beyond which the compiled form omits the light.
 _DARK = 7.0
-# Number of points of a path below which the image of a streak is the sum of the images of its points.
+# If the path of a streak has fewer points, its image is the sum of the images of these points.
 _LEAST_POINTS = 4
 
 

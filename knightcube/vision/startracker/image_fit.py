@@ -65,9 +65,9 @@ class Unknowns:
             (8,) if the pixels may not be square; empty (0,) if the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
-        scatter: whether a variance common to all stars is added to the variances of the positions for any
-            excess of the residuals. If `scatter` is false, a common variance is added only if the excess of
-            the residuals is significant and a factor common to all variances explains it less well.
+        scatter: whether a variance common to all stars is added to the variances of the positions as soon as
+            the residuals are larger than expected. If `scatter` is false, a common variance is added only if
+            this excess is significant and a factor common to all variances explains it less well.
     """
 
     scale: bool = False

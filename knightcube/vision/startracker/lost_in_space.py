@@ -66,8 +66,8 @@ class TriangleMatches:
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint16.
         star: indices of the guide stars at the corresponding corners (k, 3), uint16.
-        scale: binary logarithm (k,), int32, in units of 1 / `OCTAVE`, of the factor on the observed tangents
-            that makes the longest sides of both triangles equal.
+        scale: factor on the observed tangents that makes the longest sides of both triangles equal, as
+            `OCTAVE` times its binary logarithm (k,), int32.
     """
 
     observed: npt.NDArray[np.uint16]
@@ -356,7 +356,7 @@ _RUNS_AHEAD, _CACHE_LINE = 256, 16
 
 @loop_helper
 def _fields(entry: np.uint32) -> tuple[np.uint32, np.uint32, np.uint32]:
-    """Return the longest side and both positions in an entry of the index."""
+    """Return the longest side and the two positions that an entry of the index contains."""
     return entry >> np.uint32(16), entry >> np.uint32(8) & np.uint32(0xFF), entry & np.uint32(0xFF)
 
 

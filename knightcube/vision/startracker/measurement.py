@@ -48,7 +48,7 @@ LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
 """Half-width of a star's window (PSF standard deviations), limited to `LEAST_HALF` to `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
+# Assumed mismatch between PSF and Gaussian in the second fit, as a fraction of the star's counts.
 # A mismatch as large as in the first fit would give weight only to the wings of bright stars.
 _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.

@@ -79,7 +79,7 @@ class FrameSolution:
         faint: whether the stars were identified by the light of faint stars (`solve_faint`).
         motion: motion of the camera from the streaks, camera frame, or None for points.
         mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
-            image after left and right are swapped about the optical axis. The points of a solution are those
+            image after it is flipped left to right at the optical axis. The points of a solution are those
             of the original image even for a mirrored sky.
         psf_sigma: measured standard deviation of the point spread, px; NaN if unknown.
     """

@@ -283,7 +283,7 @@ _REVERSED = 30.0
 _DOUBLE = 8.0
 # Minimum flux ratio of the fainter to the brighter component of a double image.
 _DOUBLE_RATIO = 0.3
-# Largest fraction of double images with which the rate of a frame is accepted.
+# Largest fraction of stars with a double image in a frame whose rate is accepted.
 _MOST_DOUBLE = 0.4
 # Distance (px) below which two fitted streaks count as the same star.
 _SAME = 1.5

@@ -76,7 +76,7 @@ class Circles:
 
 
 ScannedAngle = tuple[float, FloatArray, FloatArray]
-"""Trial rotation angle, rad, with the positions (n, 2), px, and fluxes (n,), counts, of its n stars."""
+"""Trial rotation angle, rad, and positions (n, 2), px, and fluxes (n,), counts, of the stars found by it."""
 
 
 def scan_angles(

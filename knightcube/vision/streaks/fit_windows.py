@@ -40,7 +40,8 @@ STEEPEST = 0.68
 
 SLOWEST = 1e-3
 """Lower limit (px per exposure) of a star's speed, which avoids divisions by zero."""
-# Largest camera rotation (rad) in one part of a path, along which column or row must change monotonically.
+# Largest camera rotation (rad) in one part of a path. The column or the row of a star must change
+# monotonically along each part.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is sampled to find where it crosses lines of pixels.
 _CROSSING_SAMPLES = 17

@@ -640,7 +640,7 @@ def mid_exposure_positions(
 
 
 def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> FloatArray:
-    """Return the path lengths (n,), px, during the exposure of stars that are at `stars` (n, 2), px."""
+    """Return the lengths (n,), px, of the paths of stars at `stars` (n, 2), px, during the exposure."""
     samples, count = len(_SAMPLED), len(stars)
     repeated, time = np.concatenate([stars] * samples), np.repeat(_SAMPLED, count)
     there = positions(pinhole, motion, repeated, time).reshape(samples, count, 2)

@@ -200,7 +200,7 @@ class StreakFit:
     hidden: StreakScene | None = None
 
     def grows(self) -> bool:
-        """Return whether the rate changes significantly, by a score test of the constant rate.
+        """Return whether a score test rejects a constant rate.
 
         If the scatter of the stars' estimates exceeds their noise, the significance is computed from the
         scatter (Hotelling's T-squared test). Therefore, a single blended star cannot make the step of the

@@ -19,7 +19,7 @@ cumulant of a uniform distribution over the pixel, -1/120 along each axis, corre
 path. The following equation gives the change dm of the counts if a parameter displaces the path at time t by
 c(t).
 
-    dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
+    dm = c_n (n/w^2) m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
 In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
 per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with

@@ -47,7 +47,7 @@ _AT_ONCE = 32
 
 
 Rotations = Callable[[FloatArray], FloatArray]
-"""Function that returns p rotation vectors (p, 3, m), rad, at m instants, in exposures since mid-exposure."""
+"""Function of m times since mid-exposure, in exposure times. It returns p rotation vectors (p, 3, m), rad."""
 
 
 class _Instants(NamedTuple):
