@@ -192,9 +192,9 @@ def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArr
 def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> FloatArray:
     """Return the apparent rate changes (n, 3, m), rad per exposure, of n stars due to m calibration errors.
 
-    Each calibration error has the size of its standard deviation. Exactly known calibration parameters are omitted. The last of the m errors is the error of the
-    line time. A streak determines the position of its path perpendicular to the path, and its ends determine
-    the length.
+    Each calibration error has the size of its standard deviation. Exactly known calibration parameters
+    are omitted. The last of the m errors is the error of the line time. A streak determines the position
+    of its path perpendicular to the path, and its ends determine the length.
     """
     errors = _error_root(camera)
     n = len(scene.stars)
