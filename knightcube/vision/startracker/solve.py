@@ -231,6 +231,8 @@ _LOOKED_FOR = 30
 # Minimum and maximum search radius (px) around a predicted position.
 # If a larger search radius is needed, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
+# Maximum number of fits with larger variances of the stars that unresolved catalogue stars displace.
+_COMPANION_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,6 +294,7 @@ def solve_points(
     solution = solve_places(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
+    solution = _beside_companions(solution, found, camera, scale, sky, settings)
     return _shape_unknown(solution, found, settings)
 
 
@@ -442,8 +445,71 @@ def solve_near(
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
     if near.status is not MatchStatus.IDENTIFIED:
         return None
-    solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found, settings)
+    solution = _with_attitude(seen, near, sky, settings)
+    solution = _beside_companions(solution, found, camera, scale, sky, settings)
+    solution = _shape_unknown(solution, found, settings)
     return solution if _agrees(solution, prior) else None
+
+
+def _beside_companions(
+    solution: FrameSolution,
+    found: Detections,
+    camera: CameraModel,
+    scale: tuple[float, float],
+    sky: SkyIndex,
+    settings: SolveSettings,
+) -> FrameSolution:
+    """Return the solution with larger variances of the stars that an unresolved catalogue star displaces.
+
+    A bright star that is measured together with a fainter neighbour is displaced by several of its standard
+    deviations. Such a star can dominate the attitude and exclude undisplaced stars. If a star is displaced by
+    more than its standard deviation, the stars are matched and the attitude is fitted again. The new attitude
+    may match a displaced star that did not match before, so the check is repeated. The `camera` and `scale`
+    must be those with which `solution` was computed.
+    """
+    for _ in range(_COMPANION_ROUNDS):
+        shift = _shift_by_companions(solution, found.psf_sigma, sky)
+        displaced = shift**2 > 0.5 * np.trace(solution.covariance, axis1=1, axis2=2)
+        if solution.fix is None or not np.any(displaced):
+            break
+        seen = _mirrored(solution) if solution.mirrored else solution
+        doubt = np.where(displaced, shift**2, 0.0)[:, None, None] * np.eye(2)
+        seen = replace(seen, camera=camera, covariance=seen.covariance + doubt)
+        sigma = float(shift.max()) / solution.camera.focal_length
+        near = track(star_field(seen, found.flux, scale), sky, solution.fix.quaternion, sigma)
+        again = _with_attitude(seen, near, sky, settings)
+        if near.status is not MatchStatus.IDENTIFIED or again.status is not SolveStatus.SOLVED:
+            break
+        again = replace(again, log10_false_alarm=solution.log10_false_alarm)
+        solution = _mirrored(again) if solution.mirrored else again
+    return solution
+
+
+def _shift_by_companions(solution: FrameSolution, psf_sigma: float, sky: SkyIndex) -> FloatArray:
+    """Return by how many px (n,) catalogue stars that were not measured displace the measured stars.
+
+    A fit of a Gaussian with the width s to noise of equal variance in all pixels is displaced by the fraction
+    exp(-d^2 / 4 s^2) of the distance d, times the ratio of the fluxes. For noise that grows with the
+    brightness, the displacement is about twice as large; this displacement is returned.
+    """
+    shift = np.zeros(len(solution.points))
+    if solution.fix is None or not math.isfinite(psf_sigma):
+        return shift
+    camera, star = solution.camera, solution.star[solution.matched]
+    half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
+    matrix = attitude_matrix(solution.fix.quaternion)
+    companion = np.setdiff1d(expected_stars(sky, matrix, half_width, len(sky.stars)), star)
+    # A point near a companion that does not match a star is the companion, which was fitted with the star.
+    seen = _mirrored(solution) if solution.mirrored else solution
+    rest = camera.unit_vectors(np.delete(seen.points, solution.matched, axis=0)) @ matrix
+    nearest = np.max(sky.stars.direction[companion] @ rest.T, axis=1, initial=-1.0)
+    companion = companion[np.arccos(np.minimum(nearest, 1.0)) * camera.focal_length > psf_sigma + 0.5]
+    apart = sky.stars.direction[companion] - sky.stars.direction[star, None]
+    distance = camera.focal_length * np.linalg.norm(apart, axis=-1)
+    fainter = sky.stars.magnitude[companion] - sky.stars.magnitude[star, None]
+    weight = 2.0 * np.exp(-(distance**2) / (4.0 * (psf_sigma**2 + PIXEL_VARIANCE)))
+    shift[solution.matched] = np.sum(distance * np.minimum(10.0 ** (-0.4 * fainter) * weight, 1.0), axis=1)
+    return shift
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
