@@ -80,8 +80,9 @@ from knightcube.gnc.guidance.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSea
 STRETCH = 3.0
 """Default of the longest duration to which `plan_slew` extends a slew, as a multiple of the requested
 duration."""
-_STEPS = 4
-"""Number of Runge-Kutta steps per collocation interval, an even number."""
+_STEPS, _LONGEST_STEP = 4, 16.0
+"""Smallest number of Runge-Kutta steps per collocation interval, and longest step, s. The number is even.
+Gravity gradient amplifies errors of the integration by a factor of ten in about 20 minutes."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
 """Largest number of corrections of a path, error at the nodes (half angle, rad) below which the corrections
 end, and error at the nodes above which the plan of the path fails."""
@@ -97,9 +98,10 @@ def closed(
     """
     equations, at = program.equations, point.at
     layout, count, scale = equations.layout, equations.count, equations.scale
-    around = along(np.linspace(0.0, scale, 2 * _STEPS * count + 1))
+    twice = 2 * max(_STEPS, 2 * math.ceil(scale / (2.0 * _LONGEST_STEP * count)))
+    around = along(np.linspace(0.0, scale, twice * count + 1))
     motion = SlewDynamics(craft, scale, unit, around)
-    motions = [motion.part(slice(k, 2 * _STEPS * count + k, 2 * _STEPS)) for k in range(2 * _STEPS + 1)]
+    motions = [motion.part(slice(k, twice * count + k, twice)) for k in range(twice + 1)]
     factors = program.factors(point)
     middles, ends = _integrated(motions, at, 1.0 / count)
     for _ in range(_ROUNDS):
@@ -119,18 +121,22 @@ def closed(
 
 
 def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> tuple[FloatArray, FloatArray]:
-    """Return the integrated states (k, 7) in the middle and at the end of k intervals."""
-    x, h = at.states[:-1:2], length / _STEPS
-    slope = (at.dipoles[1:] - at.dipoles[:-1]) / (2 * _STEPS)
+    """Return the integrated states (k, 7) in the middle and at the end of k intervals.
+
+    The equations of motion `motions` are given at the ends and middles of all steps within the intervals.
+    """
+    twice = len(motions) - 1
+    x, h = at.states[:-1:2], 2.0 * length / twice
+    slope = (at.dipoles[1:] - at.dipoles[:-1]) / twice
     middle = x
-    for k in range(0, 2 * _STEPS, 2):
+    for k in range(0, twice, 2):
         m = [at.dipoles[:-1] + (k + part) * slope for part in range(3)]
         first = motions[k].flow(x, m[0])
         second = motions[k + 1].flow(x + 0.5 * h * first, m[1])
         third = motions[k + 1].flow(x + 0.5 * h * second, m[1])
         last = motions[k + 2].flow(x + h * third, m[2])
         x = x + h / 6.0 * (first + 2.0 * second + 2.0 * third + last)
-        if k + 2 == _STEPS:
+        if 2 * (k + 2) == twice:
             middle = x
     return middle, x
 
@@ -154,6 +160,8 @@ _ENDS = 9
 """Number of durations of a failed slew for which its end is checked, to name a cone in the error message."""
 
 
+_LONGEST_INTERVAL = 250.0
+"""Length (s) of a collocation interval up to which paths are found in a low orbit."""
 _HOPELESS = 10.0
 """Ratio of the required dipole to the dipole limit above which no other start time is tried. Along an orbit,
 the energy varies by a factor of up to ten, and the dipole by a factor of about three."""
@@ -298,6 +306,11 @@ def refusal(task: SlewTask, tried: int, least: float = math.inf) -> str:
         return (
             f"{text}: without the limit, a slew of {task.horizon:g} s needs {least:.3g} times the dipole "
             "limit: check that inertia is in kg m^2 and the dipole limit in A m^2, or allow a longer time"
+        )
+    if task.horizon > _LONGEST_INTERVAL * task.nodes:
+        return (
+            f"{text}: in intervals of {task.horizon / task.nodes:.0f} s, the field rotates too far: give at "
+            f"least {math.ceil(task.horizon / _LONGEST_INTERVAL)} nodes, or a shorter duration"
         )
     return f"{text}: allow a longer time or another start"
 

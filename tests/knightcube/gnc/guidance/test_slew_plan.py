@@ -252,3 +252,24 @@ def test_a_small_cost_of_time_gives_a_slow_slew_of_little_heat() -> None:
     assert free.energy + cost * free.horizon <= 1.01 * (fixed.energy + cost * fixed.horizon)
     assert free.horizon > 180.0
     assert free.peak < 0.5
+
+
+def test_a_slew_over_a_whole_orbit_ends_in_its_target() -> None:
+    """Over 6,000 s, the gravity gradient amplifies errors of the integration a thousand times.
+
+    The dipoles of the plan are integrated in the environment of the task, in steps of 12.5 s.
+    """
+    *_, (_, task) = slews(2, 75, False)
+    task = replace(task, horizon=6000.0, longest=6000.0)
+    plan = plan_task(task)
+    end = task.end(plan.horizon)
+    assert isinstance(end, AttitudeEnd)
+    assert off_degrees(flown(plan, task)[:4], end.quaternion) <= 0.005
+
+
+def test_a_refusal_of_a_slew_in_long_intervals_states_the_number_of_nodes() -> None:
+    text = slew_plan.refusal(small_slew(horizon=12_000.0, longest=20_000.0, nodes=24), 16)
+    assert text.endswith(
+        "in intervals of 500 s, the field rotates too far: give at least 48 nodes, or a shorter duration"
+    )
+    assert "nodes" not in slew_plan.refusal(small_slew(), 16)
