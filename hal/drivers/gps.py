@@ -440,7 +440,9 @@ class UbloxReceiver:
         now_ns, port = self._clock.now_ns(), self._port
         decoded_ns = max(*self._arrivals_ns.values(), self._rate_ns)
         if self._return_ns is not None:
-            if now_ns >= self._return_ns:
+            if self._is_due:  # the receiver has reported that another of its ports is connected
+                self._command_rate(now_ns)
+            elif now_ns >= self._return_ns:
                 self._return_ns, self._is_due = None, True
                 self._change_rate(self._own_rate)
         elif port.baud_rate == self._own_rate:
@@ -449,11 +451,18 @@ class UbloxReceiver:
                 self._others.append(self._others.pop(0))
                 self._change_rate(self._others[-1])
         elif decoded_ns > self._rate_ns:
-            self._found_rate, self._return_ns = port.baud_rate, now_ns + _RETURN_NS
-            rate = value_frame({BAUD_RATE_KEYS[UART1]: self._own_rate})
-            port.send(port_set_up(self._own_rate) + rate)
+            self._found_rate = port.baud_rate
+            self._command_rate(now_ns)
         elif now_ns - self._rate_ns >= self._silence_ns:
             self._change_rate(self._own_rate)
+
+    def _command_rate(self, now_ns: int) -> None:
+        """Command the configured baud rate at the receiver's connected port, and ask which port this is."""
+        self._return_ns, self._is_due = now_ns + _RETURN_NS, False
+        port = self._receiver_port if self._receiver_port in BAUD_RATE_KEYS else UART1
+        rate = value_frame({BAUD_RATE_KEYS[port]: self._own_rate})
+        # A receiver that has changed its baud rate would send the answer at the new one.
+        self._port.send(frame(CFG_PRT) + port_set_up(self._own_rate, port) + rate)
 
     def _change_rate(self, baud_rate: int) -> None:
         self._port.set_baud_rate(baud_rate)

@@ -343,6 +343,18 @@ def test_a_receiver_at_its_factory_baud_rate_is_found_and_set_to_the_configured_
     assert gps.driver.link().condition == ""
 
 
+@pytest.mark.parametrize("protocol", [18.0, 23.0, 27.0, 32.0])
+@pytest.mark.parametrize("ports", [(UART2, UART1), (UART2,)])
+def test_a_receiver_at_another_baud_rate_is_changed_on_the_port_in_use(
+    protocol: float, ports: tuple[int, ...]
+) -> None:
+    gps = bench()
+    gps.gps.protocol, gps.gps.ports, gps.line.device.baud_rate = protocol, ports, 9600
+    gps.fly(60.0)
+    assert (gps.line.device.baud_rate, gps.line.host.baud_rate) == (115200, 115200)
+    assert sum(reading.valid for reading in gps.fly(4.0)) >= 3
+
+
 def test_a_receiver_that_does_not_obey_is_named_with_its_baud_rate() -> None:
     gps = bench()
     gps.gps.obeys, gps.line.device.baud_rate = False, 9600
