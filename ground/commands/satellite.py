@@ -595,10 +595,10 @@ class _FileWork:
             self._turn("")
         return {"text": f"completed: {directive}"}
 
-    def _transmit(self, now_ns: int) -> None:
-        """Send what is due. A failure of the network is reported once, and ends the work if it lasts."""
+    def _try(self, use: Callable[[], object]) -> None:
+        """Use the line. A failure of the line is reported once, and ends the work if it lasts."""
         try:
-            self._session.transmit(now_ns)
+            use()
         except FileError:
             raise
         except KnightCubeError as error:
@@ -606,14 +606,14 @@ class _FileWork:
                 raise
             if str(error) != self._said:
                 self._said = str(error)
-                sys.stderr.write(f"knightcube: frames are not sent: {error}; tried again\n")
+                sys.stderr.write(f"knightcube: {error}; tried again\n")
 
     def _turn(self, name: str) -> None:
         """Receive and send what is due. Raises KnightCubeError after a signal or a long silence."""
         if select.select([self._terminal], [], [], _TURN_S)[0]:
-            self._session.take(self._terminal.take(), time.monotonic_ns())
+            self._try(lambda: self._session.take(self._terminal.take(), time.monotonic_ns()))
         now_ns = time.monotonic_ns()
-        self._transmit(now_ns)
+        self._try(lambda: self._session.transmit(now_ns))
         kept = "; the received data is kept: run the same command again to continue" if name else ""
         if self._ended():
             raise KnightCubeError(f"ended by a signal{kept}")

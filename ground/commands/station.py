@@ -138,7 +138,7 @@ def run_watch(options: argparse.Namespace) -> int:
         with contextlib.closing(LinkFeed(terminal_of(options))) as feed:
             status = _watch(options, feed, options.patience, "over the link")
             if feed.problem:
-                sys.stderr.write(f"knightcube: pings are not sent: {feed.problem}\n")
+                sys.stderr.write(f"knightcube: {feed.problem}\n")
             return status
     folder = Path(options.flight)
     if folder.is_socket() or (":" in options.flight and not folder.exists()):

@@ -242,8 +242,8 @@ class LinkFeed:
         """Return the packets by name received since the last call.
 
         If the flight software was restarted since then, only the packets after the restart are returned. A
-        failure to send is stored in `problem`, because telemetry may still arrive. Raises KnightCubeError if
-        the line is lost.
+        failure to send is stored in `problem`, because telemetry may still arrive. Raises FileError if the
+        disk of the file transfers fails.
         """
         with self.lock:
             now = time.monotonic()
@@ -251,7 +251,10 @@ class LinkFeed:
                 self._asked = now
                 with contextlib.suppress(KnightCubeError):
                     self._terminal.send(self._packer.pack(commands.Ping(), utc_ns()), _SPI)
-            packets = list(self._terminal.packets(_LISTEN_S))
+            packets = list[tuple[int, bytes]]()
+            with contextlib.suppress(KnightCubeError):  # the next ping opens a lost line again
+                for packet in self._terminal.packets(_LISTEN_S):
+                    packets.append(packet)
             if self._session is not None:
                 self._session.take(packets, time.monotonic_ns())
                 try:

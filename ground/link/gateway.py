@@ -48,7 +48,8 @@ _READ_BYTES = 1 << 16
 _PING_PERIOD_S = 20.0
 """Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""
 _KEPT_PINGS = 64  # number of the gateway's newest pings whose reports are not relayed
-_UNSENT_S = 60.0  # time (s) without a failure after which the same failure to send is reported again
+_FAILURE_S = 60.0  # time (s) without a failure after which the same failure of the line is reported again
+_RETRY_S = 2.0  # time (s) from a failure of the line to the next ping, which opens a lost stream again
 _TOKEN_S = 5.0  # time (s) after which a connection without the token is closed
 _MOST_WITHOUT_TOKEN = 256
 """Maximum number of connections that have not sent the token; a further connection closes the oldest."""
@@ -214,7 +215,7 @@ class Gateway:
         self._packer = CommandPacker()
         self._asked_at: float | None = None
         self._own: deque[int] = deque(maxlen=_KEPT_PINGS)  # counters of the gateway's own pings
-        self._unsent, self._unsent_at = "", -math.inf  # reason and time of the last failure to send
+        self._failure, self._failed_at = "", -math.inf  # reason and time of the line's last failure
         self._connections: dict[socket.socket, _StationConnection] = {}
         self.down = self.up = self.refused = 0
         try:
@@ -237,10 +238,7 @@ class Gateway:
         return int(self._listener.getsockname()[1])
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Relay packets until `ended` returns true.
-
-        Raises KnightCubeError if the line to the satellite was closed.
-        """
+        """Relay packets until `ended` returns true."""
         while not ended():
             self.turn(0.2)
 
@@ -255,8 +253,11 @@ class Gateway:
         reading: list[Terminal | socket.socket] = [self._terminal, self._listener, *self._connections]
         ready, writable, _ = select.select(reading, waiting, [], seconds)
         if self._terminal in ready:
-            for _, packet in self._terminal.take():
-                self._hand_over(packet)
+            try:
+                for _, packet in self._terminal.take():
+                    self._hand_over(packet)
+            except KnightCubeError as error:
+                self._note_failure(str(error))
         if self._listener in ready:
             self._accept()
         for line in [line for line in ready if line in self._connections]:
@@ -276,17 +277,21 @@ class Gateway:
     def _send(self, packet: bytes) -> int | None:
         """Send a packet and return its frame counter, or None for a packet that cannot be sent now.
 
-        The network or the disk of the counters may fail for a while. Each reason is reported once, and again
-        if it returns after a minute.
+        The network, the line or the disk of the counters may fail for a while.
         """
         try:
             return self._terminal.send_by(self._sealer, packet)
         except KnightCubeError as error:
-            now = time.monotonic()
-            if str(error) != self._unsent or now - self._unsent_at > _UNSENT_S:
-                self._complain(f"commands and pings are not sent: {error}")
-            self._unsent, self._unsent_at = str(error), now
+            self._note_failure(f"commands and pings are not sent: {error}")
             return None
+
+    def _note_failure(self, reason: str) -> None:
+        """Try the line again soon. Each reason is reported once, and again if it returns after a minute."""
+        now = time.monotonic()
+        self._asked_at = now - _PING_PERIOD_S + _RETRY_S
+        if reason != self._failure or now - self._failed_at > _FAILURE_S:
+            self._complain(reason)
+        self._failure, self._failed_at = reason, now
 
     def _hand_over(self, packet: bytes) -> None:
         if packet[:2] == _VERIFIED:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import os
 import select
 import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -38,6 +40,7 @@ _STORE_EVERY = 256  # number of telemetry frames between two writes of the anti-
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
+_RECONNECT_S = 2.0  # minimum time (s) between two attempts to open a stream
 _LOST = -2  # value of `highest` in the packet `link` for an SPI whose counter is lost
 PORTS = 1 << 16  # number of TCP and UDP ports
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
@@ -98,7 +101,7 @@ class GroundLine(Protocol):
         """Return the file descriptor for `select`."""
 
     def receive(self) -> list[bytes]:
-        """Return the received frames. Raises KnightCubeError if the line was closed."""
+        """Return the received frames. Raises KnightCubeError once if the line is lost."""
 
     def send(self, frame: bytes) -> None:
         """Send a frame. Raises KnightCubeError."""
@@ -337,39 +340,104 @@ class UdpGround:
         self._socket.close()
 
 
-class StreamGround:
-    """Stream of frames over TCP or a serial line."""
+Opened = tuple[int, Callable[[], object]]
+"""File descriptor of an open stream, and the function that closes the stream."""
 
-    def __init__(self, name: str, file: int, framing: Framing, close: Callable[[], object]) -> None:
-        """Create a stream on an open file descriptor."""
-        self._name = name
-        self._file = file
-        self._framing = framing
+
+class StreamGround:
+    """Stream of frames over TCP or a serial line. A lost stream is opened again when a frame is sent."""
+
+    def __init__(self, name: str, framing: Framing, connect: Callable[[], Opened]) -> None:
+        """Open a stream by the function `connect`. Raises KnightCubeError if it raises OSError."""
+        self._name, self._framing, self._connect = name, framing, connect
+        # The descriptor of the poll object stays the same when the stream is opened again.
+        self._readable = select.epoll()
+        self._file = -1
+        self._close: Callable[[], object] = _nothing
+        self._tried, self._problem = -math.inf, ""
         self._stream = framing.stream()
-        self._close = close
+        try:
+            self._open()
+        except KnightCubeError:
+            self._readable.close()
+            raise
 
     def fileno(self) -> int:
-        """Return the file descriptor."""
-        return self._file
+        """Return a file descriptor that is readable while the stream is readable."""
+        return self._readable.fileno()
 
     def receive(self) -> list[bytes]:
-        """Return the received frames. Raises KnightCubeError at the end of the stream."""
-        with _reaching(self._name):
-            data = os.read(self._file, _READ_BYTES)
-        if not data:
-            raise KnightCubeError(f"{self._name}: the line was closed")
+        """Return the received frames. Raises KnightCubeError once when the stream is lost."""
+        if self._file < 0:
+            return []
+        try:
+            with _reaching(self._name):
+                data = os.read(self._file, _READ_BYTES)
+            if not data:
+                raise KnightCubeError(f"{self._name}: the line was closed")
+        except KnightCubeError as error:
+            self._drop(str(error))
+            raise
         return self._stream.add(data)
 
     def send(self, frame: bytes) -> None:
-        """Send a frame."""
+        """Send a frame. Raises KnightCubeError if the stream is lost and cannot be opened again."""
+        if self._file < 0:
+            self._open()
         data = self._framing.wrap(frame)
-        with _reaching(self._name):
-            while data:
-                data = data[os.write(self._file, data) :]
+        try:
+            with _reaching(self._name):
+                while data:
+                    data = data[os.write(self._file, data) :]
+        except KnightCubeError as error:
+            self._drop(str(error))
+            raise
 
     def close(self) -> None:
         """Close the line."""
-        self._close()
+        self._drop(f"{self._name}: the line was closed")
+        self._readable.close()
+
+    def _open(self) -> None:
+        if time.monotonic() - self._tried < _RECONNECT_S:
+            raise KnightCubeError(self._problem)
+        self._tried = time.monotonic()
+        try:
+            with _reaching(self._name):
+                self._file, self._close = self._connect()
+        except KnightCubeError as error:
+            self._problem = str(error)
+            raise
+        self._readable.register(self._file, select.EPOLLIN)
+        self._stream = self._framing.stream()
+
+    def _drop(self, problem: str) -> None:
+        self._problem = problem
+        if self._file >= 0:
+            with contextlib.suppress(OSError):
+                self._readable.unregister(self._file)
+            with contextlib.suppress(OSError):
+                self._close()
+        self._file, self._close = -1, _nothing
+
+
+def _nothing() -> None:
+    """Do nothing, in the place of the function that closes a lost stream."""
+
+
+def _serial_port(place: str) -> Opened:
+    """Open the serial port /dev/FILE@BAUD. Raises OSError, and ValueError for another form."""
+    device, _, baud = place.partition("@")
+    port = serial.Serial(device, int(baud), exclusive=True)
+    os.set_blocking(port.fileno(), True)  # pySerial's port fails when its output buffer is full
+    return port.fileno(), port.close
+
+
+def _connection(address: tuple[str, int]) -> Opened:
+    """Connect to a TCP address. Raises OSError."""
+    connection = socket.create_connection(address, timeout=5.0)
+    connection.setblocking(True)
+    return connection.fileno(), connection.close
 
 
 def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
@@ -391,19 +459,13 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
     framing, place = codes.on_ground(kiss), address.removeprefix("kiss:")
     line: GroundLine
     try:
-        with _reaching(address):
-            if place.startswith("/"):
-                device, _, baud = place.partition("@")
-                port = serial.Serial(device, int(baud), exclusive=True)
-                os.set_blocking(port.fileno(), True)  # pySerial's port fails when its output buffer is full
-                line = StreamGround(address, port.fileno(), framing, port.close)
-            elif kiss or place.startswith("tcp:"):
-                where = checked_address(place.removeprefix("tcp:"))
-                connection = socket.create_connection(where, timeout=5.0)
-                connection.setblocking(True)
-                line = StreamGround(address, connection.fileno(), framing, connection.close)
-            else:
-                line = UdpGround(address, codes)
+        if place.startswith("/"):
+            line = StreamGround(address, framing, partial(_serial_port, place))
+        elif kiss or place.startswith("tcp:"):
+            where = checked_address(place.removeprefix("tcp:"))
+            line = StreamGround(address, framing, partial(_connection, where))
+        else:
+            line = UdpGround(address, codes)
     except ValueError as error:
         raise UsageError(f"{address}: give {ADDRESSES}") from error
     return Terminal(line, vault, settings, codes)

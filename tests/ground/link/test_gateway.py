@@ -133,6 +133,7 @@ def test_a_network_or_disk_that_fails_for_a_while_is_reported_once_and_ends_noth
 
     with monkeypatch.context() as broken:
         broken.setattr(station.satellite, "send_by", fail)
+        broken.setattr(module, "_RETRY_S", 0.0)
         line = station.connect(station.line + SAFE)
         station.satellite.say(TELEMETRY)
         station.turn()
@@ -142,6 +143,30 @@ def test_a_network_or_disk_that_fails_for_a_while_is_reported_once_and_ends_noth
     line.sendall(SAFE)
     station.turn()
     assert [packet[:2] for packet in station.satellite.commands] == [SAFE[:2]]
+
+
+def test_a_line_that_is_lost_is_reported_and_pinged_again(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> list[tuple[int, bytes]]:
+        station.satellite._ours.recv(4096)
+        raise KnightCubeError("tcp:192.0.2.7:5010: the line was closed")
+
+    known = station.connect(station.line)
+    pings = len(station.satellite.up)
+    with monkeypatch.context() as broken:
+        broken.setattr(station.satellite, "take", fail)
+        for _ in range(2):
+            station.satellite.say(TELEMETRY)
+            station.turn()
+    assert station.complaints == ["tcp:192.0.2.7:5010: the line was closed"]
+    assert len(station.satellite.up) == pings
+    monkeypatch.setattr(module, "_RETRY_S", 0.0)
+    station.gateway._note_failure("tcp:192.0.2.7:5010: the line was closed")
+    station.satellite.say(TELEMETRY)
+    station.turn()
+    assert len(station.satellite.up) == pings + 1
+    assert known.recv(4096) == TELEMETRY
 
 
 def test_the_gateway_keeps_the_counters_of_its_newest_pings_only(

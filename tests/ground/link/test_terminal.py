@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import socket
 import stat
 import threading
@@ -147,17 +148,34 @@ def listening() -> Iterator[socket.socket]:
         yield server
 
 
-def test_a_tcp_line_waits_for_its_bytes_and_ends_with_its_peer(keys: Path) -> None:
+def test_a_tcp_line_is_opened_again_after_its_peer_has_closed_it(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loss is reported once, and the next frame is sent over a new connection."""
     with listening() as server:
         terminal = open_terminal(f"tcp:127.0.0.1:{server.getsockname()[1]}", keys)
         peer, _ = server.accept()
         with contextlib.closing(terminal), peer:
-            assert os.get_blocking(terminal.fileno())
             peer.sendall(b"no frame")
             assert list(terminal.take()) == []
             peer.shutdown(socket.SHUT_WR)
+            file = terminal.fileno()
             with pytest.raises(KnightCubeError, match="the line was closed"):
                 list(terminal.take())
+            assert list(terminal.take()) == []
+            with pytest.raises(KnightCubeError, match="the line was closed"):
+                terminal.send(b"too early")
+            assert "the line was closed" in terminal.problem
+            monkeypatch.setattr(terminal_module, "_RECONNECT_S", 0.0)
+            terminal.send(b"packet")
+            again, _ = server.accept()
+            with again:
+                assert len(again.recv(4096)) > len(b"packet")
+                again.sendall(b"no frame")
+                assert select.select([terminal], [], [], 60.0)[0]
+                assert terminal.fileno() == file
+                assert list(terminal.take()) == []
+                assert (terminal.problem, terminal.failing) == ("", 0.0)
 
 
 @pytest.mark.parametrize(

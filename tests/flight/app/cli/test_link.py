@@ -144,7 +144,7 @@ def test_a_command_is_scheduled_listed_and_deleted(
 
 def test_a_command_goes_by_a_serial_line_with_a_marker_before_each_frame(lines: dict[str, str]) -> None:
     radio = int(lines["radio"])
-    line = StreamGround("radio", radio, LinkCodes(DEFAULTS.frame_bytes).on_ground(), lambda: None)
+    line = StreamGround("radio", LinkCodes(DEFAULTS.frame_bytes).on_ground(), lambda: (radio, lambda: None))
     terminal = Terminal(line, Vault(Path(lines["place"]) / "keys" / "ground"), TerminalSettings())
     counter = terminal.send(CommandPacker().pack(Ping(3), 1))
     stages = [report.stage for report in terminal.follow(counter, 1, 10.0)]
@@ -280,5 +280,5 @@ def test_a_link_that_runs_for_the_required_time_proves_its_release(
     station = Mock()
     station.run = lambda *_: proven.wait(60.0)
     monkeypatch.setattr(link_process, "retried_start", lambda *_: (station, "udp"))
-    link_process._run(tmp_path / "config.yaml", tmp_path, lambda: False)
+    link_process._run(tmp_path / "config.yaml", tmp_path, proven.is_set)
     assert proven.is_set()

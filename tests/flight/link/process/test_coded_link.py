@@ -286,7 +286,7 @@ def test_datagrams_and_streams_of_both_ends_are_coded_alike(stack: ExitStack, ki
     else:
         line = TcpLine("127.0.0.1:0", framing=codes.on_board())
         caller = stack.enter_context(socket.create_connection(("127.0.0.1", line.port), timeout=10.0))
-        ground = StreamGround("tcp", caller.fileno(), far.on_ground(), lambda: None)
+        ground = StreamGround("tcp", far.on_ground(), lambda: (caller.fileno(), lambda: None))
     stack.callback(line.close)
     stack.callback(ground.close)
     ground.send(command)
