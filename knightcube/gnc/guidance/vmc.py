@@ -364,6 +364,26 @@ def plan(
         program, trial = search.with_time_cost(
             horizon, min(SHORTEST_WITH_TIME_COST, longest), longest, time_cost
         )
+    if trial is None and cost is PathCost.SUPPLY:
+        # The heat is a smooth function of the current, so its search finds the shortest duration more often.
+        coolest = plan(
+            plant,
+            start_q2,
+            start_rate,
+            end_q2,
+            end_rate,
+            horizon,
+            nodes=nodes,
+            reference=reference,
+            q2_limit=q2_limit,
+            max_stretch=max_stretch,
+            time_cost=time_cost,
+            last=last,
+        )
+        search = HorizonSearch(program_at, _remains(coolest.path, nodes), search.evaluations)
+        program, trial = search.over(coolest.horizon, search.warm)
+        if trial is None:
+            return coolest
     if trial is None:
         raise PlanningError(
             f"no path was found from {angle_of(start_q2):.4f} rad at {start_rate:.4f} rad/s to "

@@ -505,3 +505,21 @@ def test_a_horizon_slightly_shorter_than_the_first_path_found_is_kept() -> None:
     plant = replace(KNIGHTCUBE, damping=2e-6, stiffness=1.969058302744695e-5)
     slew = Problem(plant, -0.6781216293719047, 0.0, -0.6677379601088886, 0.0, 25.11531181068483)
     assert slew.planned().horizon <= slew.horizon * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "disturbance", "stiffness"),
+    [(-0.0201, -0.1375, 0.1, 0.0), (-1.067, -1.157, 0.0, 0.2), (0.322, 0.8006, 0.0, 0.2)],
+)
+def test_a_path_of_little_supply_energy_is_stretched_as_a_path_of_little_heat(
+    start: float, end: float, disturbance: float, stiffness: float
+) -> None:
+    """Half of the duration of the bang-bang path cannot suffice, so both paths take longer."""
+    strongest = 3e-4 * 0.2
+    plant = SingleAxisPlant(1e-3, 3e-4, 20.0, 0.2, stiffness * strongest, 0.0, disturbance * strongest / 1e-3)
+    horizon = math.sqrt(abs(end - start) * 1e-3 / strongest)
+    heat, supply = (plan(plant, q2_of(start), 0.0, q2_of(end), 0.0, horizon, cost=cost) for cost in PathCost)
+    assert heat.status is supply.status is PlanStatus.STRETCHED
+    assert supply.horizon <= 1.02 * heat.horizon
+    assert supply.supplied <= 1.001 * heat.supplied
+    assert supply.peak_current <= 1.001 * plant.current_limit
