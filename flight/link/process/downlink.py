@@ -103,7 +103,7 @@ class LogFollower:
         If the current segment was removed, the flight has begun a new log, which is read from its oldest
         segment.
         """
-        is_gone = self._path is not None and _size(self._path) < self._offset
+        is_gone = self._path is not None and _is_gone(self._path, self._offset)
         if self._path is not None and not is_gone:
             number = _number(self._path)
             later = [path for path in _segments(self._path.parent) if _number(path) > number]
@@ -175,12 +175,14 @@ def _number(path: Path) -> int:
     return int(path.stem.rpartition("-")[2])
 
 
-def _size(path: Path) -> int:
-    """Return the size (bytes) of a file, or -1 if the file is missing."""
+def _is_gone(path: Path, offset: int) -> bool:
+    """Return whether a file is missing or shorter than `offset`; a failed disk access shows neither."""
     try:
-        return path.stat().st_size
+        return path.stat().st_size < offset
+    except FileNotFoundError:
+        return True
     except OSError:
-        return -1
+        return False
 
 
 def _read(path: Path, offset: int) -> bytes:

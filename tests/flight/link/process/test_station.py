@@ -316,6 +316,26 @@ def test_a_log_that_was_removed_and_begun_again_is_followed(
     assert link.of("cycle_timing")[before:] == timing_packets(5)
 
 
+def test_a_failed_access_to_the_log_does_not_send_the_log_again(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link.record(*timing_packets(200))
+    link.turn(4.0)
+    before, stat = len(link.of("cycle_timing")), Path.stat
+
+    def fail(path: Path, **options: bool) -> os.stat_result:
+        if path.name.startswith("flight-"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return stat(path, **options)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "stat", fail)
+        link.turn(2.0)
+    link.turn(2.0)
+    assert before > 0
+    assert len(link.of("cycle_timing")) == before
+
+
 def test_live_packets_come_in_order_and_none_is_lost(link: BothEnds) -> None:
     sent = timing_packets(300)
     for begin in range(0, 300, 30):
