@@ -252,11 +252,14 @@ class Store:
         _write(self._path(record), record)
 
     def remove(self, record: Outgoing | Incoming) -> None:
-        """Remove a record and, for an incoming transfer, the received data."""
+        """Remove a record and, for an incoming transfer, first the received data.
+
+        Received data without a record would stay on the disk, because nothing refers to the file.
+        """
         with suppress(OSError):
-            self._path(record).unlink(missing_ok=True)
             if isinstance(record, Incoming):
                 self.part(record).unlink(missing_ok=True)
+            self._path(record).unlink(missing_ok=True)
 
     def part(self, record: Incoming) -> Path:
         """Return the path of the data of an incomplete incoming file."""
@@ -295,7 +298,10 @@ class Store:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file atomically and durably. Raises FileError if the disk cannot be written."""
+    """Replace a file atomically and durably. Raises FileError if the disk cannot be written.
+
+    A failure leaves no incomplete file, which would occupy the rest of a full disk.
+    """
     beside = path.with_name(path.name + "~")
     try:
         with beside.open("wb") as file:
@@ -305,6 +311,8 @@ def write_whole(path: Path, data: bytes) -> None:
         os.replace(beside, path)
         make_lasting(path.parent)
     except OSError as error:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flight.link.files import store
-from flight.link.files.store import FileError, Store, problem_of_name
+from flight.link.files.store import FileError, Incoming, Store, problem_of_name
 from flight.link.files.transfer import (
     CRC32,
     CRC32C,
@@ -480,3 +480,37 @@ def test_ranges_against_a_set_of_bytes() -> None:
         while ranges:
             taken |= set(range(*ranges.take(3)))
         assert taken == known
+
+
+def test_a_record_that_does_not_fit_on_the_disk_leaves_no_incomplete_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "listing.json"
+    store.write_whole(path, b"before")
+
+    def fail(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(FileError, match="No space left"):
+        store.write_whole(path, b"after")
+    assert {one.name: one.read_bytes() for one in tmp_path.iterdir()} == {"listing.json": b"before"}
+
+
+def test_received_data_is_removed_before_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that is killed in between leaves a record, with which the next start removes the transfer."""
+    folder, record = Store(tmp_path), Incoming(GROUND, 7)
+    folder.save(record)
+    folder.part(record).write_bytes(b"data")
+    unlink = Path.unlink
+
+    def killed(path: Path, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "unlink", killed)
+        with pytest.raises(KeyboardInterrupt):
+            folder.remove(record)
+    assert not folder.part(record).exists()
+    assert folder.incoming() == [record]
