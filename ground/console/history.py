@@ -1,17 +1,17 @@
 """History of a flight for the console: all packets by time, and the state at a chosen time.
 
 The packets of hours of flight at 40 Hz do not fit into the memory of a ground computer. The packets are
-therefore stored in a temporary folder, and only their times (8 bytes each) are in memory.
+therefore stored in temporary files, and only their times (8 bytes each) are in memory.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -34,16 +34,18 @@ _FIRST_CAPACITY = 1024
 
 
 class History:
-    """Packets of a flight by name and time, as a context manager that removes its files at the end.
+    """Packets of a flight by name and time, as a context manager that closes its files at the end.
+
+    The files have no names, so that no program that tidies the temporary folder removes the packets of a long
+    flight, and a console that is killed leaves no files.
 
     The attribute `clears` is the number of times that all packets were removed.
     """
 
     def __init__(self) -> None:
-        """Make a temporary folder for the packets."""
+        """Make a temporary file for each packet type."""
         self.clears = 0
-        self._folder = tempfile.TemporaryDirectory(prefix="knightcube-console-")
-        self._tracks = {name: _Track(layout, Path(self._folder.name)) for name, layout in LAYOUTS.items()}
+        self._tracks = {name: _Track(layout) for name, layout in LAYOUTS.items()}
 
     def __enter__(self) -> Self:
         """Return this history."""
@@ -52,8 +54,9 @@ class History:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove the files."""
-        self._folder.cleanup()
+        """Close the files, which removes them."""
+        for track in self._tracks.values():
+            track.close()
 
     def append(self, packets: Mapping[str, PacketArray]) -> None:
         """Append packets to the history in order of arrival.
@@ -123,9 +126,9 @@ class History:
 class _Track:
     """Packets with the same name, whose bytes are in a file and whose times are in memory."""
 
-    def __init__(self, layout: Layout, folder: Path) -> None:
+    def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        self._path = folder / f"{layout.packet.name}.packets"
+        self._file = tempfile.TemporaryFile(prefix="knightcube-console-")  # noqa: SIM115 - `close` closes it
         self._kept: npt.NDArray[np.int64] = np.zeros(_FIRST_CAPACITY, dtype=np.int64)
         self._count = 0
 
@@ -135,9 +138,10 @@ class _Track:
         return self._kept[: self._count]
 
     def append(self, rows: PacketArray) -> None:
-        with self._path.open("ab") as file:
-            file.truncate(self._count * self._layout.length)  # a failed write may have left bytes
-            file.write(rows.tobytes())
+        data, place = rows.tobytes(), self._count * self._layout.length
+        while data:
+            written = os.pwrite(self._file.fileno(), data, place)
+            data, place = data[written:], place + written
         stop = self._count + len(rows)
         if stop > len(self._kept):
             grown = np.zeros(max(stop, 2 * len(self._kept)), dtype=np.int64)
@@ -152,13 +156,19 @@ class _Track:
         """Remove all packets but the first `count`."""
         self._count = count
 
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
     def rows(self, first: int, stop: int) -> PacketArray:
         first, stop = max(first, 0), min(stop, self._count)
         if stop <= first:
             return self._layout.array(b"")
-        with self._path.open("rb") as file:
-            file.seek(first * self._layout.length)
-            return self._layout.array(file.read((stop - first) * self._layout.length))
+        place, end = first * self._layout.length, stop * self._layout.length
+        data = b""
+        while part := os.pread(self._file.fileno(), end - place - len(data), place + len(data)):
+            data += part
+        return self._layout.array(data)
 
 
 @dataclass(slots=True)

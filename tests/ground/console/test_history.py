@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import errno
-import io
+import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -129,25 +129,35 @@ def test_packets_that_the_disk_refuses_are_stored_whole_later(
     packets = {name: rows for name, rows in run.flight.packets.items() if len(rows) > 1}
     halves = [{name: rows[part] for name, rows in packets.items()} for part in (slice(1), slice(1, None))]
 
-    class FullDisk(io.FileIO):
-        def write(self, data: Any, /) -> int:
-            super().write(bytes(data)[:7])
+    pwrite = os.pwrite
+
+    def full(file: int, data: bytes, place: int) -> int:
+        if file == stored._tracks[max(packets)]._file.fileno():
+            pwrite(file, data[:7], place)
             raise OSError(errno.ENOSPC, "No space left on device")
+        return pwrite(file, data, place)
 
-    def opened(path: Path, mode: str = "r") -> Any:
-        full = path.name.startswith(max(packets)) and mode == "ab"
-        return FullDisk(path, "ab") if full else open(path, mode)
-
-    with History() as history:
-        history.append(halves[0])
+    with History() as stored:
+        stored.append(halves[0])
         feed = Mock(new=Mock(return_value=dict(run.flight.packets) | halves[1]), restarts=0)
-        console = Console("run", feed, history, UNKNOWN, CommandForms(None))
+        console = Console("run", feed, stored, UNKNOWN, CommandForms(None))
         with monkeypatch.context() as patch:
-            patch.setattr(Path, "open", opened)
+            patch.setattr(os, "pwrite", full)
             console.read()
             assert "No space left" in console.trouble
-            assert {name: history.count(name, LATER) for name in packets} == dict.fromkeys(packets, 1)
+            assert {name: stored.count(name, LATER) for name in packets} == dict.fromkeys(packets, 1)
         console.read()
         assert (console.trouble, feed.new.call_count) == ("", 1)
         for name, rows in packets.items():
-            assert history.rows(name, 0, 10**9).tobytes() == rows.tobytes()
+            assert stored.rows(name, 0, 10**9).tobytes() == rows.tobytes()
+
+
+def test_the_history_leaves_no_file_that_another_program_could_remove(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Programs that tidy the temporary folder remove the files that were not used for some days."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with History() as history:
+        history.append(run.flight.packets)
+        assert list(tmp_path.iterdir()) == []
+        assert history.rows("run", 0, 1).tobytes() == run.flight.packets["run"][:1].tobytes()
