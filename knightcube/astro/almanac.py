@@ -269,8 +269,7 @@ def propagate_orbit(
     Args:
         position: (3,) initial position in ICRS axes, m.
         velocity: (3,) initial velocity in ICRS axes, m/s.
-        seconds: (n,) times relative to the initial state, s, in increasing or decreasing order; at most 30
-            days.
+        seconds: (n,) times relative to the initial state, s, in any order; at most 30 days.
 
     Raises:
         ArgumentError: if a value is not finite, if the orbit intersects the Earth (as a state in km does), or
@@ -293,11 +292,13 @@ def propagate_orbit(
             f"{longest:g} s from the state: the orbit is unknown after {_LONGEST:g} s (30 days): give a "
             "newer state",
         )
-    state, elapsed, states = np.concatenate([at, motion]), 0.0, []
-    for time in times.tolist():
-        state, elapsed = propagated(state, time - elapsed), time
-        states.append(state)
-    found = np.array(states).reshape(-1, 6)
+    found = np.empty((len(times), 6))
+    for some in (np.flatnonzero(times >= 0.0), np.flatnonzero(times < 0.0)):
+        state, elapsed = np.concatenate([at, motion]), 0.0
+        for k in some[np.argsort(np.abs(times[some]), kind="stable")].tolist():
+            time = float(times[k])
+            state, elapsed = propagated(state, time - elapsed), time
+            found[k] = state
     return found[:, :3], found[:, 3:]
 
 

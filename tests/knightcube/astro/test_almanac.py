@@ -20,10 +20,15 @@ from knightcube.astro.almanac import (
     sun_direction,
     sunlit_fraction,
 )
-from knightcube.astro.arrays import finite_array, unit_vector
+from knightcube.astro.arrays import FloatArray, finite_array, unit_vector
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.geomagnetism import GeomagneticError
-from knightcube.astro.earth.orbit_knowledge import LARGEST_SIGMA, OrbitError, TwoLineElements
+from knightcube.astro.earth.orbit_knowledge import (
+    LARGEST_SIGMA,
+    OrbitError,
+    TwoLineElements,
+    propagated,
+)
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, julian_date
 from knightcube.errors import ArgumentError, UsageError
@@ -251,3 +256,21 @@ def test_two_line_elements_are_those_of_sgp4() -> None:
         assert position @ velocity == pytest.approx(1e6 * np.dot(r, v), abs=1e5)
     empty, _ = propagate_elements((FIRST, SECOND), [])
     assert empty.shape == (0, 3)
+
+
+def test_an_orbit_at_times_in_any_order_is_integrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alternating between both ends of a month would integrate thirty days for each time."""
+    times = np.array([5000.0, -3000.0, 0.0, 9000.0, -100.0, 5000.0])
+    lengths: list[float] = []
+
+    def counted(state: FloatArray, duration: float) -> FloatArray:
+        lengths.append(abs(duration))
+        return propagated(state, duration)
+
+    monkeypatch.setattr("knightcube.astro.almanac.propagated", counted)
+    positions, velocities = propagate_orbit(PLACE, MOTION, times)
+    assert sum(lengths) == pytest.approx(12_000.0)
+    for time, position, velocity in zip(times, positions, velocities, strict=True):
+        (alone,), (moving,) = propagate_orbit(PLACE, MOTION, [time])
+        np.testing.assert_allclose(position, alone, atol=5.0)
+        np.testing.assert_allclose(velocity, moving, atol=5e-3)
