@@ -435,7 +435,8 @@ def estimate_rate(
         camera: pinhole model or calibrated lens.
         exposure: exposure time, s.
         prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
-            the rotation.
+            the rotation. If its component along the measured rate is at most three standard deviations, the
+            status is `ambiguous`.
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         settings: gain, saturation, point spread and line time of the camera, and limits of the fit.
 
