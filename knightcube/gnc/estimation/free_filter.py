@@ -154,7 +154,7 @@ class FreeMotion:
     def __init__(self, inertia: FloatArray) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        Raises UsageError for an impossible tensor, with which a body in a tumble is predicted wrongly.
+        Raises ArgumentError for an impossible tensor, with which a body in a tumble is predicted wrongly.
         """
         self._assumed: FloatArray = finite_array("inertia", inertia, (3, 3))
         if problem := inertia_problem(self._assumed):
