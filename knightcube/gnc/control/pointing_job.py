@@ -359,7 +359,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
     task = _task(begin, wish, job.target, job.axes, ahead, around, near.horizon, avoided)
     # The rest of a slew needs fewer intervals than the whole slew for the same accuracy.
     nodes = math.ceil(NODES * near.horizon / wish.seconds)
-    task = replace(task, nodes=min(max(nodes, FEWEST), NODES))
+    task = replace(task, longest=near.horizon, nodes=min(max(nodes, FEWEST), NODES))
     _, plan_rest = wish.planners()
     try:
         plan = plan_rest(task, near)
