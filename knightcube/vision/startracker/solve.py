@@ -233,6 +233,8 @@ _LOOKED_FOR = 30
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 # Maximum number of fits with larger variances of the stars that unresolved catalogue stars displace.
 _COMPANION_ROUNDS = 3
+# Distance (PSF widths) up to which an unresolved star can displace another one.
+_COMPANION_REACH = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -468,7 +470,7 @@ def _beside_companions(
     must be those with which `solution` was computed.
     """
     for _ in range(_COMPANION_ROUNDS):
-        shift = _shift_by_companions(solution, found.psf_sigma, sky)
+        shift = _shift_by_companions(solution, found.psf_sigma, sky, settings.velocity)
         displaced = shift**2 > 0.5 * np.trace(solution.covariance, axis1=1, axis2=2)
         if solution.fix is None or not np.any(displaced):
             break
@@ -485,7 +487,9 @@ def _beside_companions(
     return solution
 
 
-def _shift_by_companions(solution: FrameSolution, psf_sigma: float, sky: SkyIndex) -> FloatArray:
+def _shift_by_companions(
+    solution: FrameSolution, psf_sigma: float, sky: SkyIndex, velocity: FloatArray | None
+) -> FloatArray:
     """Return by how many px (n,) catalogue stars that were not measured displace the measured stars.
 
     A fit of a Gaussian with the width s to noise of equal variance in all pixels is displaced by the fraction
@@ -497,17 +501,22 @@ def _shift_by_companions(solution: FrameSolution, psf_sigma: float, sky: SkyInde
         return shift
     camera, star = solution.camera, solution.star[solution.matched]
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
-    matrix = attitude_matrix(solution.fix.quaternion)
+    matrix, direction = attitude_matrix(solution.fix.quaternion), sky.stars.direction
+    width = math.sqrt(psf_sigma**2 + PIXEL_VARIANCE)
     companion = np.setdiff1d(expected_stars(sky, matrix, half_width, len(sky.stars)), star)
+    nearest = np.max(direction[companion] @ direction[star].T, axis=1, initial=-1.0)
+    companion = companion[nearest > math.cos(_COMPANION_REACH * width / camera.focal_length)]
     # A point near a companion that does not match a star is the companion, which was fitted with the star.
     seen = _mirrored(solution) if solution.mirrored else solution
     rest = camera.unit_vectors(np.delete(seen.points, solution.matched, axis=0)) @ matrix
-    nearest = np.max(sky.stars.direction[companion] @ rest.T, axis=1, initial=-1.0)
+    rest = rest[np.isfinite(rest).all(axis=1)]
+    rest = rest if velocity is None else apparent(rest, -velocity)
+    nearest = np.max(direction[companion] @ rest.T, axis=1, initial=-1.0)
     companion = companion[np.arccos(np.minimum(nearest, 1.0)) * camera.focal_length > psf_sigma + 0.5]
-    apart = sky.stars.direction[companion] - sky.stars.direction[star, None]
+    apart = direction[companion] - direction[star, None]
     distance = camera.focal_length * np.linalg.norm(apart, axis=-1)
     fainter = sky.stars.magnitude[companion] - sky.stars.magnitude[star, None]
-    weight = 2.0 * np.exp(-(distance**2) / (4.0 * (psf_sigma**2 + PIXEL_VARIANCE)))
+    weight = 2.0 * np.exp(-(distance**2) / (4.0 * width**2))
     shift[solution.matched] = np.sum(distance * np.minimum(10.0 ** (-0.4 * fainter) * weight, 1.0), axis=1)
     return shift
 
