@@ -352,6 +352,7 @@ class FileSession:
         self._failed: list[tuple[Progress, int]] = []  # failed transfers with timeout (ns)
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
+        self._unsent = b""  # packet that could not be sent yet
         self._credit, self._credit_ns = 0.0, now_ns  # transmission capacity at the last call of `transmit`
 
     def ask(self, directive: Directive, now_ns: int) -> None:
@@ -397,17 +398,24 @@ class FileSession:
                     self._texts[int(row["source"]), int(row["number"])] = text_of(row["text"])
 
     def transmit(self, now_ns: int) -> None:
-        """Send the commands and PDUs that are due, within the rate limit. Raises KnightCubeError."""
+        """Send the commands and PDUs that are due, within the rate limit.
+
+        Raises KnightCubeError if a packet cannot be sent. The next call sends this packet again.
+        """
+        self.entity.keep(now_ns)
         if self._asked is not None and now_ns >= self._asked[1]:
             self._send(self._asked[0], now_ns)
         self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9
         self._credit = min(self._credit, max(self._rate * _BURST_S, 2.0 * LONGEST_FRAME))
         self._credit_ns = now_ns
-        while self._credit > 0.0 and (unit := self.entity.unit(now_ns)) is not None:
-            packet = self._units.pack(unit, utc_ns())
-            self._terminal.send_by(self._sealer, packet)
-            self._credit -= len(packet) + FRAME_OVERHEAD_BYTES
-        self.entity.keep(now_ns)
+        while self._credit > 0.0:
+            if not self._unsent and (unit := self.entity.unit(now_ns)) is not None:
+                self._unsent = self._units.pack(unit, utc_ns())
+            if not self._unsent:
+                break
+            self._terminal.send_by(self._sealer, self._unsent)
+            self._credit -= len(self._unsent) + FRAME_OVERHEAD_BYTES
+            self._unsent = b""
 
     def _may_come(self, metadata: units.Metadata) -> str:
         """Return why a file from the satellite is rejected, or an empty text if it is accepted."""

@@ -40,7 +40,8 @@ _STORE_EVERY = 256  # number of telemetry frames between two writes of the anti-
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
-_RECONNECT_S = 2.0  # minimum time (s) between two attempts to open a stream
+_RECONNECT_S = 2.0  # minimum time (s) between the end of an attempt to open a stream and the next
+_CONNECT_S = 1.5  # longest time (s) to wait for a TCP connection; the program waits meanwhile
 _LOST = -2  # value of `highest` in the packet `link` for an SPI whose counter is lost
 PORTS = 1 << 16  # number of TCP and UDP ports
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
@@ -401,13 +402,14 @@ class StreamGround:
     def _open(self) -> None:
         if time.monotonic() - self._tried < _RECONNECT_S:
             raise KnightCubeError(self._problem)
-        self._tried = time.monotonic()
         try:
             with _reaching(self._name):
                 self._file, self._close = self._connect()
         except KnightCubeError as error:
             self._problem = str(error)
             raise
+        finally:
+            self._tried = time.monotonic()
         self._readable.register(self._file, select.EPOLLIN)
         self._stream = self._framing.stream()
 
@@ -435,7 +437,7 @@ def _serial_port(place: str) -> Opened:
 
 def _connection(address: tuple[str, int]) -> Opened:
     """Connect to a TCP address. Raises OSError."""
-    connection = socket.create_connection(address, timeout=5.0)
+    connection = socket.create_connection(address, timeout=_CONNECT_S)
     connection.setblocking(True)
     return connection.fileno(), connection.close
 

@@ -8,6 +8,7 @@ import socket
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -329,6 +330,34 @@ def test_units_are_sent_within_the_rate(tmp_path: Path) -> None:
     files.transmit(100 * S)
     burst = sum(len(packet) + overhead for packet in line.sent[before:])
     assert burst <= 2 * LONGEST_FRAME + 1200, "unused rate accumulates for a short time only"
+
+
+def test_a_packet_that_cannot_be_sent_is_sent_by_the_next_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A failure of the network must not lose the segment that the transfer has already handed over."""
+    (tmp_path / "file").write_bytes(bytes(range(256)) * 20)
+    sent: list[list[bytes]] = []
+    for failures in (0, 3):
+        line = terminal()
+        files = session(tmp_path / f"store-{failures}", line)
+        files.put(tmp_path / "file", "name", 0)
+        send, left = line.send_by, failures
+
+        def failing(sealer: Any, packet: bytes, send: Any = send) -> int:
+            nonlocal left
+            if left:
+                left -= 1
+                raise KnightCubeError("the network is unreachable")
+            return int(send(sealer, packet))
+
+        monkeypatch.setattr(line, "send_by", failing)
+        for step in range(1, 20):
+            with suppress(KnightCubeError):
+                files.transmit(step * S // 20)
+        sent.append([packet[16:-2] for packet in line.sent])  # without time and checksum
+    assert len(sent[0]) > 3
+    assert sent[1] == sent[0]
 
 
 def test_the_satellites_reason_goes_before_our_own(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -176,6 +177,37 @@ def test_a_tcp_line_is_opened_again_after_its_peer_has_closed_it(
                 assert terminal.fileno() == file
                 assert list(terminal.take()) == []
                 assert (terminal.problem, terminal.failing) == ("", 0.0)
+
+
+def test_a_slow_attempt_to_open_a_line_is_followed_by_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If each frame began another attempt, a peer that does not answer would block the program."""
+    now = 0.0
+    monkeypatch.setattr(terminal_module, "time", SimpleNamespace(monotonic=lambda: now))
+    own, peer = socket.socketpair()
+    attempts = 0
+
+    def connect() -> terminal_module.Opened:
+        nonlocal attempts, now
+        attempts += 1
+        if attempts == 1:
+            return own.fileno(), own.close
+        now += 5.0
+        raise OSError(110, "Connection timed out")
+
+    codes = TerminalSettings().codes()
+    with contextlib.closing(terminal_module.StreamGround("tcp:x", codes.on_ground(False), connect)) as line:
+        peer.close()
+        with pytest.raises(KnightCubeError, match="closed"):
+            line.receive()
+        now += 10.0
+        for _ in range(3):
+            with pytest.raises(KnightCubeError, match="timed out"):
+                line.send(b"frame")
+        assert attempts == 2
+        now += 10.0
+        with pytest.raises(KnightCubeError, match="timed out"):
+            line.send(b"frame")
+        assert attempts == 3
 
 
 @pytest.mark.parametrize(
