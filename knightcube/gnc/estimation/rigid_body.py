@@ -266,6 +266,8 @@ LONGEST_STEP = 0.025
 _LARGEST_ROTATION = 0.01
 """Largest rotation (rad) of the body in one propagation step. The error of the midpoint rule, per radian of
 rotation, is about a 24th of the squared rotation of a step."""
+_FASTEST = 10.0
+"""Rate (rad/s) above which the propagation steps are not shortened further."""
 _UNKNOWN_FOR = 0.3
 """Correlation time (s) of an unknown coil current, which gives the spectral density of an equivalent white
 noise. The correlation time exceeds the delay after which the guardian switches off the coils of a hung
@@ -297,9 +299,11 @@ def propagate(
 ) -> tuple[FilterState, FloatArray]:
     """Propagate over `duration` s under one coil command.
 
-    A step lasts at most `LONGEST_STEP` s, and the body rotates by at most `_LARGEST_ROTATION` in a step.
+    A step lasts at most `LONGEST_STEP` s, and the body rotates by at most `_LARGEST_ROTATION` in a step. At
+    rates above `_FASTEST`, which no body reaches, the rotation in a step is larger, so that the number of
+    steps is limited.
     """
-    speed = math.hypot(*state.rate)
+    speed = min(math.hypot(*state.rate), _FASTEST)
     steps = math.ceil(duration * max(1.0 / LONGEST_STEP, speed / _LARGEST_ROTATION) - 1e-9) or 1
     steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
     x, y, z = torquing.driven

@@ -148,4 +148,13 @@ def test_a_fast_tumble_is_integrated_as_accurately_as_a_slow_one() -> None:
     assert energy[1] == pytest.approx(energy[0], rel=1e-4)
 
 
+def test_an_absurd_rate_does_not_make_the_propagation_slow() -> None:
+    """The number of steps is limited; at 1e9 rad/s, steps of 0.01 rad would take hours."""
+    body = RigidBody(np.diag([0.01, 0.01, 0.01]), 0.0, FIELD)
+    state = FilterState((0.0, 0.0, 0.0, 1.0), (1e9, 0.0, 0.0), _NONE, _NONE, body.parameters)
+    noise = ProcessNoise(0.0, np.zeros((3, 3)), np.zeros(SIZE))
+    later, _ = propagate(body, noise, state, np.zeros((SIZE, SIZE)), body.torquing(np.zeros(3)), 0.025)
+    assert later.rate[0] == pytest.approx(1e9)
+
+
 _NONE: Vector = (0.0, 0.0, 0.0)
