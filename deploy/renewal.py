@@ -489,7 +489,7 @@ class Renewal:
             ended, state.trial = [trial.request, "activate"], None
             if trial.what == "configuration":
                 state.previous = trial.old
-            elif trial.stage == "fly" and trial.old:
+            elif trial.old:
                 # install.sh keeps the current release as the fallback, which must not be an unconfirmed one.
                 self._board.point("current", trial.old)
         if ended:
