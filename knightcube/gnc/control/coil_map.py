@@ -334,11 +334,13 @@ def allocate(
     # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.
     effect = turns[:, None] * np.cross(dipoles.T, field).T * usable
     wanted = wanted * turns
-    directions, torques, _ = np.linalg.svd(effect * limits)
-    kept = directions[:, : len(torques)][:, torques > _WEAKEST * torques[0]]
-    # The pseudo-inverse minimises the sum of (weights * currents)^2, which is proportional to the heat.
+    at_limits = effect * limits
+    squares, directions = np.linalg.eigh(at_limits @ at_limits.T)  # squared torques, in ascending order
+    kept = directions[:, squares > _WEAKEST**2 * squares[-1]].T
+    # The currents of least norm in these units cause the least heat.
     weights = np.ones(len(usable)) if resistance is None else np.sqrt(resistance / resistance.max())
-    currents = np.linalg.pinv(kept.T @ effect / weights) @ (kept.T @ wanted) / weights * usable
+    scaled = kept @ effect / weights
+    currents = scaled.T @ np.linalg.solve(scaled @ scaled.T, kept @ wanted) / weights * usable
     excess = float(np.max(np.abs(currents) / np.where(limits > 0.0, limits, 1.0)))
     if excess > 1.0:
         currents = currents / excess
