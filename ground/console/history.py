@@ -212,6 +212,10 @@ class PageCursor:
         return min(max(round(moved * 1e9), span_ns[0]), span_ns[1])
 
 
+EMPTY_STATE: Object = {"newest": {}, "listed": {}, "omitted": {}, "again": False}
+"""State without new packets."""
+
+
 class PageState:
     """State of a flight for one reader, who receives only the changes since the previous state."""
 

@@ -32,7 +32,7 @@ from flight.link.process.directives import KINDS
 from flight.link.telemetry.definitions import CONTROL, LINK, NAVIGATION, SPIN, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import CommandForms, Files
-from ground.console.history import MAX_TIME, History, PageCursor, PageState
+from ground.console.history import EMPTY_STATE, MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
 from ground.documentation import Body, add_components, database, endings
 from ground.watch import PacketSource
@@ -288,6 +288,10 @@ async def _errors_as_json(request: web.Request, handler: _Handler) -> web.Stream
     except (KnightCubeError, TelemetryError) as error:
         status = 400 if isinstance(error, UsageError) else 502
         return web.json_response({"error": str(error)}, status=status)
+    except ConnectionError:  # the browser has closed the connection
+        raise
+    except OSError as error:
+        return web.json_response({"error": f"the disk failed: {reason_of(error)}"}, status=502)
 
 
 class _Pages:
@@ -449,6 +453,12 @@ class _Pages:
         span = console.history.span_ns[0], console.settled_ns
         at_ns = cursor.at_ns(span, time.monotonic())
         utc = self._utc(at_ns * 1e-9)
+        trouble, shown = console.trouble, EMPTY_STATE
+        try:
+            shown = state.at(at_ns, LAYOUTS)
+        except OSError as error:
+            state.reset()  # the next state that can be read is sent completely
+            trouble = f"the history of the console cannot be read: {reason_of(error)}"
         return {
             "time": at_ns * 1e-9,
             "span": [span[0] * 1e-9, span[1] * 1e-9],
@@ -456,11 +466,11 @@ class _Pages:
             "speed": cursor.speed,
             "silence": console.feed.silence,
             "flight_silence": time.monotonic() - console.flight_received,
-            "trouble": console.trouble,
+            "trouble": trouble,
             "utc_ns": utc,
             "body": console.forms.body,
             "surroundings": None if utc is None else console.surroundings.at(utc),
-            **state.at(at_ns, LAYOUTS),
+            **shown,
         }
 
     def _utc(self, seconds: float) -> int | None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import math
+import os
 import shutil
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -22,7 +25,7 @@ from flight.link.commands import COMMANDS, POINT, Command, crc_of
 from flight.link.events import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
-from ground.console import server
+from ground.console import history, server
 from ground.console.commanding import CommandForms, RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console
@@ -226,6 +229,36 @@ def test_the_server_pushes_the_newest_state_and_then_a_requested_past_state(fold
     assert (newest["live"], newest["again"], newest["time"]) == (True, True, newest["span"][1])
     assert (past["live"], past["time"], past["speed"]) == (False, 2.0, 0.0)
     assert past["newest"]["control"]["time_ns"] == 2 * 10**9
+
+
+def test_a_history_that_cannot_be_read_is_reported_and_shown_when_it_can_be_read_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = True
+
+    def pread(*given: Any) -> bytes:
+        if broken:
+            raise OSError(errno.EIO, "Input/output error")
+        return os.pread(*given)
+
+    monkeypatch.setattr(history, "os", SimpleNamespace(pread=pread, pwrite=os.pwrite))
+
+    async def ask(client: TestClient[Any, Any]) -> tuple[Any, Any, Any]:
+        nonlocal broken
+        async with client.get("/api/series?packet=control&field=path_q2&from=0&to=1000") as answer:
+            series = answer.status, await answer.json()
+        async with client.ws_connect("/api/live", origin=page_origin(client)) as line:
+            first = await line.receive_json()
+            broken = False
+            while not (second := await line.receive_json())["again"]:
+                pass
+            return series, first, second
+
+    (status, error), first, second = asked(folder, ask)
+    assert (status, error["error"]) == (502, "the disk failed: Input/output error")
+    assert first["trouble"] == "the history of the console cannot be read: Input/output error"
+    assert (first["newest"], first["again"], second["trouble"]) == ({}, False, "")
+    assert second["newest"]["control"]["time_ns"] > 0
 
 
 def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path) -> None:
