@@ -28,6 +28,7 @@ from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files.units import PACKET_VERSION, UP
 from flight.link.frames import LONGEST_FRAME
+from flight.link.process.commanding import request_of
 from flight.link.process.directives import LONGEST_IN_PORTIONS
 from flight.link.process.station import host_port
 from flight.link.telemetry.definitions import VERIFICATION
@@ -39,6 +40,7 @@ from knightcube.errors import KnightCubeError, UsageError, reason_of
 ADDRESS = "127.0.0.1:5013"
 
 _VERIFIED = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
+_UNIT = UP.to_bytes(2, "big")  # first two bytes of a packet of a file transfer
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
 _MAX_UNSENT = 1 << 22  # number of unsent bytes above which a connection is closed
@@ -50,6 +52,7 @@ _PING_PERIOD_S = 20.0
 _KEPT_PINGS = 64  # number of the gateway's newest pings whose reports are not relayed
 _FAILURE_S = 60.0  # time (s) without a failure after which the same failure of the line is reported again
 _RETRY_S = 2.0  # time (s) from a failure of the line to the next ping, which opens a lost stream again
+_ACCEPT_PAUSE_S = 1.0  # time (s) without accepting connections after a failure, such as too many open files
 _TOKEN_S = 5.0  # time (s) after which a connection without the token is closed
 _MOST_WITHOUT_TOKEN = 256
 """Maximum number of connections that have not sent the token; a further connection closes the oldest."""
@@ -95,7 +98,7 @@ _HEADER_FORMS = (
         _HeaderForm(layout.identifier.to_bytes(2, "big"), layout.length, layout.length, layout.packet.version)
         for layout in TELECOMMANDS.values()
     ),
-    _HeaderForm(UP.to_bytes(2, "big"), _SHORTEST_UNIT, _LONGEST_PACKET, PACKET_VERSION),
+    _HeaderForm(_UNIT, _SHORTEST_UNIT, _LONGEST_PACKET, PACKET_VERSION),
 )
 
 
@@ -216,6 +219,7 @@ class Gateway:
         self._asked_at: float | None = None
         self._own: deque[int] = deque(maxlen=_KEPT_PINGS)  # counters of the gateway's own pings
         self._failure, self._failed_at = "", -math.inf  # reason and time of the line's last failure
+        self._accept_at = -math.inf  # time from which connections are accepted
         self._connections: dict[socket.socket, _StationConnection] = {}
         self.down = self.up = self.refused = 0
         try:
@@ -246,11 +250,12 @@ class Gateway:
         """Relay the packets that are received within `seconds` s."""
         if self._asked_at is None or time.monotonic() - self._asked_at > _PING_PERIOD_S:
             self._asked_at = time.monotonic()
-            counter = self._send(self._packer.pack(Ping(), utc_ns()))
-            if counter is not None:
-                self._own.append(counter)
+            with suppress(KnightCubeError):
+                self._own.append(self._send(self._packer.pack(Ping(), utc_ns())))
         waiting = [line for line, connection in self._connections.items() if connection.unsent]
-        reading: list[Terminal | socket.socket] = [self._terminal, self._listener, *self._connections]
+        reading: list[Terminal | socket.socket] = [self._terminal, *self._connections]
+        if time.monotonic() >= self._accept_at:  # a connection that cannot be accepted stays ready
+            reading.append(self._listener)
         ready, writable, _ = select.select(reading, waiting, [], seconds)
         if self._terminal in ready:
             try:
@@ -274,16 +279,16 @@ class Gateway:
             self._drop(line)
         self._listener.close()
 
-    def _send(self, packet: bytes) -> int | None:
-        """Send a packet and return its frame counter, or None for a packet that cannot be sent now.
+    def _send(self, packet: bytes) -> int:
+        """Send a packet and return its frame counter.
 
-        The network, the line or the disk of the counters may fail for a while.
+        Raises KnightCubeError if the network, the line or the disk of the counters fails for a while.
         """
         try:
             return self._terminal.send_by(self._sealer, packet)
         except KnightCubeError as error:
             self._note_failure(f"commands and pings are not sent: {error}")
-            return None
+            raise
 
     def _note_failure(self, reason: str) -> None:
         """Try the line again soon. Each reason is reported once, and again if it returns after a minute."""
@@ -331,8 +336,11 @@ class Gateway:
                 most = max(self._terminal.packet_bytes, LONGEST_IN_PORTIONS)
                 if len(packet) > most:
                     raise StreamError(f"{len(packet)} bytes: the link carries {most}")
-                counter = self._send(finished(packet, utc_ns()))
-                if counter is None:
+                try:
+                    counter = self._send(finished(packet, utc_ns()))
+                except KnightCubeError as error:
+                    if packet[:2] != _UNIT:  # a file transfer repeats its packets
+                        self._complain(f"{_title(packet)} was not sent: {error}; send it again")
                     continue
                 if counter in self._own:  # after a change of the key the counters begin again at 0
                     self._own.remove(counter)
@@ -343,7 +351,13 @@ class Gateway:
     def _accept(self) -> None:
         try:
             line, _ = self._listener.accept()
-        except OSError:
+        except (BlockingIOError, ConnectionError):  # the client has closed the connection
+            return
+        except OSError as error:
+            now = time.monotonic()
+            if now - self._accept_at > _FAILURE_S:
+                self._complain(f"connections cannot be accepted: {reason_of(error)}")
+            self._accept_at = now + _ACCEPT_PAUSE_S
             return
         line.setblocking(False)
         strangers = self._without_token()
@@ -367,6 +381,13 @@ class Gateway:
     def _drop(self, line: socket.socket) -> None:
         self._connections.pop(line, None)
         line.close()
+
+
+def _title(packet: bytes) -> str:
+    """Return the name and the sequence count of a command packet."""
+    request = request_of(packet)
+    name = next(name for name, layout in TELECOMMANDS.items() if layout.identifier == request.packet)
+    return f"command {name} with sequence count {request.sequence}"
 
 
 def finished(packet: bytes, now_ns: int) -> bytes:

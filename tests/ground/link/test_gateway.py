@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import re
 import select
 import socket
@@ -14,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
+from unittest.mock import Mock
 
 import pytest
 
@@ -122,7 +124,7 @@ def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
     assert station.satellite.up[-1][:2] == ping[:2]
 
 
-def test_a_network_or_disk_that_fails_for_a_while_is_reported_once_and_ends_nothing(
+def test_a_network_that_fails_for_a_while_is_reported_once_and_each_lost_command_by_name(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_PING_PERIOD_S", 0.0)
@@ -134,15 +136,42 @@ def test_a_network_or_disk_that_fails_for_a_while_is_reported_once_and_ends_noth
     with monkeypatch.context() as broken:
         broken.setattr(station.satellite, "send_by", fail)
         broken.setattr(module, "_RETRY_S", 0.0)
-        line = station.connect(station.line + SAFE)
+        # The satellite acknowledges packets of a file transfer, so the ground station repeats them.
+        line = station.connect(station.line + SAFE + UnitPacker(UP).pack(bytes(20), 1) + SAFE)
         station.satellite.say(TELEMETRY)
         station.turn()
         assert line.recv(4096) == TELEMETRY
-    assert station.complaints == [f"commands and pings are not sent: {problem}"]
+    name, count = "safe", int.from_bytes(SAFE[2:4], "big") & 0x3FFF
+    lost = f"command {name} with sequence count {count} was not sent: {problem}; send it again"
+    assert station.complaints == [f"commands and pings are not sent: {problem}", lost, lost]
     assert (station.satellite.commands, station.gateway.up) == ([], 0)
     line.sendall(SAFE)
     station.turn()
     assert [packet[:2] for packet in station.satellite.commands] == [SAFE[:2]]
+
+
+def test_a_connection_that_cannot_be_accepted_is_not_polled_without_a_pause(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener = station.gateway._listener
+    exhausted = Mock(
+        fileno=listener.fileno,
+        getsockname=listener.getsockname,
+        accept=Mock(side_effect=OSError(errno.EMFILE, "Too many open files")),
+    )
+    with monkeypatch.context() as broken:
+        broken.setattr(station.gateway, "_listener", exhausted)
+        broken.setattr(module, "_ACCEPT_PAUSE_S", 1e6)
+        line = station.connect(station.line)
+        station.turn()
+        assert exhausted.accept.call_count == 1
+    (complaint,) = station.complaints
+    assert complaint.startswith("connections cannot be accepted: Too many open files")
+    station.gateway._accept_at = time.monotonic()
+    station.turn()
+    station.satellite.say(TELEMETRY)
+    station.turn()
+    assert line.recv(4096) == TELEMETRY
 
 
 def test_a_line_that_is_lost_is_reported_and_pinged_again(
