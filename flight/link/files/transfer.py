@@ -12,6 +12,7 @@ that must survive a restart of the process is stored on disk (`flight.link.files
 
 from __future__ import annotations
 
+import errno
 import os
 import zlib
 from bisect import bisect_left, bisect_right
@@ -189,6 +190,30 @@ class Timer:
         self.times = 0
 
 
+_DISK_NS = 2_000_000_000
+_DISK_TRIES = 6
+"""Number of repeated attempts after a failed access to the disk; the attempts take about half a minute."""
+_LASTING = {None, errno.ENOENT, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+"""Error numbers of failures that a further attempt would not end; None is a file that is too short."""
+
+
+class DiskTimer(Timer):
+    """Timer of the attempts to read or write a file, because a single failed access is no lasting damage."""
+
+    def __init__(self, now_ns: int) -> None:
+        super().__init__(_DISK_NS, now_ns)
+
+    def waits(self, now_ns: int) -> bool:
+        """Return whether an access has failed and the next attempt is not due yet."""
+        return self.times > 0 and not self.due(now_ns)
+
+    def failed(self, error: BaseException | None, now_ns: int) -> bool:
+        """Count a failed access, at most once a period. Return whether the transfer must be given up."""
+        if not self.waits(now_ns):
+            self.retried(now_ns)
+        return getattr(error, "errno", None) in _LASTING or self.times > _DISK_TRIES
+
+
 ASK_NS = 5_000_000_000
 """Period (ns) after which an unacknowledged EOF is repeated."""
 _EOF_TRIES = 20
@@ -234,6 +259,7 @@ class Sender:
         self._stopped: Condition | None = None
         self._sum_of_sent = 0  # checksum of the transmitted data of a cancelled transfer
         self._timer = Timer(ASK_NS, now_ns)
+        self._disk = DiskTimer(now_ns)
 
     @property
     def sent(self) -> int:
@@ -281,7 +307,7 @@ class Sender:
 
     def next(self, now_ns: int) -> Content | None:
         """Return the content of the next PDU to send, or None if no PDU is due."""
-        self._continue_checksum()
+        self._continue_checksum(now_ns)
         if self.record.suspended and self._stopped is None:
             return None
         if self._metadata_due:
@@ -289,7 +315,7 @@ class Sender:
             name = self.record.name
             return Metadata(self.record.size, name, name, self.record.kind)
         if self._wanted:
-            return self._segment(now_ns)
+            return None if self._disk.waits(now_ns) else self._segment(now_ns)
         if not self._end_due and self._timer.due(now_ns):
             self._end_due = True
         if self._end_due and self._sum is None:
@@ -309,8 +335,12 @@ class Sender:
                 file.seek(begin)
                 data = file.read(end - begin)
         except OSError as error:
+            if not self._disk.failed(error, now_ns):
+                self._wanted.add(begin, end)
+                return None
             data, reason = b"", error.strerror or str(error)
         else:
+            self._disk.reset(now_ns)
             reason = "it has become shorter"
         if len(data) < end - begin:
             self.cancel(Condition.FILESTORE_REJECTION, f"{self.record.name}: {reason}")
@@ -318,11 +348,12 @@ class Sender:
         self._reached = max(self._reached, end)
         return FileData(begin, data)
 
-    def _continue_checksum(self) -> None:
-        if self._sum is None:
+    def _continue_checksum(self, now_ns: int) -> None:
+        if self._sum is None or (self._stopped is None and self._disk.waits(now_ns)):
             return
         try:
             value = self._sum.step()
+            self._disk.reset(now_ns)
             if value is None:
                 return
             self._sum = None
@@ -334,6 +365,8 @@ class Sender:
                 self._save(self.record)
         except OSError as error:
             if self._stopped is None:
+                if not self._disk.failed(error, now_ns):
+                    return
                 self.cancel(Condition.FILESTORE_REJECTION, str(error))
             self._sum = None  # the transmitted data can no longer be read
 
@@ -392,12 +425,14 @@ class Receiver:
         self._requested_to: int | None = None  # offset up to which gaps are requested in the current round
         self._sum: FileSum | None = None
         self._finish = Timer(FINISHED_NS, now_ns - FINISHED_NS)
+        self._disk = DiskTimer(now_ns)
+        self._unplaced = False  # whether the received file has not been moved to its final path yet
         # A transfer that continues after a restart requests its missing ranges at once.
         age_ns = SILENT_NS if record.name is not None else 0
         self._lack, self._silence = (Timer(period, now_ns - age_ns) for period in (LACK_NS, SILENT_NS))
         # A damaged file must not keep the link from starting.
         if record.finished is not None and record.finished[1] and os.path.exists(store.part(record)):
-            self._place()
+            self._place(now_ns)
 
     @property
     def received(self) -> int:
@@ -414,7 +449,7 @@ class Receiver:
             case Metadata() if self.record.name is None and self.record.finished is None:
                 self._begin(content)
             case FileData(offset, data) if self.record.finished is None:
-                self._store_segment(offset, data)
+                self._store_segment(offset, data, now_ns)
             case Eof():
                 return self._end(content, now_ns)
             case Ack(code=Code.FINISHED) if self.record.finished is not None:
@@ -425,10 +460,11 @@ class Receiver:
 
     def next(self, now_ns: int) -> Content | None:
         """Return the content of the next PDU to send, or None if no PDU is due."""
-        if self.record.finished is not None:
+        if self.record.finished is not None and not self._unplaced:
             return self._next_finished(now_ns)
-        if self._is_complete():
-            self._continue_check()
+        if self._unplaced or self._is_complete():
+            if not self._disk.waits(now_ns):
+                (self._place if self._unplaced else self._continue_check)(now_ns)
             return None
         if self.record.suspended:
             return None
@@ -487,7 +523,8 @@ class Receiver:
         if problem:
             self.stop(Condition.FILESTORE_REJECTION, problem)
 
-    def _store_segment(self, offset: int, data: bytes) -> None:
+    def _store_segment(self, offset: int, data: bytes, now_ns: int) -> None:
+        """Store data of the file. After a failed access to the disk the data are requested again."""
         end = offset + len(data)
         known = self.record.size if self.record.name is not None else self._most
         if end > known:
@@ -501,8 +538,10 @@ class Receiver:
             if os.pwrite(self._file, data, offset) != len(data):
                 return
         except OSError as error:
-            self.stop(Condition.FILESTORE_REJECTION, error.strerror or str(error))
+            if self._disk.failed(error, now_ns):
+                self.stop(Condition.FILESTORE_REJECTION, error.strerror or str(error))
             return
+        self._disk.reset(now_ns)
         self._ranges.add(offset, end)
         self._dirty = True
 
@@ -532,7 +571,7 @@ class Receiver:
             gaps.insert(0, (0, 0))
         return Nak(gaps[0][0], gaps[-1][1], tuple(gaps)) if gaps else None
 
-    def _continue_check(self) -> None:
+    def _continue_check(self, now_ns: int) -> None:
         assert self.record.end is not None
         checksum, size = self.record.end
         # Data received before the metadata could not be checked against the size of the file.
@@ -547,26 +586,33 @@ class Receiver:
         try:
             value = self._sum.step()
         except OSError as error:
-            self.stop(Condition.FILESTORE_REJECTION, str(error))
+            if self._disk.failed(error, now_ns):
+                self.stop(Condition.FILESTORE_REJECTION, str(error))
             return
+        self._disk.reset(now_ns)
         if value is not None and value != checksum:
             self.stop(Condition.CHECKSUM_FAILURE, f"its checksum is {value:08x}, not {checksum:08x}")
         elif value is not None:
             self._conclude(Condition.NO_ERROR, complete=True, kept=FileStatus.RETAINED, why="whole")
+            self._place(now_ns)
 
     def _conclude(self, condition: int, *, complete: bool, kept: FileStatus, why: str) -> None:
         self.said = why
         self._dirty = True
         self.record = msgspec.structs.replace(self.record, finished=(condition, complete, kept))
-        if complete:
-            self._place()
 
-    def _place(self) -> None:
+    def _place(self, now_ns: int) -> None:
+        """Move the received file to its final path, or try again later after a failed access to the disk."""
+        self._unplaced = True
         try:
             self.keep()  # the record is stored first, so that a restart can move the file
             self.close()
             self._store.place(self.record)
+            self._unplaced = False
         except FileError as error:
+            if not self._disk.failed(error.__cause__, now_ns):
+                return
+            self._unplaced = False
             condition, kept = Condition.FILESTORE_REJECTION, FileStatus.REJECTED
             self._conclude(condition, complete=False, kept=kept, why=str(error))
 

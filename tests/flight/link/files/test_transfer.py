@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -514,3 +515,56 @@ def test_received_data_is_removed_before_its_record(tmp_path: Path, monkeypatch:
             folder.remove(record)
     assert not folder.part(record).exists()
     assert folder.incoming() == [record]
+
+
+class FailingDisk:
+    """A disk on which each kind of access to a file of a transfer fails a number of times."""
+
+    def __init__(self, failures: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.left = dict.fromkeys(("read", "write", "move"), failures)
+        opened, pwrite, replace = Path.open, os.pwrite, os.replace
+
+        def open_(path: Path, mode: str = "r") -> Any:
+            self.access("read", mode == "rb")
+            return opened(path, mode)
+
+        def write(file: int, data: bytes, offset: int) -> int:
+            self.access("write", offset > SIZE // 2)
+            return pwrite(file, data, offset)
+
+        def move(one: Path, other: Path) -> None:
+            self.access("move", one.suffix == ".part")
+            replace(one, other)
+
+        monkeypatch.setattr(Path, "open", open_)
+        monkeypatch.setattr(os, "pwrite", write)
+        monkeypatch.setattr(os, "replace", move)
+
+    def access(self, kind: str, fails: bool) -> None:
+        if fails and self.left[kind]:
+            self.left[kind] -= 1
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+@pytest.mark.parametrize("source", [SATELLITE, GROUND])
+@pytest.mark.parametrize("access", ["read", "write", "move"])
+def test_a_failed_access_to_the_disk_is_repeated_for_half_a_minute_before_the_transfer_is_given_up(
+    tmp_path: Path, file: Path, source: int, access: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    other = GROUND if source == SATELLITE else SATELLITE
+    disk = FailingDisk(0, monkeypatch)
+    disk.left[access] = 3
+    pair.send(source, file, "a")
+    pair.until_closed()
+    assert disk.left[access] == 0
+    assert pair.received(other, "a") == file.read_bytes()
+    disk.left[access] = 10**9
+    begun_ns, failures = pair.now_ns, disk.left[access]
+    pair.send(source, file, "b")
+    pair.until_closed()
+    assert [one.condition for one in pair.ended[source]] == [0, Condition.FILESTORE_REJECTION]
+    assert 25e9 < pair.now_ns - begun_ns < 120e9
+    attempts = failures - disk.left[access]
+    assert attempts < 30 or access == "write", "each attempt is followed by a pause"
+    assert not pair.store(other).incoming()
