@@ -11,12 +11,15 @@ from __future__ import annotations
 import os
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from flight.link.coding import pseudo_random
+from flight.link.files.transfer import DiskTimer
 from flight.link.frames import TELEMETRY_HEADER, IdleFramer, MasterCount, Seal, TelemetryFramer
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Play
@@ -24,7 +27,10 @@ from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import COMMAND, EVENT, MODE, PLAN, RUN, STARS, STREAK, TARGET
 from flight.link.telemetry.log import find_runs, find_segments
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, LONGEST_PACKET, walk
+from hal.interfaces.wires import Clock
 from knightcube.errors import KnightCubeError
+
+_Read = TypeVar("_Read")
 
 _STEM = "flight"
 _CHUNK = 1 << 16
@@ -129,12 +135,34 @@ class LogFollower:
                 self._path = segments[-1]
 
 
-def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
-    """Yield packets of mission time `begin` to `end` (s), and b"" after each read, for interruptions."""
+def stretch(
+    folder: Path, begin: float, end: float, missing: list[str], now_ns: Callable[[], int]
+) -> Iterator[bytes]:
+    """Yield packets of mission time `begin` to `end` (s), and b"" after each read, for interruptions.
+
+    Failed accesses to the disk are repeated. The list `missing` receives each part of the log that cannot be
+    read; the rest of its segment is skipped.
+    """
     begin_ns, end_ns = begin * 1e9, end * 1e9
-    for path in _segments_from(folder, begin_ns):
+
+    def repeated(access: Callable[[], _Read], name: str) -> Generator[bytes, None, _Read | None]:
+        disk = DiskTimer(now_ns())
+        while True:
+            try:
+                if not disk.waits(now_ns()):
+                    return access()
+            except OSError as error:
+                if disk.failed(error, now_ns()):
+                    missing.append(f"{name}: {error.strerror or error}")
+                    return None
+            yield b""
+
+    segments = yield from repeated(partial(_segments_from, folder, begin_ns), folder.name)
+    for path in segments or ():
         stream, offset = _PacketStream(), 0
-        while data := _read(path, offset):
+        while data := (
+            yield from repeated(partial(_portion, path, offset), f"{path.name} from byte {offset}")
+        ):
             offset += len(data)
             packets = stream.add(data)
             yield from (packet for packet in packets if begin_ns <= time_of(packet) <= end_ns)
@@ -144,14 +172,17 @@ def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
 
 
 def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
-    """Return the segments of a run that can contain packets of mission time `begin_ns` or later."""
-    segments = _segments(folder)
-    while len(segments) > 1:
-        first = _PacketStream().add(_read(segments[1], 0)[: 2 * LONGEST_PACKET])
-        if first and time_of(first[0]) + _UNORDERED_NS > begin_ns:
-            break
-        segments = segments[1:]
-    return segments
+    """Return the segments of a run that can contain packets of mission time `begin_ns` or later.
+
+    Raises OSError if the folder cannot be listed.
+    """
+    segments, begin = find_segments(folder, _STEM), 0
+    for number, path in enumerate(segments[1:], 1):
+        if head := _PacketStream().add(_read(path, 0)[: 2 * LONGEST_PACKET]):
+            if time_of(head[0]) + _UNORDERED_NS > begin_ns:
+                break
+            begin = number
+    return segments[begin:]
 
 
 def _runs(archive: Path) -> list[Path]:
@@ -187,12 +218,16 @@ def _is_gone(path: Path, offset: int) -> bool:
 
 def _read(path: Path, offset: int) -> bytes:
     """Return at most 64 kB of a file, or empty bytes if the file cannot be read."""
-    try:
-        with open(path, "rb", opener=_at_once) as file:
-            file.seek(offset)
-            return file.read(_CHUNK)
-    except OSError:
-        return b""
+    with suppress(OSError):
+        return _portion(path, offset)
+    return b""
+
+
+def _portion(path: Path, offset: int) -> bytes:
+    """Return at most 64 kB of a file. Raises OSError."""
+    with open(path, "rb", opener=_at_once) as file:
+        file.seek(offset)
+        return file.read(_CHUNK)
 
 
 def _at_once(path: str, flags: int) -> int:
@@ -389,9 +424,10 @@ class Downlink:
 class Playback:
     """Playback of one time interval of recorded packets at a time."""
 
-    def __init__(self, downlink: Downlink, log: LogFollower) -> None:
-        self._downlink, self._log = downlink, log
+    def __init__(self, downlink: Downlink, log: LogFollower, clock: Clock) -> None:
+        self._downlink, self._log, self._clock = downlink, log, clock
         self._done: Report | None = None
+        self._missing: list[str] = []
 
     def begin(self, play: Play, done: Report) -> list[Report]:
         """Begin a playback and return the reports due now; `done` is the report of completion."""
@@ -399,7 +435,8 @@ class Playback:
         if folder is None:
             return [replace(done, stage=Stage.FAILED, text=f"the archive has no run {play.run}")]
         reports = self.end("replaced by another playback")
-        self._downlink.play(stretch(folder, play.begin, play.end))
+        self._missing = []
+        self._downlink.play(stretch(folder, play.begin, play.end, self._missing, self._clock.now_ns))
         self._done = done
         return [*reports, replace(done, stage=Stage.STARTED)]
 
@@ -411,8 +448,11 @@ class Playback:
         return reports
 
     def turn(self) -> list[Report]:
-        """Return the completion report of a playback once all its packets were sent, otherwise nothing."""
+        """Return the final report of a playback once all readable packets were sent, otherwise nothing."""
         if self._done is None or self._downlink.playing:
             return []
         done, self._done = self._done, None
+        if self._missing:
+            text = f"unreadable parts: {len(self._missing)}, first {self._missing[0]}"
+            done = replace(done, stage=Stage.FAILED, text=text)
         return [done]

@@ -496,7 +496,7 @@ class Station:
         self._unpacked, self._unpacked_text = 0, ""
         self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
-        self._playback = Playback(self._downlink, log)
+        self._playback = Playback(self._downlink, log, clock)
         self._scheduling = Scheduling(Timetable(vault.folder, vault.restored), settings.foreign_modes)
         self._report(*self._scheduling.beginning())
         if vault.restored or vault.rebuilt:

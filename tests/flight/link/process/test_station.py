@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flight.link.commands import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
 from flight.link.events import Mode
 from flight.link.frames import idle_packet
-from flight.link.process import directives, station
+from flight.link.process import directives, downlink, station
 from flight.link.process.directives import Deletion, NewKey, Play, Portion, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK, Downlink
 from flight.link.security import WINDOW, Admitted
@@ -378,6 +379,39 @@ def test_an_interval_of_the_archive_is_played_back_completely_beside_live_teleme
     link.turn()
     assert (link.stages(missing)[-1], link.stages(stop)[-1]) == ("failed", "completed")
     assert link.obeyed == [], "a command of the link went to the flight"
+
+
+@pytest.mark.parametrize("failures", [1, 3, 10**9])
+def test_a_playback_repeats_failed_reads_and_reports_what_it_could_not_read(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch, failures: int
+) -> None:
+    old = timing_packets(4000)
+    link.record(*old)
+    link.turn(4.0)
+    link.packets.clear()
+    left = failures
+
+    def fail(path: Path, mode: str, **options: Any) -> Any:
+        nonlocal left
+        if path.name == "flight-0002.ccsds" and left:
+            left -= 1
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return open(path, mode, **options)
+
+    monkeypatch.setattr(downlink, "open", fail, raising=False)
+    play = link.terminal.send(directives.pack(Play(0, 0.0, 1e3), 1))
+    link.turn(60.0)
+    played = [one for channel, one in link.packets if channel == PLAYBACK]
+    if failures < 10:
+        assert link.stages(play) == ["accepted", "started", "completed"]
+        assert played == old
+        return
+    assert link.stages(play) == ["accepted", "started", "failed"]
+    text = "unreadable parts: 1, first flight-0002.ccsds from byte 0: Input/output error"
+    assert link.reports()[-1].text == text
+    assert failures - left < 30, "each attempt is followed by a pause"
+    assert 1000 < len(played) < len(old)
+    assert (played[0], played[-1]) == (old[0], old[-1])
 
 
 def test_after_a_key_change_frames_with_the_old_key_are_refused(link: BothEnds) -> None:
