@@ -198,7 +198,7 @@ _LASTING = {None, errno.ENOENT, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.E
 
 
 class DiskTimer(Timer):
-    """Timer of the attempts to read or write a file, because a single failed access is no lasting damage."""
+    """Timer of the attempts to read or write a file, because a single failure may pass."""
 
     def __init__(self, now_ns: int) -> None:
         super().__init__(_DISK_NS, now_ns)
