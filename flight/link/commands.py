@@ -430,6 +430,9 @@ def _by_fields(words: list[str], stored: bool) -> list[str]:
         if len(numbers) != keyword + 2:
             raise CommandError(f"roll needs one angle such as 90{_DEGREES}")
         numbers = [*numbers[:keyword], *["nan"] * (4 - keyword), *numbers[keyword + 1 :]]
+    most = next((NUMBERS.get(one, (0,))[-1] for one in Goal if goal == [one.label]), 4)
+    if not stored and any(word != "nan" for word in numbers[most:4]):
+        raise CommandError(f"{goal[0]} takes at most {most} numbers: give a roll as roll 90{_DEGREES}")
     return goal + [
         word if is_attitude and at < 4 else _in_radians(word, stored) for at, word in enumerate(numbers)
     ]

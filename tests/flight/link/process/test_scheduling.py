@@ -379,6 +379,15 @@ def test_words_are_read_by_the_table() -> None:
             command_of_words(wrong)
 
 
+@pytest.mark.parametrize(
+    "words", ["point nadir 90deg", "point sun 5deg roll 3deg", "point ground 1deg 2deg 3deg"]
+)
+def test_a_number_that_the_goal_does_not_take_is_refused_and_not_ignored(words: str) -> None:
+    """In `point nadir 90deg` the angle is a roll without its word `roll`."""
+    with pytest.raises(CommandError, match="takes at most"):
+        command_of_words(words)
+
+
 def test_angles_in_words_have_their_unit() -> None:
     target = PointingTarget(Goal.GROUND, (math.radians(52.5), math.radians(-13.4)), math.radians(90.0))
     for words in ("point ground 52.5deg -13.4deg roll 90deg", "point ground 52.5deg -13.4deg --roll 90deg"):
