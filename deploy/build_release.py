@@ -190,19 +190,22 @@ def _source_files(path: Path) -> Iterator[Path]:
 
 def _damaged_package(release: Path) -> str:
     """Return how the package files of a release differ from its manifest, or an empty text if they agree."""
-    first, _, rest = (release / MANIFEST).read_text(encoding="utf-8").partition("\n")
-    if hashlib.sha256(rest.encode()).hexdigest() != first:
-        return f"the manifest of {release.name} is damaged"
-    for line in rest.splitlines():
-        expected, _, name = line.split(" ", 2)
-        parts = name.split("/")
-        if parts[:2] != ["venv", "lib"] or "__pycache__" in parts:
-            continue
-        if any(fnmatch.fnmatch(part, pattern) for part in parts[4:5] for pattern in _OURS):
-            continue
-        path = release / name
-        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != expected:
-            return f"{name} is damaged"
+    try:
+        first, _, rest = (release / MANIFEST).read_text(encoding="utf-8").partition("\n")
+        if hashlib.sha256(rest.encode()).hexdigest() != first:
+            return f"the manifest of {release.name} is damaged"
+        for line in rest.splitlines():
+            expected, _, name = line.split(" ", 2)
+            parts = name.split("/")
+            if parts[:2] != ["venv", "lib"] or "__pycache__" in parts:
+                continue
+            if any(fnmatch.fnmatch(part, pattern) for part in parts[4:5] for pattern in _OURS):
+                continue
+            path = release / name
+            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+                return f"{name} is damaged"
+    except (OSError, ValueError) as error:
+        return f"{release.name} cannot be read: {error}"
     return ""
 
 
@@ -285,7 +288,10 @@ def _sync(folder: Path) -> None:
 
 
 def _text(path: Path) -> str:
-    return path.read_text(encoding="ascii") if path.is_file() else ""
+    """Return the text of a file, empty if the file is missing, damaged or cannot be read."""
+    with suppress(OSError, ValueError):
+        return path.read_text(encoding="ascii")
+    return ""
 
 
 def main(words: list[str]) -> int:

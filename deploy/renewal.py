@@ -580,7 +580,8 @@ class Renewal:
         left_s, despite, before = 3600.0 * hours, bool(request["despite_faults"]), board.release("previous")
         session = str(self._contact.get("session", ""))
         if kind == "release":
-            old, new, what = board.release("current"), "", "release"
+            # If the current release is incomplete, the previous release runs, and also follows a trial.
+            old, new, what = board.release("current") or board.release("previous"), "", "release"
             os.sync()  # the sources are on disk before the trial is stored
         else:
             old, what = board.keep(""), "configuration"
@@ -687,7 +688,7 @@ class Renewal:
                 if trial.tries > MOST_TRIES:
                     raise Refused(f"the build of the release did not end {MOST_TRIES} times")
                 self._save()
-                trial.new = self._built()
+                trial.new = self._built(trial.old)
                 self._save()
             if trial.new == trial.old:
                 raise Refused("this release is in use already")
@@ -701,10 +702,12 @@ class Renewal:
         self._report(trial.request, "started", "activate", text)
         self._save()
 
-    def _built(self) -> str:
-        """Build the release of the bundle and return its name. Raises Refused if this fails, and OSError."""
+    def _built(self, old: str) -> str:
+        """Build the release of the bundle beside the release `old`, and return its name.
+
+        Raises Refused if this fails, and OSError.
+        """
         board, source = self._board, self._board.own / "staging/source"
-        old = board.release("current")
         wheels = ["--wheels", source / "wheels"] if (source / "wheels").is_dir() else ["--reuse", old]
         words = [board.builder(old), "-I", source / "deploy/build_release.py", board.prefix, "build"]
         done = board.run([*words, "--python", board.builder(old), *wheels])

@@ -450,6 +450,40 @@ def test_a_release_replaces_one_whose_own_files_or_bytecode_are_damaged(board: R
     assert not list((board.files.prefix / "current").glob("venv/lib/python3*/site-packages/__pycache__"))
 
 
+@pytest.mark.parametrize("file", ["source", "manifest"])
+def test_a_bad_byte_in_the_records_of_the_current_release_stops_no_program(
+    board: RenewedBoard, file: str
+) -> None:
+    """Without a manifest the packages must be in the bundle; the record of the sources is not needed."""
+    record = board.files.prefix / "current" / file
+    record.write_bytes(b"\xff" + record.read_bytes()[1:])
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    result, text = board.reports(request)[-1]
+    if file == "source":
+        assert (result, board.release()) == ("started", "new"), text
+    else:
+        assert (result, "add the folder wheels" in text) == ("failed", True), text
+
+
+def test_a_trial_that_fails_after_damage_to_the_current_release_ends_with_the_release_that_ran_before(
+    board: RenewedBoard,
+) -> None:
+    board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    board.request("confirm", "release")
+    board.step()
+    (board.files.prefix / "current/manifest").unlink()
+    assert board.release() == "old"
+    request = board.activate(board.bundle("release", board.source("newest"), 2), "release")
+    board.step()
+    assert board.release() == "newest", board.reports(request)
+    assert (board.files.prefix / "previous").readlink() == Path("releases") / FIRST
+    board.step(4000.0)
+    assert board.reports(request)[-1][0] == "failed"
+    assert board.release() == "old"
+
+
 def test_a_trial_ends_although_its_reports_cannot_be_written(board: RenewedBoard) -> None:
     before = board.flown()
     activated(board)
