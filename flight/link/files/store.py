@@ -88,10 +88,29 @@ def overwrite(path: Path, data: bytes) -> bool:
         finally:
             os.close(file)
         if new:
-            make_lasting(path.parent)
+            try:
+                make_lasting(path.parent)
+            except OSError:  # the next attempt must sync the folder again
+                path.unlink()
+                raise
     except OSError:
         return False
     return True
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder with its parents, and sync each new name to disk. Raises OSError."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        make_lasting(folder.parent)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the temporary files that a killed process has left in a folder and its subfolders."""
+    with suppress(OSError):
+        for path in folder.rglob("*~"):
+            path.unlink()
 
 
 @contextmanager
@@ -213,7 +232,8 @@ class Store:
         self.received = folder / "received"
         try:
             for path in (self._folder, self.received):
-                path.mkdir(parents=True, exist_ok=True, mode=0o700)
+                make_folder(path)
+            self._identity = _identity(self._folder)
         except OSError as error:
             raise UsageError(f"{folder}: cannot be made: {error.strerror or error}") from error
         numbers = _read(self._folder / "numbers.json", _Numbers) or _Numbers()
@@ -223,6 +243,7 @@ class Store:
     def owned(self) -> Iterator[None]:
         """Lock the folder against a second process. Raises UsageError if another process has locked it."""
         with locked(self._folder / "owner", f"{self._folder}: another process transfers these files"):
+            remove_unfinished(self._folder)
             yield
 
     def new_number(self, utc_ns: int) -> int:
@@ -249,7 +270,7 @@ class Store:
 
     def save(self, record: Outgoing | Incoming) -> None:
         """Store a record durably. Raises FileError if the disk cannot be written."""
-        _write(self._path(record), record)
+        self._write(self._path(record), record)
 
     def remove(self, record: Outgoing | Incoming) -> None:
         """Remove a record and, for an incoming transfer, first the received data.
@@ -270,7 +291,7 @@ class Store:
         assert record.name is not None
         target = self.received / record.name
         try:
-            target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            make_folder(target.parent)
             os.replace(self.part(record), target)
             make_lasting(target.parent)
         except OSError as error:
@@ -293,8 +314,26 @@ class Store:
         return self._folder / f"in-{record.source:05d}-{record.number:010d}.json"
 
     def _write_numbers(self, last: int, endings: tuple[Ending, ...]) -> None:
-        _write(self._folder / "numbers.json", _Numbers(last, endings))
+        self._write(self._folder / "numbers.json", _Numbers(last, endings))
         self.last, self.endings = last, endings
+
+    def _write(self, path: Path, values: msgspec.Struct) -> None:
+        """Store values as a record. Raises FileError if the disk cannot be written.
+
+        A folder that was mounted later belongs to other transfers, whose records must not be replaced.
+        """
+        try:
+            if _identity(self._folder) != self._identity:
+                raise FileError(f"{self._folder}: another folder is mounted there: restart this program")
+        except OSError as error:
+            raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+        write_whole(path, to_record(msgspec.json.encode(values)))
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    """Return device and inode number of a folder. Raises OSError."""
+    found = folder.stat()
+    return found.st_dev, found.st_ino
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -314,11 +353,6 @@ def write_whole(path: Path, data: bytes) -> None:
         with suppress(OSError):
             beside.unlink(missing_ok=True)
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
-def _write(path: Path, values: msgspec.Struct) -> None:
-    """Store values as a record. Raises FileError if the disk cannot be written."""
-    write_whole(path, to_record(msgspec.json.encode(values)))
 
 
 def _read(path: Path, shape: type[T]) -> T | None:

@@ -29,10 +29,12 @@ from flight.link.files.store import (
     FileError,
     Store,
     line_of,
+    make_folder,
     make_lasting,
     overwrite,
     problem_of_name,
     read_regular,
+    remove_unfinished,
     to_record,
     write_whole,
 )
@@ -89,6 +91,7 @@ class Filing:
         """
         self._folder = folder
         self._store = Store(folder)
+        remove_unfinished(folder)
         self._roots = {"log": log, "received": self._store.received}
         self._checks: list[tuple[Report, Iterator[str | None]]] = []
         self._units = UnitPacker(DOWN)
@@ -251,7 +254,7 @@ class Filing:
         digest = hashlib.sha256()
         kind, _, own = name.removeprefix("received/").partition("/")
         folder = self._folder / "chosen" / kind
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        make_folder(folder)
         beside = folder.with_name(f"{kind}~")
         try:
             with path.open("rb") as file, beside.open("wb") as copy:
@@ -335,6 +338,7 @@ class Renewal:
         self._utc_offset_ns: int | None = None  # receiver's UTC minus the time of the host's clock
         self._recorded = ("", "")
         self._due_ns = self._modified_ns = self._reported = 0
+        remove_unfinished(folder)
         with suppress(OSError, *_DAMAGED):
             self._reported = int(decoded(read_regular(folder / "reported", _LARGEST) or b""))
 

@@ -23,7 +23,7 @@ from flight.link import commands
 from flight.link.coding import LONGEST_CLTU, FrameDecoder, Framing, LinkCodes
 from flight.link.commands import CommandError, CommandPacker, filter_datagrams
 from flight.link.events import Mode
-from flight.link.files.store import files_folder
+from flight.link.files.store import FileError, files_folder
 from flight.link.files.units import UP, is_unit
 from flight.link.frames import TELECOMMAND_HEADER, TELECOMMAND_MASK, TELEMETRY_MASK, open_telecommand
 from flight.link.process import directives
@@ -549,7 +549,11 @@ class Station:
         if self._keys_returned:
             complain("the lost keys can be read again: the link is started again")
         self._control.close()
-        self._filing.close(self._clock.now_ns())
+        try:
+            self._filing.close(self._clock.now_ns())
+        except FileError:
+            if not self._keys_returned:  # a late folder belongs to other transfers, which continue
+                raise
 
     def turn(self) -> bool:
         """Process received frames and send due frames. Return whether any frame was received."""

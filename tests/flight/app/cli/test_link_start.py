@@ -18,6 +18,8 @@ import pytest
 
 from flight.app.cli import link, main
 from flight.app.service import SeparationInhibit
+from flight.link.files.store import Incoming, Store
+from flight.link.files.units import UP, Metadata, Transaction, UnitPacker, pack
 from flight.link.process.commanding import Timetable
 from flight.link.process.station import Station
 from flight.link.security import Vault
@@ -209,17 +211,23 @@ def test_a_lost_folder_of_keys_is_rebuilt_a_minute_after_it_was_found_missing(
 def test_a_folder_of_keys_that_is_mounted_late_is_read_by_a_new_start(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The stored schedule of a folder that is mounted after the rebuilding is executed."""
+    """The stored schedule and the transfers of a folder that is mounted after the rebuilding continue."""
     config = write_linked_config(place, udp="127.0.0.1:0")
-    keys, away, hidden = place / "keys" / "satellite", place / "away", place / "hidden"
-    opened = list[tuple[bool, int]]()
+    keys, away = place / "keys" / "satellite", place / "away"
+    opened = list[tuple[bool, int, list[str]]]()
+    files, late = place / "keys" / "files", place / "late"
+    Store(late).save(Incoming(2, 7, "elements/late", 5))
     run, turns = Station.run, itertools.count()
 
     def run_shortly(self: Station, ended: Callable[[], bool], *callbacks: Callable[..., object]) -> None:
-        opened.append((self._vault.rebuilt, len(self._scheduling._timetable.entries)))
-        if len(opened) == 1:  # the folder is mounted while the link with rebuilt keys runs
-            keys.rename(hidden)
-            away.rename(keys)
+        names = [one.name for one in self._filing.status()]
+        opened.append((self._vault.rebuilt, len(self._scheduling._timetable.entries), names))
+        if len(opened) == 1:  # the parent folder is mounted while the link with rebuilt keys runs
+            metadata = pack(Transaction(2, 7, 1), Metadata(9, "elements/early", "a", 3))
+            self._filing.take(UnitPacker(UP).pack(metadata, 1), 0)
+            for path, other in ((keys, away), (files, late)):
+                path.rename(place / f"hidden-{path.name}")
+                other.rename(path)
         run(self, lambda: ended() or next(turns) >= 100, *callbacks)
 
     Vault(keys, place / "keys" / "witness")
@@ -228,7 +236,7 @@ def test_a_folder_of_keys_that_is_mounted_late_is_read_by_a_new_start(
     monkeypatch.setattr(link, "_KEYS_WAIT_NS", 0)
     monkeypatch.setattr(Station, "run", run_shortly)
     link._run(config, place, lambda: len(opened) > 1)
-    assert opened == [(True, 0), (False, 1)]
+    assert opened == [(True, 0, []), (False, 1, ["elements/late"])]
     assert "the lost keys can be read again" in capsys.readouterr().err
 
 

@@ -568,3 +568,48 @@ def test_a_failed_access_to_the_disk_is_repeated_for_half_a_minute_before_the_tr
     attempts = failures - disk.left[access]
     assert attempts < 30 or access == "write", "each attempt is followed by a pause"
     assert not pair.store(other).incoming()
+
+
+def test_records_are_not_written_into_a_folder_that_is_mounted_later(tmp_path: Path) -> None:
+    first, late = tmp_path / "files", tmp_path / "late"
+    record = Incoming(GROUND, 1, "elements/late", 5)
+    Store(late).save(record)
+    end = Entity(SATELLITE, Store(first), lambda _: "", SIZE, 0)
+    metadata = pack(Transaction(GROUND, 1, SATELLITE), Metadata(9, "elements/early", "a", CRC32))
+    end.take(metadata, 0)
+    end.keep(0, at_once=True)
+    first.rename(tmp_path / "hidden")
+    late.rename(first)
+    end.take(pack(Transaction(GROUND, 1, SATELLITE), FileData(0, b"abc")), 0)
+    with pytest.raises(FileError, match="another folder is mounted there"):
+        end.close(0)
+    assert Store(first).incoming() == [record]
+
+
+def test_a_new_name_is_synced_to_disk_in_each_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, record = Store(tmp_path), Incoming(GROUND, 7, "elements/a", 4)
+    folder.part(record).write_bytes(b"data")
+    synced: list[Path] = []
+    monkeypatch.setattr(store, "make_lasting", synced.append)
+    folder.place(record)
+    assert synced == [folder.received, folder.received / "elements"]
+
+
+def test_a_new_file_is_stored_only_if_its_folder_was_synced_to_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[Path] = []
+
+    def sync(folder: Path) -> None:
+        synced.append(folder)
+        if len(synced) == 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(store, "make_lasting", sync)
+    assert [store.overwrite(tmp_path / "a", data) for data in (b"one", b"two", b"three")] == [
+        False,
+        True,
+        True,
+    ]
+    assert synced == [tmp_path, tmp_path]
+    assert (tmp_path / "a").read_bytes() == b"three"

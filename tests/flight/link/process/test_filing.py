@@ -101,6 +101,25 @@ def test_only_the_last_selected_file_of_a_kind_is_kept(link: FiledEnds) -> None:
     assert sorted(path.name for path in (folder / "received" / "elements").iterdir()) == ["a.tle", "b.tle"]
 
 
+def test_temporary_files_of_a_killed_process_are_removed_at_the_start(link: FiledEnds) -> None:
+    folder = link.place / "keys" / "files"
+    (folder / "received" / "elements").mkdir()
+    kept = folder / "received" / "elements" / "a.tle"
+    kept.write_bytes(b"kept")
+    left = [folder / name for name in ("chosen/elements~", "transfers/out-0000000001.json~", "listing.json~")]
+    left.append(link.place / "keys" / "renewal" / "1-2-3-4~")
+    for path in left:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"left")
+    link.restart()
+    assert not any(path.exists() for path in left)
+    assert kept.read_bytes() == b"kept"
+    unfinished = link.session.entity._store._folder / "in-00001-0000000001.json~"
+    unfinished.write_bytes(b"left")
+    with link.session.entity._store.owned():
+        assert not unfinished.exists()
+
+
 def test_a_file_that_changes_while_it_is_checked_is_chosen_as_it_was_checked(
     link: FiledEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
