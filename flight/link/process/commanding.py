@@ -35,7 +35,7 @@ from flight.link.files.store import line_of, overwrite, read_regular, to_record
 from flight.link.process.directives import LONGEST_COMMAND, SCHEDULE, Deletion, Listing, Scheduled
 from flight.link.security import COPIES
 from flight.link.telemetry.definitions import COMMAND, HEALTH, MODE
-from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk
+from flight.link.telemetry.packets import LONGEST_PACKET, row_of, to_text, walk
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError
 
@@ -129,10 +129,11 @@ class Verification:
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
         """Return the reports for an answer of the control process. Empty bytes represent a missing answer."""
-        found = [answer[begin:end] for layout, begin, end in walk(answer) if layout.packet is COMMAND]
-        if not found:
-            return [report(sent, Stage.FAILED, "the flight did not answer")]
-        (row,) = LAYOUTS[COMMAND.name].array(found[0])
+        rows = (row_of(COMMAND, answer[begin:end]) for _, begin, end in walk(answer))
+        row = next((row for row in rows if row is not None), None)
+        if row is None:
+            problem = "answered in another version" if answer else "did not answer"
+            return [report(sent, Stage.FAILED, f"the flight {problem}")]
         text = to_text(row["text"])
         if not row["obeyed"]:
             return [report(sent, Stage.FAILED, text)]
@@ -149,10 +150,8 @@ class Verification:
 
     def followed(self, packet: bytes) -> list[Report]:
         """Return the reports of commands whose completion or failure a live telemetry packet shows."""
-        layout = LAYOUTS[MODE.name]
-        if self._open is None or packet[:2] != layout.identifier.to_bytes(2, "big"):
+        if self._open is None or (row := row_of(MODE, packet)) is None:
             return []
-        (row,) = layout.array(packet)
         sent, wanted, since_ns = self._open
         slews, trigger = isinstance(sent.command, Slew), to_text(row["trigger"])
         # The mission time of a restarted flight begins at 0 again, with the mode BOOT.
@@ -378,10 +377,6 @@ _PAST_ENTRIES = 8
 LATEST_NS = 10 * SECOND_NS
 """Maximum delay (ns) with which a scheduled command is still executed."""
 
-_WITH_MODE = {
-    LAYOUTS[packet.name].identifier.to_bytes(2, "big"): LAYOUTS[packet.name] for packet in (MODE, HEALTH)
-}
-
 
 class Scheduling:
     """Scheduler that executes time-tagged commands. Times are UTC in ns since 1970."""
@@ -400,9 +395,9 @@ class Scheduling:
 
     def followed(self, packet: bytes) -> None:
         """Update the current mode if a packet of live telemetry contains the mode."""
-        layout = _WITH_MODE.get(packet[:2])
-        if layout is not None:
-            self._mode = int(layout.array(packet)[0]["mode"])
+        for kind in (MODE, HEALTH):
+            if (row := row_of(kind, packet)) is not None:
+                self._mode = int(row["mode"])
 
     def reported(self, report: Report) -> None:
         """Update the result of a scheduled command from a report about this command."""

@@ -67,7 +67,7 @@ from flight.link.process.directives import (
     UseFile,
 )
 from flight.link.telemetry.definitions import EVENT, FIX, MODE
-from flight.link.telemetry.packets import LAYOUTS, to_text
+from flight.link.telemetry.packets import row_of, to_text
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
 
@@ -311,7 +311,6 @@ CONTACT_NS = 10 * SECOND_NS
 """Minimum time (ns) between two records of the contact with the ground."""
 _LARGEST = 1 << 16
 _REACTION = "reaction safe"  # trigger in the mode packet after an event (flight.loop.modes)
-_MODE_LAYOUT, _EVENT_LAYOUT, _FIX_LAYOUT = (LAYOUTS[packet.name] for packet in (MODE, EVENT, FIX))
 _STAGES = {"started": Stage.STARTED, "completed": Stage.COMPLETED, "failed": Stage.FAILED}
 _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, RecursionError)
 
@@ -376,20 +375,16 @@ class Renewal:
 
         The time of a used GPS fix is also noted if the packet was just written (`live` is true).
         """
-        if packet[:2] == _MODE_LAYOUT.identifier.to_bytes(2, "big"):
-            (row,) = _MODE_LAYOUT.array(packet)
+        if (row := row_of(MODE, packet)) is not None:
             if row["mode"] == Mode.SAFE and to_text(row["trigger"]) == _REACTION:
                 self._fault = to_text(row["reason"])[:64] or _REACTION
-        elif packet[:2] == _EVENT_LAYOUT.identifier.to_bytes(2, "big"):
-            (row,) = _EVENT_LAYOUT.array(packet)
+        elif (row := row_of(EVENT, packet)) is not None:
             # A flight that refuses the new configuration uses its last valid configuration.
             fails = row["severity"] == Severity.FAULT or row["code"] == CONFIG_DAMAGED.code
             if fails and not self._fault:
                 self._fault = f"{to_text(row['name'])}: {to_text(row['text'])}"[:64]
-        elif live and packet[:2] == _FIX_LAYOUT.identifier.to_bytes(2, "big"):
-            (row,) = _FIX_LAYOUT.array(packet)
-            if row["used"]:
-                self._utc_offset_ns = int(row["utc_ns"]) - now_ns
+        elif live and (row := row_of(FIX, packet)) is not None and row["used"]:
+            self._utc_offset_ns = int(row["utc_ns"]) - now_ns
 
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
         """Record the number `admitted` of authentic frames so far, and return new reports of the program."""

@@ -70,7 +70,7 @@ from flight.link.security import (
     may_change,
 )
 from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Packet
-from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError
+from flight.link.telemetry.packets import Packer, TelemetryError, row_of
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
 from knightcube.errors import KnightCubeError, UsageError
@@ -719,9 +719,12 @@ class Station:
 
         The largest offset is the most accurate one, because packets are delayed in the log.
         """
+        if (row := row_of(RUN, label)) is None:  # the flight has another version of the packet
+            self._utc_offset_ns = None
+            return
         if label != self._label:
             self._label, self._utc_offset_ns = label, None
-            self._zero_utc_ns = int(LAYOUTS[RUN.name].array(label)[0]["utc_ns"])
+            self._zero_utc_ns = int(row["utc_ns"])
         offset_ns = self._zero_utc_ns + mission_offset_ns
         self._utc_offset_ns = max(
             offset_ns, offset_ns if self._utc_offset_ns is None else self._utc_offset_ns

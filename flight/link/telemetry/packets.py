@@ -284,7 +284,7 @@ def _valid_length(data: bytes, position: int, layout: Layout) -> int:
     """Return the length (bytes) of the valid packet at offset `position`, 0 if there is no valid packet."""
     length = _stated_length(data, position)
     stop = position + length
-    if length < HEADER_BYTES + 1 or stop > len(data):
+    if length < HEADER_BYTES + SECONDARY_BYTES + CRC_BYTES or stop > len(data):
         return 0
     if data[position + 2] & _SEQUENCE_FLAGS != _SEQUENCE_FLAGS:
         return 0

@@ -17,12 +17,23 @@ from flight.link.commands import ChangeMode, Command, CommandError, CommandPacke
 from flight.link.events import Mode
 from flight.link.frames import idle_packet
 from flight.link.process import directives, downlink, station
+from flight.link.process.commanding import Sent, Stage, Verification
 from flight.link.process.directives import Deletion, NewKey, Play, Portion, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK, Downlink
 from flight.link.security import WINDOW, Admitted
-from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT, MODE
+from flight.link.telemetry.definitions import (
+    COMMAND,
+    CYCLE_TIMING,
+    EVENT,
+    FIX,
+    HEALTH,
+    MODE,
+    RUN,
+    Field,
+    Packet,
+)
 from flight.link.telemetry.log import SegmentStore
-from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, crc16
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, compile_layouts, crc16
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError
 from tests.flight.link.process.both_ends import BothEnds
@@ -232,6 +243,26 @@ def test_a_log_that_states_any_time_does_not_end_the_link(link: BothEnds) -> Non
     link.turn()
     assert link.stages(counter) == ["accepted", "started", "completed"]
     assert link.status()["time_ns"] == 2**63 - 1
+
+
+@pytest.mark.parametrize("kind", [RUN, MODE, HEALTH, EVENT, FIX, COMMAND], ids=lambda kind: kind.name)
+@pytest.mark.parametrize("change", ["shorter", "longer"])
+def test_packets_of_another_release_are_sent_down_and_do_not_end_the_link(
+    link: BothEnds, kind: Packet, change: str
+) -> None:
+    """During a renewal, and after its end, flight and link can be of different releases."""
+    fields = kind.fields[:-1] if change == "shorter" else (*kind.fields, Field("more", "u1", "-", "more"))
+    other = replace(kind, fields=fields, version=kind.version + 1)
+    packer, values = Packer(compile_layouts([other])), plain_contents(other)
+    for second in range(2):
+        link.record(packer.pack(other, second * SECOND_NS, values))
+        link.turn(1.0)
+    assert len(link.of(kind.name)) >= 2
+    counter = link.terminal.send(packet(Ping(1)))
+    link.turn()
+    assert link.stages(counter) == ["accepted", "started", "completed"]
+    (answered,) = Verification().answered(Sent(1, counter, Ping(1)), packer.pack(other, 0, values))
+    assert (answered.stage, answered.text) == (Stage.FAILED, "the flight answered in another version")
 
 
 def test_the_loop_reports_progress_once_a_second_also_while_it_processes_many_frames(

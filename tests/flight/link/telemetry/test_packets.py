@@ -28,6 +28,7 @@ from flight.link.telemetry.packets import (
     compile_layouts,
     crc16,
     to_text,
+    walk,
 )
 from ground.telemetry import decode
 from tests.flight.link.telemetry.samples import contents, plain_contents, timing_packets
@@ -90,6 +91,14 @@ def test_every_packet_is_equal_after_packing_and_unpacking(
             assert to_text(row[field.name]) == values[field.name]
         else:
             np.testing.assert_array_equal(row[field.name], np.asarray(values[field.name], dtype=field.kind))
+
+
+def test_bytes_that_are_too_short_for_the_headers_are_not_a_packet_of_another_version() -> None:
+    """Readers take the mission time from the secondary header of every packet."""
+    for content in (b"\7", b"\7" + bytes(7)):
+        head = LAYOUTS[EVENT.name].identifier.to_bytes(2, "big") + b"\xc0\0"
+        body = head + (len(content) + 1).to_bytes(2, "big") + content
+        assert not list(walk(body + crc16(body).to_bytes(2, "big")))
 
 
 def test_sequence_counts_are_kept_for_each_apid_and_wrap_at_14_bits() -> None:
