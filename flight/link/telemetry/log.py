@@ -159,7 +159,11 @@ class SegmentStore:
     def _open_next(self) -> None:
         """Begin the next segment file. If no file can be created, the current file remains in use."""
         path = self._folder / f"{self._stem}-{self._number + 1:04d}{SUFFIX}"
-        self._file = self._opener(path)
+        try:
+            self._file = self._opener(path)
+        except FileExistsError:  # a failing disk has kept the file of an earlier attempt
+            self._number += 1
+            raise
         self._path = path
         self._number += 1
         self._size = 0

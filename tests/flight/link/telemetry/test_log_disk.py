@@ -165,6 +165,29 @@ def test_a_segment_that_cannot_be_opened_later_stops_the_log_in_order(tmp_path: 
     assert os.strerror(errno.EROFS) in log.error()
 
 
+def test_a_segment_that_a_failing_disk_leaves_behind_does_not_stop_the_log(tmp_path: Path) -> None:
+    """The disk can fail between the creation of a segment and the removal of its file."""
+    failures = iter([False, True])
+
+    def opened(path: Path) -> SegmentFile:
+        file = open_segment(path)
+        if next(failures, False):
+            file.close()
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return file
+
+    clock, packets = ManualClock(0), timing_packets(25)
+    log = FlightLog(tmp_path, clock=clock, segment_bytes=10 * len(packets[0]), opener=opened)
+    for packet in packets:
+        log.write(packet)
+    clock.advance(SECOND)
+    assert os.strerror(errno.EIO) in log.error()
+    clock.advance(3 * SECOND)
+    assert log.error() == ""
+    log.close()
+    assert content(tmp_path) == b"".join(packets)
+
+
 def test_the_disk_is_synced_about_once_a_second_or_only_at_the_end(tmp_path: Path) -> None:
     for name, period, expected in (("flying", SECOND, 10), ("lock-step", None, 0)):
         clock, disk = ManualClock(0), SmallDisk(1 << 20)
