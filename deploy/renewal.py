@@ -787,8 +787,10 @@ class Renewal:
             if not name or name == current or name in state.bad:
                 return False
         else:
-            name = GROUND if what == GROUND else state.previous
-            current, stored = board.keep(""), board.stored(name) if name else None
+            name, current = GROUND if what == GROUND else state.previous, ""
+            with suppress(OSError):  # the return is possible without a copy of the present configuration
+                current = board.keep("")
+            stored = board.stored(name) if name else None
             if stored is None or hashlib.sha256(stored[CONFIGURATION]).hexdigest() == current:
                 return False
         state.returning = [what, name, current, request, word, text]

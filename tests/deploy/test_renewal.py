@@ -735,6 +735,20 @@ def test_without_contact_the_board_leaves_a_configuration_that_cannot_be_read(
     assert board.flown() == ground
 
 
+def test_without_contact_the_board_returns_although_the_present_configuration_cannot_be_stored(
+    board: RenewedBoard,
+) -> None:
+    ground = board.flown()
+    activated(board)
+    board.request("confirm")
+    board.contact(7, limit_s=1000.0)
+    board.step()
+    with patch.object(renewal.Board, "keep", side_effect=OSError(5, "Input/output error")):
+        for _ in range(3):
+            board.step(1100.0)
+    assert board.flown() == ground
+
+
 def test_a_configuration_that_cannot_be_read_can_be_replaced(board: RenewedBoard) -> None:
     ground, path = board.flown(), board.changed("second")
     board.config.unlink()
