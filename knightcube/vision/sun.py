@@ -26,7 +26,7 @@ from scipy.ndimage import find_objects, label
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, check_fields, check_type, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, image_of_camera
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus
 
@@ -210,12 +210,14 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
             slightly below saturation.
 
     Raises:
-        ArgumentError: if the image does not have the size of the camera, or if its pixels are not finite
-            numbers.
+        ArgumentError: if the image does not have the size of the camera, if its pixels are not finite
+            numbers, or if the stride is so large that no row is read.
     """
     settings = LINEAR if settings is None else settings
     check_type("settings", settings, SunSettings)
     image = image_of_camera(image, camera)
+    if settings.stride // 2 >= camera.rows:
+        raise ArgumentError("settings.stride", f"{settings.stride}: no row of {camera.rows} is read")
     # Off the axis, a pinhole camera stretches a disc by at most the squared secant of the field angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch

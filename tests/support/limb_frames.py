@@ -43,7 +43,8 @@ def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSet
     """Return the default limb settings with the response of the camera, for an atmosphere of `AIRS`."""
     response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
     settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
-    return replace(settings, limb_height_sigma=KNOWN_LIMB) if air == "known" else settings
+    even = replace(settings, limb_height_sigma=KNOWN_LIMB, uneven_limb_sigma=0.0)
+    return even if air == "known" else settings
 
 
 def random_air(generator: np.random.Generator) -> Atmosphere:

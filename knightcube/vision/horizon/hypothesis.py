@@ -290,6 +290,12 @@ class Hypothesis:
         return max(1.0, self.altitude_off**2) * covariance
 
 
+def prior_of(settings: HorizonSettings, turn: float, altitude: float) -> Prior:
+    """Return the prior of a limb fit, with the standard deviations of rotation about nadir and altitude."""
+    limb = settings.limb_height_sigma, altitude, settings.uneven_limb_sigma
+    return Prior(min(turn, _UNKNOWN_TURN), *limb)
+
+
 def examine(
     guess: InitialGuess,
     observation: Observation,
@@ -300,7 +306,7 @@ def examine(
     """Return the horizon hypothesis fitted from an initial guess, or None if no limb can be fitted."""
     place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
-    prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
+    prior = prior_of(settings, stand.sigma, place.altitude_sigma)
     fitted = _fitted(guess, observation, sun, settings, prior)
     if fitted is None:
         return None

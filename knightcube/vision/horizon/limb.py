@@ -213,11 +213,15 @@ UNKNOWN = 1e9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Standard deviations of the rotation about nadir (rad), the limb height (m) and the altitude (m)."""
+    """Standard deviations of the rotation about nadir (rad), the limb height (m) and the altitude (m).
+
+    The standard deviation of the limb height along the limb, relative to the common height, is `uneven`, m.
+    """
 
     azimuth: float
     limb_height: float
     altitude: float = UNKNOWN
+    uneven: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,7 +289,32 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
     covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))
     if covariance is None:
         return None
+    if prior.uneven > 0.0:
+        covariance = covariance + _uneven_limb_error(view, rays, weighted, normal, prior.uneven)
     return FittedLimb(view, covariance, residuals, used, factor, float(moved @ information @ moved))
+
+
+_UNEVEN_ANGLE = 0.7
+"""Angle about nadir (rad) over which the height of the limb is correlated."""
+
+
+def _uneven_limb_error(
+    view: LimbView, rays: FloatArray, weighted: FloatArray, normal: FloatArray, uneven: float
+) -> FloatArray:
+    """Return the covariance (5, 5) of a fit's parameters due to a limb height that varies along the limb.
+
+    The variation has the standard deviation `uneven`, m, and is a Gaussian process of the azimuth about nadir
+    with the correlation length `_UNEVEN_ANGLE`. The fit absorbs most of such a smooth variation, so that the
+    residuals do not show it. The weighted gradients (n, 5) and the normal matrix (5, 5) are those of the fit.
+    """
+    gain = _solved(normal, weighted.T)
+    if gain is None:
+        return np.zeros((PARAMETERS, PARAMETERS))
+    aside = rays @ tangent_basis(view.nadir).T
+    aside /= np.sqrt(np.einsum("ij,ij->i", aside, aside))[:, None]
+    # The kernel exp((cos d - 1) / L^2) of the azimuth difference d is Gaussian for small differences.
+    kernel = np.exp((aside @ aside.T - 1.0) / _UNEVEN_ANGLE**2)
+    return np.asarray((uneven / view.limb_distance) ** 2 * gain @ kernel @ gain.T)
 
 
 def shared_error(

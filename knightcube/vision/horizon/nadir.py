@@ -33,7 +33,7 @@ from knightcube.astro.quaternion import multiply
 from knightcube.errors import ArgumentError
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_shape, image_of_camera
 from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, ScanLines, find_edges, observe
-from knightcube.vision.horizon.hypothesis import Hypothesis, examine, near_limb
+from knightcube.vision.horizon.hypothesis import Hypothesis, examine, near_limb, prior_of
 from knightcube.vision.horizon.initial_guess import (
     MOST_MISMATCH,
     SPHERE_ALTITUDE_SIGMA,
@@ -54,7 +54,6 @@ from knightcube.vision.horizon.limb import (
     UNKNOWN,
     FittedLimb,
     LimbView,
-    Prior,
     fit_limb,
     shared_error,
 )
@@ -642,8 +641,6 @@ _COMMON = 2.0
 The ratio of variances is above 1, because an unknown limb height displaces the nadirs measured on opposite
 sides of the Earth in opposite directions.
 """
-_UNKNOWN_TURN = 1.0
-"""Prior standard deviation of an unknown rotation about nadir (rad)."""
 _OWN_AIR = 400.0
 """Standard deviation (m) of the difference between the limb heights in the images of two cameras."""
 
@@ -813,7 +810,7 @@ def _joint_fit(
     rays = np.concatenate([cameras[number].in_body(each[number].limb) for number in numbers])
     sigma = np.concatenate([each[number].limb_sigma for number in numbers])
     altitude = UNKNOWN if place is None else place.altitude_sigma
-    prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, altitude)
+    prior = prior_of(settings, stand.sigma, altitude)
     fit = fit_limb(body, rays, sigma, prior)
     if fit is None:
         return JointNadir(HorizonStatus.REFUSED, "no limb fits the edges of all cameras", None, (), each)

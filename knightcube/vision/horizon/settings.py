@@ -18,6 +18,7 @@ from knightcube.astro.arrays import (
     check_fields,
     check_type,
     checked_deviation,
+    checked_number,
     finite_array,
     real_number,
     unit_vector,
@@ -28,6 +29,8 @@ from knightcube.errors import ArgumentError, UsageError
 LEAST_ALTITUDE = 50e3
 """Lowest altitude (m) from which the limb is visible; a lower camera is inside the atmosphere."""
 
+_FEWEST_EDGES = 3
+"""Number of edges that determine a cone, and with it the nadir and the altitude."""
 _UNIT_TOLERANCE = 1e-3
 """Largest deviation of the length of an approximate quaternion from 1."""
 
@@ -165,6 +168,9 @@ class EdgeSettings:
         psf_sigma: standard deviation of the blur of the optics, px. A larger blur is fitted if the brightness
             profiles of the limb show it clearly.
         response: response of the detector, or None for a linear detector.
+
+    Raises:
+        UsageError: if a value is out of range.
     """
 
     lines: int = 32
@@ -178,10 +184,16 @@ class EdgeSettings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.lines < 2:
-            raise UsageError(f"lines {self.lines}: give at least 2 columns and rows")
+        if self.response is not None:
+            check_type("response", self.response, LogarithmicResponse)
+        checked_deviation("psf_sigma", self.psf_sigma, "pixels")
+        for name in ("lines", "more_lines"):
+            if getattr(self, name) < 2:
+                raise UsageError(f"{name} {getattr(self, name)}: give at least 2 columns and rows")
         if self.run < 1 or self.run % 2 == 0:
             raise UsageError(f"run {self.run}: must be an odd number of pixels")
+        if self.most < 1:
+            raise UsageError(f"most {self.most}: give at least 1 edge for each line")
         for name in ("threshold", "contrast"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise UsageError(f"{name} {getattr(self, name)}: must lie between 0 and 1")
@@ -196,6 +208,8 @@ class HorizonSettings:
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
             of the limb height is valid for an atmosphere of unknown scale height (6.5 to 9.5 km) and unknown
             haze. If scale height and haze are known, a standard deviation of 1,000 m is sufficient.
+        uneven_limb_sigma: standard deviation of the variation of the limb's height along the limb, m. The
+            height of the limb varies with the elevation of the Sun, latitude, haze and clouds.
         altitude_sigma: standard deviation of the altitude of a known position, m.
         altitudes: range of an unknown altitude, m. The default range of altitudes covers low orbits. An
             unlimited range would accept any bright disc as the Earth, for instance a lens ghost.
@@ -210,10 +224,14 @@ class HorizonSettings:
             causes for a camera close to the surface. The tilt is added to the uncertainty of nadir if the
             direction of the flattening is unknown. The tilt of the limb decreases with the square of the
             distance from the Earth's centre.
+
+    Raises:
+        UsageError: if a value is out of range.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     limb_height_sigma: float = 3000.0
+    uneven_limb_sigma: float = 2000.0
     altitude_sigma: float = 50.0
     altitudes: tuple[float, float] = (100e3, 2_000e3)
     tolerance: float = 2.0
@@ -226,7 +244,19 @@ class HorizonSettings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        low, high = self.altitudes
+        check_type("edges", self.edges, EdgeSettings)
+        for name, unit in (
+            ("limb_height_sigma", "metres"),
+            ("altitude_sigma", "metres"),
+            ("tolerance", "pixels"),
+        ):
+            checked_number(name, getattr(self, name), unit)
+        for name, unit in (("uneven_limb_sigma", "m"), ("sphere_sigma", "rad")):
+            checked_deviation(name, getattr(self, name), unit)
+        for name, least in (("least_edges", _FEWEST_EDGES), ("candidates", 1), ("tries", 1)):
+            if getattr(self, name) < least:
+                raise UsageError(f"{name} {getattr(self, name)}: give at least {least}")
+        low, high = finite_array("altitudes", self.altitudes, (2,)).tolist()
         if not LEAST_ALTITUDE <= low < high < math.inf:
             raise UsageError(
                 f"altitudes of {1e-3 * low:g} to {1e-3 * high:g} km: give the lower altitude first,"

@@ -183,10 +183,9 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(tmp_path: Path) -> Non
     """A field of view that is 5 % wrong does no harm if its error is given, in frames of several seeds.
 
     The nadir error then stays within three standard deviations, and is less than half the error without
-    `--fov-error`. The smaller standard deviation of the nadir grows with the additional unknown. The larger
-    one depends more on the residuals of the frame than on the number of unknowns.
+    `--fov-error`.
     """
-    errors, variances = [], []
+    errors = []
     for seed in (1, 2, 3):
         limb = pillow.fromarray(render(MODEL, SCENE, np.random.default_rng(seed)))
         limb.save(tmp_path / "limb.png", compress_level=1)
@@ -197,16 +196,11 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(tmp_path: Path) -> Non
             assert done.returncode == 0, done.stderr
             found.append(json.loads(done.stdout))
         off = [np.subtract(each["nadir_camera"], nadir(SCENE)) for each in found]
-        spread, axes = zip(
-            *(np.linalg.eigh(np.array(each["covariance_rad2"])) for each in found), strict=True
-        )
-        assert np.all(np.abs(off[2] @ axes[2][:, 1:]) < 3.0 * np.sqrt(spread[2][1:]))
+        spread, axes = np.linalg.eigh(np.array(found[2]["covariance_rad2"]))
+        assert np.all(np.abs(off[2] @ axes[:, 1:]) < 3.0 * np.sqrt(spread[1:]))
         errors.append(np.linalg.norm(off[1:], axis=1))
-        variances.append(spread[2][1] / spread[0][1])
     wrong, described = np.sqrt(np.mean(np.square(errors), axis=0))
     assert described < 0.5 * wrong
-    # At a known altitude, the curvature of the limb determines the focal length well.
-    assert np.mean(variances) > 1.1
 
 
 @pytest.mark.parametrize(

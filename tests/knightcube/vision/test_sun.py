@@ -310,6 +310,8 @@ def test_a_frame_of_another_size_and_settings_that_cannot_be_are_refused() -> No
         find_sun(np.zeros((100, 512), dtype=np.uint8), CAMERA, SunSettings())
     with pytest.raises(UsageError, match="stride"):
         SunSettings(stride=0)
+    with pytest.raises(UsageError, match="stride: 1024: no row of 512 is read"):
+        find_sun(np.zeros((512, 512), dtype=np.uint8), CAMERA, SunSettings(stride=1024))
     with pytest.raises(UsageError, match="least_radius"):
         SunSettings(least_radius=0.02, greatest_radius=0.01)
     with pytest.raises(UsageError, match="level"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,45 @@ def test_fractions_lie_between_zero_and_one(name: str) -> None:
 
 def test_the_range_of_altitudes_increases_from_fifty_kilometres() -> None:
     HorizonSettings(altitudes=(50e3, 51e3))
-    for wrong in ((49e3, 1e6), (6e5, 6e5), (1e5, np.inf)):
+    with pytest.raises(UsageError, match="give finite numbers"):
+        HorizonSettings(altitudes=(1e5, np.inf))
+    for wrong in ((49e3, 1e6), (6e5, 6e5)):
         with pytest.raises(UsageError, match="give the lower altitude first, and at least 50 km"):
             HorizonSettings(altitudes=wrong)
+
+
+@pytest.mark.parametrize("name", ["limb_height_sigma", "altitude_sigma", "tolerance"])
+def test_assumed_errors_of_the_limb_are_positive(name: str) -> None:
+    """A standard deviation of 0 would make the normal equations of the limb infinite."""
+    HorizonSettings(**{name: 1e-3})  # type: ignore[arg-type]  # numbers only
+    for wrong in (0.0, -1.0, np.nan):
+        with pytest.raises(UsageError, match=name):
+            HorizonSettings(**{name: wrong})  # type: ignore[arg-type]  # numbers only
+
+
+@pytest.mark.parametrize("name", ["uneven_limb_sigma", "sphere_sigma"])
+def test_the_unevenness_of_the_limb_may_be_zero(name: str) -> None:
+    HorizonSettings(**{name: 0.0})  # type: ignore[arg-type]  # numbers only
+    with pytest.raises(UsageError, match=name):
+        HorizonSettings(**{name: -1.0})  # type: ignore[arg-type]  # numbers only
+
+
+@pytest.mark.parametrize(("name", "least"), [("least_edges", 3), ("candidates", 1), ("tries", 1)])
+def test_a_search_for_a_horizon_needs_edges_and_trials(name: str, least: int) -> None:
+    HorizonSettings(**{name: least})  # type: ignore[arg-type]  # whole numbers only
+    with pytest.raises(UsageError, match=f"give at least {least}"):
+        HorizonSettings(**{name: least - 1})  # type: ignore[arg-type]  # whole numbers only
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"more_lines": 1}, {"most": 0}, {"psf_sigma": -0.1}, {"response": 5.0}], ids=str
+)
+def test_impossible_settings_of_edges_are_errors(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=next(iter(wrong))):
+        EdgeSettings(**wrong)
+
+
+def test_settings_of_a_wrong_type_are_errors() -> None:
+    for wrong in ({"edges": None}, {"altitudes": 5}, {"altitudes": (1e5,)}):
+        with pytest.raises(UsageError, match=next(iter(wrong))):
+            HorizonSettings(**wrong)
