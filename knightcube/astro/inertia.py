@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from itertools import permutations
 
 import numpy as np
+import numpy.typing as npt
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, brief, finite_array
+from knightcube.errors import ArgumentError
 
 _ROUNDING = 1e-6
 """Largest tolerated violation of symmetry and of the triangle inequality, as a fraction of the trace."""
@@ -52,6 +54,14 @@ def inertia_problem(inertia: FloatArray) -> str:
             f"({moments[0] + moments[1]:.6g}), check the moments and the axes to which they belong"
         )
     return ""
+
+
+def checked_inertia(name: str, value: npt.ArrayLike) -> FloatArray:
+    """Return the argument `name` as an inertia tensor (3, 3), kg m^2. Raises ArgumentError if impossible."""
+    tensor = finite_array(name, value, (3, 3))
+    if problem := inertia_problem(tensor):
+        raise ArgumentError(name, f"{brief(tensor.tolist())} {problem}")
+    return tensor
 
 
 def box_inertia(mass: float, size: Sequence[float]) -> FloatArray:

@@ -37,10 +37,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_matrices, tangent_basis
+from knightcube.astro.arrays import FloatArray, check_type, cross_matrices, tangent_basis
 from knightcube.astro.chi_square import bound
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
-from knightcube.gnc.estimation.error_state import updated
+from knightcube.errors import ArgumentError
+from knightcube.gnc.estimation.error_state import check_amounts, updated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +89,10 @@ class MotionModel:
     wander: float = 1.6e-12
     residual_wander: float = 4e-13
     bend: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for a value that is negative or not a finite number."""
+        check_amounts(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,6 +252,15 @@ class TrackSettings:
     coast: float = 15.0
     maximum_tracks: int = 32
     brightness: float = 0.75
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for a value out of its range."""
+        check_amounts(self, "needed", "missed", "maximum_tracks", "brightness")
+        check_type("motion", self.motion, MotionModel)
+        if not self.missed < 1.0:
+            raise ArgumentError("missed", f"{self.missed}: give a probability below 1")
+        if self.needed > self.within:
+            raise ArgumentError("needed", f"{self.needed}: give at most `within`, which is {self.within}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -181,9 +181,11 @@ def test_a_slew_far_beyond_the_limit_is_not_tried_at_each_start(monkeypatch: pyt
         return plan_task(task)
 
     monkeypatch.setattr(slew_plan, "plan_task", counted)
-    with pytest.raises(PlanningError, match="check that inertia is in kg"):
+    with pytest.raises(PlanningError, match="check that inertia is in kg") as caught:
         plan_slew(**SLEW | {"inertia": [11.0, 10.5, 9.9]}, window=1200.0)
     assert len(tried) == 1
+    assert caught.value.is_hopeless
+    assert type(caught.value) is PlanningError, "a user can name the class of the error"
 
 
 def test_a_slew_that_is_longer_than_a_third_of_the_longest_needs_no_limit() -> None:

@@ -57,6 +57,7 @@ from knightcube.astro.arrays import FloatArray, cross_matrix, cross_product
 from knightcube.astro.quaternion import compose, inverse, matrix, times
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.estimation.error_state import check_amounts
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 
 ITERATIONS = 12
@@ -316,11 +317,8 @@ class FieldDetumblerSettings:
     slow: float
 
     def __post_init__(self) -> None:
-        """Raise UsageError for settings that are not finite and positive."""
-        for name in ("limit", "horizon", "replan", "gentle", "spin_up", "slow"):
-            value = getattr(self, name)
-            if not (np.isfinite(value).all() and np.min(value) > 0.0):
-                raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
+        """Raise ArgumentError for settings that are not finite and positive."""
+        check_amounts(self, "limit", "horizon", "replan", "gentle", "spin_up", "slow")
 
     @property
     def instants(self) -> FloatArray:

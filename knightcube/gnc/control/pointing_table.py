@@ -24,7 +24,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_matrices
+from knightcube.astro.arrays import (
+    FloatArray,
+    brief,
+    checked_number,
+    cross_matrices,
+    real_number,
+    unit_vector,
+)
 from knightcube.astro.earth.disturbance import AIR, LIGHT, Pressures, shapes
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -33,7 +40,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from knightcube.gnc.control.pointing_path import (
     CostToGo,
     LinearErrorModel,
@@ -302,6 +309,19 @@ class PointingWeights:
     fastest: float = math.inf
     roll: float | None = None
     axis: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for a weight that is not positive, and for a missing or impossible axis."""
+        for name, unit in (("turn", "rad"), ("rate", "rad/s"), ("dipole", "A m^2")):
+            checked_number(name, getattr(self, name), unit)
+        if not real_number(self.fastest) > 0.0:
+            raise ArgumentError("fastest", f"{brief(self.fastest)}: give a rate above zero, in rad/s")
+        if self.axis is not None:
+            object.__setattr__(self, "axis", unit_vector("axis", self.axis))
+        if self.roll is not None:
+            checked_number("roll", self.roll, "rad")
+            if self.axis is None:
+                raise ArgumentError("axis", "None: give the body axis (3,) about which `roll` is measured")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

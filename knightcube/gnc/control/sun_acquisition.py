@@ -21,10 +21,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_product
+from knightcube.astro.arrays import FloatArray, cross_product, unit_vector
+from knightcube.astro.inertia import checked_inertia
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.estimation.error_state import check_amounts
 
 MEMORY = 2400.0
 """Longest time (s) over which the Sun direction is propagated, which covers the longest eclipse of a low
@@ -170,6 +172,12 @@ class SunAcquisitionSettings:
     axis: FloatArray
     limit: float | FloatArray
 
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for an impossible inertia tensor, axis or dipole limit."""
+        checked_inertia("inertia", self.inertia)
+        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
+        check_amounts(self, "limit")
+
     @property
     def speed(self) -> float:
         """Bandwidth w of the Sun pointing law for this body, rad/s."""
@@ -210,8 +218,13 @@ class SunAcquisition:
         return self._sun.direction
 
     def update_sun(self, time_ns: int, sun: FloatArray) -> None:
-        """Accept a direction (3,) of the Sun, body axes, measured at `time_ns`."""
-        self._sun.measure(time_ns, sun)
+        """Accept a direction (3,) of the Sun, body axes, measured at `time_ns`.
+
+        The direction is ignored unless it is finite and not zero.
+        """
+        length = math.sqrt(float(sun @ sun))
+        if 0.0 < length < math.inf:
+            self._sun.measure(time_ns, sun / length)
 
     def acts(self, dipole: FloatArray) -> None:
         """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""

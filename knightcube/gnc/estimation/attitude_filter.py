@@ -35,7 +35,13 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, IntArray, finite_array
 from knightcube.astro.quaternion import compose, exponential, twist
 from knightcube.errors import ArgumentError
-from knightcube.gnc.estimation.error_state import ErrorState, StateBlock, gate_bounds, joined
+from knightcube.gnc.estimation.error_state import (
+    ErrorState,
+    StateBlock,
+    check_amounts,
+    gate_bounds,
+    joined,
+)
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     BIAS,
@@ -262,6 +268,13 @@ class FilterSettings:
     unknown_current: float = 0.0
     gate_sigma: float
     history_ns: int
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for a value that is negative or not a finite number.
+
+        The duration of a control cycle and the gate threshold must be above zero.
+        """
+        check_amounts(self, "control_period", "gate_sigma")
 
 
 def free_axes(body: RigidBody) -> FloatArray:

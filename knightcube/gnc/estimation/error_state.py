@@ -16,13 +16,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from knightcube.astro import chi_square
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 
 
 class Role(Enum):
@@ -262,6 +262,30 @@ class PriorCheck:
         self._least_time = time + PAUSE if is_contradicted else time
         self._number, self._sum = 0, 0.0
         return is_contradicted
+
+
+_SHAPES = {"int": ((),), "float": ((),), "tuple[float, float]": ((2,),), "float | FloatArray": ((), (3,))}
+"""Permitted shapes of the settings that `check_amounts` checks, by their annotation."""
+
+
+def check_amounts(settings: Any, *positive: str) -> None:
+    """Raise ArgumentError unless the numbers in the fields of a dataclass are finite and not negative.
+
+    The fields named in `positive` must be above zero, and fields annotated as int must be whole numbers.
+    Fields with a pair of numbers, and fields with one number or three numbers (3,), are also checked.
+    """
+    for field in dataclasses.fields(settings):
+        value, shapes = getattr(settings, field.name), _SHAPES.get(str(field.type))
+        if shapes is None:
+            continue
+        kinds, above = "iu" if field.type == "int" else "iuf", field.name in positive
+        found = np.asarray(value)
+        right = found.dtype.kind in kinds and found.shape in shapes and np.isfinite(found).all()
+        if not (right and (found > 0 if above else found >= 0).all()):
+            counts = {(): "a number", (2,): "two numbers", (3,): "three numbers"}
+            kind, least = "whole" if kinds == "iu" else "finite", "above zero" if above else "of 0 or more"
+            what = " or ".join(counts[shape] for shape in shapes).replace("number", f"{kind} number")
+            raise ArgumentError(field.name, f"{value!r}: give {what} {least}")
 
 
 def gate_bounds(sigma: float) -> dict[int, float]:

@@ -30,12 +30,36 @@ def _check_arrays(measurement: Measurement, **shapes: tuple[int, ...]) -> None:
         if not isinstance(value, np.ndarray) or value.dtype != float:
             value = float_rows(name, value, shape[-1])
             object.__setattr__(measurement, name, value)
-        if value.shape != shape:
-            raise ArgumentError(name, f"an array of shape {value.shape}: give numbers of shape {shape}")
+        _check_shape(name, value, shape)
+
+
+def _check_shape(name: str, value: FloatArray, shape: tuple[int, ...]) -> None:
+    if np.shape(value) != shape:
+        raise ArgumentError(name, f"an array of shape {np.shape(value)}: give numbers of shape {shape}")
 
 
 _LENGTH = 0.1
-"""Largest accepted difference between the length of a measured quaternion and one."""
+"""Largest accepted difference between one and the length of a measured quaternion or direction."""
+
+
+def _check_length(name: str, value: FloatArray) -> None:
+    """Raise ArgumentError for a vector whose length is not one. NaN is permitted, as in `_check_arrays`."""
+    length = math.hypot(*value.tolist())
+    if abs(length - 1.0) > _LENGTH:
+        kind = "quaternion" if len(value) == 4 else "vector"
+        raise ArgumentError(name, f"{value.tolist()}: length {length:g}: give a {kind} of length 1")
+
+
+def check_measured(covariance: FloatArray, *units: str, **measured: FloatArray) -> None:
+    """Raise ArgumentError unless the covariance is (3, 3), and the arrays `measured` are vectors (3,).
+
+    An array called `quaternion` must be (4,). The arrays named in `units` must have the length one.
+    """
+    _check_shape("covariance", covariance, (3, 3))
+    for name, value in measured.items():
+        _check_shape(name, value, (4,) if name == "quaternion" else (3,))
+    for name in units:
+        _check_length(name, measured[name])
 
 
 class _AtOneTime:
@@ -67,11 +91,7 @@ class AttitudeMeasurement(_AtOneTime):
     def __post_init__(self) -> None:
         """Raise ArgumentError for arrays of another shape, and for a quaternion whose length is not one."""
         _check_arrays(self, quaternion=(4,), covariance=(3, 3))
-        length = math.hypot(*self.quaternion.tolist())
-        if abs(length - 1.0) > _LENGTH:
-            raise ArgumentError(
-                "quaternion", f"{self.quaternion.tolist()}: length {length:g}: give a quaternion of length 1"
-            )
+        _check_length("quaternion", self.quaternion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,8 +150,10 @@ class DirectionMeasurement(_AtOneTime):
     sun_cameras: int = 0
 
     def __post_init__(self) -> None:
-        """Raise ArgumentError for arrays of another shape."""
+        """Raise ArgumentError for arrays of another shape, and for vectors whose length is not one."""
         _check_arrays(self, observed=(3,), reference=(3,), covariance=(3, 3))
+        _check_length("observed", self.observed)
+        _check_length("reference", self.reference)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, check_type
+from knightcube.astro.inertia import checked_inertia
 from knightcube.astro.quaternion import (
     Matrix,
     Quaternion,
@@ -37,7 +38,7 @@ from knightcube.astro.quaternion import (
     times,
 )
 from knightcube.compiled import compiled_floats, loop_helper
-from knightcube.gnc.estimation.error_state import Weighed, updated, weigh
+from knightcube.gnc.estimation.error_state import Weighed, check_amounts, updated, weigh
 from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 
 RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 15)
@@ -89,6 +90,12 @@ class FieldRateSettings:
     refusals: int = 5
     longest_gap: float = 0.2
     gyro_sigma: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for an impossible inertia tensor, and for a value out of its range."""
+        checked_inertia("inertia", self.inertia)
+        check_amounts(self, "field_sigma", "gate_sigma", "refusals", "longest_gap", "gyro_sigma")
+        check_type("errors", self.errors, BodyErrors)
 
 
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:

@@ -45,13 +45,14 @@ import numpy as np
 from knightcube.astro.arrays import (
     FloatArray,
     IntArray,
+    check_type,
     cross_matrix,
     cross_product,
     finite_array,
     tangent_basis,
 )
 from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas
-from knightcube.astro.inertia import inertia_problem
+from knightcube.astro.inertia import checked_inertia
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -59,11 +60,11 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import (
     ErrorState,
     Role,
     StateBlock,
+    check_amounts,
     direction_error,
     gate_bounds,
     joined,
@@ -76,7 +77,7 @@ from knightcube.gnc.estimation.error_state import (
     weigh,
     with_role,
 )
-from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.estimate import Knowledge, check_measured
 from knightcube.gnc.estimation.free_motion import Bodies, step
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
@@ -156,9 +157,7 @@ class FreeMotion:
 
         Raises ArgumentError for an impossible tensor, with which a body in a tumble is predicted wrongly.
         """
-        self._assumed: FloatArray = finite_array("inertia", inertia, (3, 3))
-        if problem := inertia_problem(self._assumed):
-            raise ArgumentError("inertia", f"{self._assumed.tolist()} {problem}")
+        self._assumed: FloatArray = checked_inertia("inertia", inertia)
         self.trace = float(np.trace(self._assumed))
         """Trace of the assumed inertia, kg m^2."""
         self.elements: FloatArray = self._assumed[_ROWS, _COLUMNS] / self.trace
@@ -242,6 +241,13 @@ class FreeFilterSettings:
     coils: FloatArray | None = None
     roles: Mapping[str, Role] = dataclasses.field(default_factory=dict)
     gate_sigma: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for a value out of its range, and for a covariance of another shape."""
+        check_amounts(self, "gate_sigma")
+        check_type("errors", self.errors, BodyErrors)
+        if self.coils is not None:
+            finite_array("coils", self.coils, (9, 9))
 
     def error_state(self, inertia: FloatArray) -> ErrorState:
         """Return the error state of the filter for a body with the inertia tensor `inertia` (3, 3) kg m^2."""
@@ -409,6 +415,7 @@ class FreeFilter:
         values are set to zero.
         """
         self.changes += 1
+        check_measured(covariance, "quaternion", quaternion=quaternion, gyro=gyro)
         if doubted:
             self.widen(np.arange(SLOW.start, SLOW.stop))
             self.field_error = max(self.field_error, self._settings.field)
@@ -649,6 +656,7 @@ class FreeFilter:
         the middle of the interval, `since` s ago, at the acceleration of the last step. The averaged rate is
         corrected for the change of the acceleration since `begin_mean`.
         """
+        check_measured(covariance, rate=rate)
         matrix = _EYE + self._matrix(GYRO_MATRIX)
         then = self.rate
         if change is not None:
@@ -668,6 +676,7 @@ class FreeFilter:
 
         The change of the rate since the middle of the exposure, `since` s ago, is `change` (3,), rad/s.
         """
+        check_measured(covariance, rate=rate, change=change)
         rows = -since * self._slope
         rows[:, RATE] += _EYE
         rows[:, CAMERA] += cross_matrix(self.rate)
@@ -682,6 +691,7 @@ class FreeFilter:
         If `by_stars` is true, the attitude was measured by the star camera, otherwise by the horizon cameras.
         The covariance (3, 3), rad^2, is given in the present body axes.
         """
+        check_measured(covariance, "quaternion", quaternion=quaternion)
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
         # The rotation since the measurement is estimated from the rate, and has an error due to the rate.
@@ -696,6 +706,7 @@ class FreeFilter:
         self, observed: FloatArray, reference: FloatArray, covariance: FloatArray, sun_cameras: int = 0
     ) -> bool:
         """Apply an observed direction; the arguments are attributes of `DirectionMeasurement`."""
+        check_measured(covariance, "observed", "reference", observed=observed, reference=reference)
         if sun_cameras and sun_cameras != self.sun_cameras:
             self.renew(SUN_CAMERA, self.layout.prior[SUN_CAMERA, SUN_CAMERA])
             self.sun_cameras = sun_cameras
@@ -713,6 +724,7 @@ class FreeFilter:
 
         The field `reference` (3,), T, in ICRS axes is that of the field model.
         """
+        check_measured(covariance, measured=measured, reference=reference)
         expected = attitude_matrix(self.quaternion) @ reference
         matrix = _EYE + self._matrix(FIELD_MATRIX)
         rows = np.zeros((3, STATES))

@@ -44,7 +44,7 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import UsageError
-from knightcube.gnc.estimation.error_state import propagated
+from knightcube.gnc.estimation.error_state import check_amounts, propagated
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,
@@ -580,6 +580,10 @@ class BodyErrors:
     field_matrix: float = 0.01
     camera: float = math.radians(0.1)
     horizon: float = math.radians(0.1)
+
+    def __post_init__(self) -> None:
+        """Raise ArgumentError for an error that is negative or not a finite number."""
+        check_amounts(self)
 
 
 def rate_products(rates: FloatArray) -> FloatArray:

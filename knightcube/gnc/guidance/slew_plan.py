@@ -167,10 +167,6 @@ _HOPELESS = 10.0
 the energy varies by a factor of up to ten, and the dipole by a factor of about three."""
 
 
-class _HopelessError(PlanningError):
-    """Raised if a slew needs so much more than the dipole limit that no start time would be feasible."""
-
-
 class SlewStatus(StrEnum):
     """Whether the requested duration was kept (OPTIMAL) or extended (STRETCHED)."""
 
@@ -226,8 +222,9 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
         if plan is not None:
             return plan
         tried, least = tried + search.tried, min(least, search.least)
-    is_hopeless = _HOPELESS < _excess(task, least) < math.inf
-    raise (_HopelessError if is_hopeless else PlanningError)(refusal(task, tried, least))
+    error = PlanningError(refusal(task, tried, least))
+    error.is_hopeless = _HOPELESS < _excess(task, least) < math.inf
+    raise error
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
@@ -469,9 +466,9 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
     for begin in begins if order.window else ():
         try:
             plan = plan_task(task_at(coarse, ephemeris, float(begin)))
-        except _HopelessError:
-            raise
         except PlanningError as error:
+            if error.is_hopeless:
+                raise
             failed = error
         else:
             # Plans rank by their duration if it was extended, and then by their cost.

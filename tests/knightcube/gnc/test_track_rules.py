@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.errors import ArgumentError
 from knightcube.gnc.tracker import (
     FrameSightings,
     LineOfSightState,
@@ -239,3 +240,19 @@ def test_an_update_weights_prediction_and_sighting_by_their_variances() -> None:
     assert better.velocity[0] == pytest.approx(0.25 * 4e-4, rel=1e-3), "by the correlation"
     assert better.covariance[0, 0] == pytest.approx(0.75e-8, rel=1e-3)
     assert better.covariance[3, 3] == pytest.approx(4e-8 - 0.25e-8, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"needed": 7}, "needed: 7: give at most `within`, which is 6"),
+        ({"missed": 1.0}, "missed: 1.0: give a probability below 1"),
+        ({"coast": math.nan}, "coast: nan"),
+        ({"motion": None}, "motion: None"),
+    ],
+)
+def test_settings_out_of_their_range_are_refused(values: dict[str, object], words: str) -> None:
+    with pytest.raises(ArgumentError, match=words):
+        TrackSettings(**values)  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match=r"wander: -1\.0: give a finite number of 0 or more"):
+        MotionModel(wander=-1.0)

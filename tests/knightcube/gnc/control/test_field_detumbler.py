@@ -15,7 +15,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.field_detumbler import (
     BOUNDED,
@@ -312,6 +312,10 @@ def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
 def test_constants_that_do_not_brake_are_refused() -> None:
     with pytest.raises(UsageError, match="limit"):
         braking(0.0)
+    with pytest.raises(ArgumentError, match=r"inertia: .*the largest must not exceed"):
+        FieldRateSettings(inertia=np.diag([1.0, 1.0, 3.0]), field_sigma=2e-7, torque_walk=1e-5)
+    with pytest.raises(ArgumentError, match=r"field_sigma: 0\.0: give a finite number above zero"):
+        FieldRateSettings(inertia=INERTIA, field_sigma=0.0, torque_walk=1e-5)
 
 
 STEP, DIPOLE_LIMIT, REST = 5.0, 0.1, 1e-5

@@ -17,6 +17,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.errors import ArgumentError
 from knightcube.gnc.control.pointing_path import (
     RUN_AWAY,
     MotionGains,
@@ -240,3 +241,19 @@ def test_a_diverging_motion_gives_no_result_and_no_warning() -> None:
     fast = propagate(ahead, rest, MotionGains(gain, steady), 1.0)
     assert fast is not None, "a motion of several revolutions a step is followed"
     assert 2.0 * np.pi < 10.0 * np.abs(fast.rate).max() < 10.0 * RUN_AWAY
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"turn": 0.0}, "turn: 0.0: give a positive, finite number of rad"),
+        ({"dipole": np.nan}, "dipole: nan"),
+        ({"fastest": -1.0}, "fastest: -1.0: give a rate above zero"),
+        ({"roll": 0.5}, "axis: None: give the body axis"),
+        ({"roll": 0.5, "axis": np.zeros(3)}, "axis: .*give a direction"),
+    ],
+)
+def test_weights_without_meaning_are_refused(wrong: dict[str, object], words: str) -> None:
+    """A roll without its axis would have the weight of every other rotation."""
+    with pytest.raises(ArgumentError, match=words):
+        replace(DEAR, **wrong)  # type: ignore[arg-type]

@@ -7,6 +7,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
+from knightcube.errors import ArgumentError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.sun_acquisition import (
     DIPOLE_GAIN,
@@ -256,3 +257,35 @@ def test_the_dipole_makes_the_commanded_torque_across_the_field(sunny: bool) -> 
     else:
         assert torque @ rate < 0.0
     assert abs(dipole @ here) < 1e-9 * np.linalg.norm(here)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(3), np.array([np.nan, 0.0, 1.0]), np.array([np.inf, 0.0, 0.0])])
+def test_a_sun_without_a_direction_is_left_out(wrong: FloatArray) -> None:
+    """A zero vector would count as a Sun behind the body, and NaN would stay in the propagated direction."""
+    law = seeker()
+    law.update_sun(0, wrong)
+    assert law.sun is None
+    law.update_sun(0, 2.0 * Z)
+    law.update_sun(1, wrong)
+    np.testing.assert_array_equal(law.sun, Z)
+
+
+@pytest.mark.parametrize(
+    ("inertia", "axis", "limit", "words"),
+    [
+        (np.diag([1.0, 1.0, 3.0]), Z, LIMIT, "inertia: .*the largest must not exceed"),
+        (np.diag(INERTIA), np.zeros(3), LIMIT, "axis: .*give a direction"),
+        (
+            np.diag(INERTIA),
+            Z,
+            -LIMIT,
+            "limit: -0.0959: give a finite number or three finite numbers above zero",
+        ),
+        (np.diag(INERTIA), Z, np.array([LIMIT, LIMIT]), "limit: .*or three finite numbers"),
+    ],
+)
+def test_impossible_settings_are_refused(
+    inertia: FloatArray, axis: FloatArray, limit: float | FloatArray, words: str
+) -> None:
+    with pytest.raises(ArgumentError, match=words):
+        SunAcquisitionSettings(inertia=inertia, axis=axis, limit=limit)

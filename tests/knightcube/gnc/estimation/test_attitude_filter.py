@@ -20,6 +20,7 @@ from knightcube.gnc.estimation.estimate import (
     PARAMETERS,
     RATE,
     AttitudeMeasurement,
+    DirectionMeasurement,
     Estimate,
     MeanRateMeasurement,
     Parameters,
@@ -442,3 +443,24 @@ def test_a_quaternion_of_length_zero_and_an_exposure_without_duration_are_refuse
         AttitudeMeasurement(0, np.zeros(4), np.eye(3))
     with pytest.raises(ArgumentError, match="must begin before its end"):
         MeanRateMeasurement(SECOND, SECOND, np.zeros(3), np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("current_noise", -1e-3, "give a finite number of 0 or more"),
+        ("control_period", 0.0, "give a finite number above zero"),
+        ("gate_sigma", math.nan, "nan: give a finite number"),
+        ("history_ns", 1.5, "give a whole number"),
+    ],
+)
+def test_settings_out_of_their_range_are_refused_by_name(name: str, value: float, words: str) -> None:
+    with pytest.raises(ArgumentError, match=f"{name}: .*{words}|{name}: {words}"):
+        replace(SETTINGS, **{name: value})  # type: ignore[arg-type]
+
+
+def test_a_direction_of_length_zero_is_refused() -> None:
+    down = np.array([0.0, 0.0, 1.0])
+    for observed, reference in ((np.zeros(3), down), (down, np.zeros(3))):
+        with pytest.raises(ArgumentError, match="vector of length 1"):
+            DirectionMeasurement(0, observed, reference, np.eye(3))

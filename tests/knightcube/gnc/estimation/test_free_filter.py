@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -32,7 +34,7 @@ from knightcube.gnc.estimation.free_filter import (
     FreeFilterSettings,
 )
 from knightcube.gnc.estimation.free_filter import INERTIA as INERTIA_ERROR
-from knightcube.gnc.estimation.rigid_body import per_trace
+from knightcube.gnc.estimation.rigid_body import BodyErrors, per_trace
 from tests.knightcube.gnc.estimation.filter_states import NO_ERRORS
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
@@ -292,3 +294,51 @@ def test_a_coil_that_is_known_exactly_stays_known() -> None:
 def test_an_impossible_inertia_is_refused(inertia: FloatArray) -> None:
     with pytest.raises(ArgumentError, match="inertia"):
         FreeFilter(inertia, FreeFilterSettings())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("gyro", (-1e-3, 0.0), "gyro: .*give two finite numbers of 0 or more"),
+        ("gyro", 1e-3, r"gyro: 0\.001: give two finite numbers"),
+        ("field", math.nan, "field: nan: give a finite number"),
+        ("gate_sigma", 0.0, "gate_sigma: 0.0: give a finite number above zero"),
+        ("gate_sigma", math.nan, "gate_sigma: nan"),
+        ("coils", np.eye(3), r"coils: an array of shape \(3, 3\)"),
+        ("errors", None, "errors: None: give an object of the class BodyErrors"),
+    ],
+)
+def test_settings_out_of_their_range_are_refused_by_name(name: str, value: object, words: str) -> None:
+    with pytest.raises(ArgumentError, match=words):
+        FreeFilterSettings(**{name: value})  # type: ignore[arg-type]
+
+
+def test_errors_of_a_body_that_are_negative_are_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"moments: -0.1"):
+        BodyErrors(moments=-0.1)
+
+
+def test_measurements_of_another_shape_or_length_are_refused_and_change_nothing() -> None:
+    """Added to a matrix, a number or a row would act as a correlated covariance."""
+    found, _, _ = fly(3, 1)
+    before, still, down = found.covariance.copy(), np.zeros(3), np.array([0.0, 0.0, 1.0])
+    for wrong in (np.array(1e-8), 1e-8 * np.ones(3)):
+        with pytest.raises(ArgumentError, match="covariance: an array of shape"):
+            found.gyro(still, wrong)
+        with pytest.raises(ArgumentError, match="covariance: an array of shape"):
+            found.mean_rate(still, wrong, still)
+        with pytest.raises(ArgumentError, match="covariance: an array of shape"):
+            found.attitude(IDENTITY, wrong)
+        with pytest.raises(ArgumentError, match="covariance: an array of shape"):
+            found.direction(down, down, wrong)
+        with pytest.raises(ArgumentError, match="covariance: an array of shape"):
+            found.field(1e-5 * down, 1e-5 * down, wrong)
+    with pytest.raises(ArgumentError, match="rate: an array of shape"):
+        found.gyro(np.zeros(1), np.eye(3))
+    with pytest.raises(ArgumentError, match="quaternion of length 1"):
+        found.attitude(np.zeros(4), np.eye(3))
+    with pytest.raises(ArgumentError, match=r"observed: .*vector of length 1"):
+        found.direction(np.zeros(3), down, np.eye(3))
+    with pytest.raises(ArgumentError, match="quaternion of length 1"):
+        found.start(np.zeros(4), np.eye(3), still)
+    np.testing.assert_array_equal(found.covariance, before)
