@@ -28,7 +28,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -570,7 +570,8 @@ class Renewal:
         utc = "" if "utc" not in request else str(int(request["utc"]))
         if len(utc) > MOST_DIGITS:
             raise Refused("the request is damaged")
-        facts = self._opened(kind, staging, utc)
+        releases = filter(None, (board.release("current"), board.release("previous")))
+        facts = self._opened(kind, staging, releases, board.own / "trusted", utc)
         version = int(facts["version"])
         if version <= state.versions.get(kind, 0) and not facts["back"]:
             raise Refused(
@@ -609,20 +610,21 @@ class Renewal:
         if digest.hexdigest() != expected:
             raise Refused(f"{name} is not the file that was activated: its SHA-256 is {digest.hexdigest()}")
 
-    def _opened(self, kind: str, staging: Path, utc: str) -> dict[str, Any]:
+    def _opened(
+        self, kind: str, folder: Path, releases: Iterable[str], trusted: Path, utc: str = ""
+    ) -> dict[str, Any]:
         """Return the result of `open_bundle.py` at the mission time `utc` (s), an empty text if unknown.
 
-        Raises Refused if `open_bundle.py` refuses the bundle in every attempt.
+        The content is written to `folder`. Raises Refused if every attempt with one of `releases` fails.
         """
         board, problems = self._board, list[str]()
         program = Path(__file__).resolve().with_name("open_bundle.py")
         kept = "/" / board.kept.relative_to(board.root)
         # One copy of the root metadata and one release may be damaged, so all combinations are tried.
-        releases = filter(None, (board.release("current"), board.release("previous")))
         for release, root in ((release, root) for release in releases for root in board.roots()):
             for left in ("unpacked", "set", "source"):
-                shutil.rmtree(staging / left, ignore_errors=True)
-            words = [program, board.own / "trusted", root, staging / "bundle", kind, staging]
+                shutil.rmtree(folder / left, ignore_errors=True)
+            words = [program, trusted, root, board.own / "staging/bundle", kind, folder]
             words += [board.configuration, kept, utc]
             done = board.run([board.python(release), "-I", "-B", *words], 600.0)
             if done.returncode == 0:
@@ -718,6 +720,13 @@ class Renewal:
         checked = board.run([board.python(name), "-I", "-B", dropin, board.configuration], 120.0)
         if checked.returncode != 0:
             raise Refused(f"the release refuses the present configuration: {checked.stderr.strip()[-60:]}")
+        again = board.own / "staging/again"
+        shutil.rmtree(again, ignore_errors=True)
+        again.mkdir()
+        try:
+            self._opened("release", again, [name], again / "trusted")
+        except Refused as error:  # after two such releases, no bundle could be opened any more
+            raise Refused(f"the release cannot open bundles: {error}") from error
         return name
 
     def _begin_revert(self, problem: str) -> None:

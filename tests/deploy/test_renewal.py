@@ -8,7 +8,7 @@ import json
 import shutil
 import subprocess
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import pytest
 from flight.link.process.filing import decoded, encoded
 from ground.commands.renewal import replace_signing_key
 from tests.deploy.boards import FIRST
-from tests.deploy.renewed_board import RenewedBoard, renewal
+from tests.deploy.renewed_board import RenewedBoard, open_bundle, renewal
 from tests.deploy.scripts import script
 
 pytestmark = pytest.mark.skipif(
@@ -421,6 +421,21 @@ def test_a_refused_bundle_leaves_no_files(board: RenewedBoard) -> None:
     board.step()
     assert board.reports(request)[-1][0] == "failed"
     assert not (board.own / "staging").exists()
+
+
+def test_a_release_that_cannot_open_bundles_is_refused(board: RenewedBoard) -> None:
+    """Such a release could never be replaced once both releases of the board are of this kind."""
+    opened = open_bundle.main
+
+    def main(words: Sequence[str]) -> int:
+        return opened(words) if Path(words[0]) == board.own / "trusted" else 1
+
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    with patch.object(open_bundle, "main", main):
+        board.step()
+    result, text = board.reports(request)[-1]
+    assert (result, "the release cannot open bundles" in text) == ("failed", True), text
+    assert board.release() == "old"
 
 
 def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> None:
