@@ -33,6 +33,8 @@ from knightcube.astro.earth.orbit_knowledge import (
 from knightcube.errors import UsageError
 
 _SGP4_EPOCH = datetime(1949, 12, 31, tzinfo=UTC)
+_RESOLUTION = timedelta(microseconds=864)
+"""Resolution of the epoch of two-line elements, 1e-8 days."""
 _ANY_NUMBER, _LARGEST_NUMBER = 999_999_999, 339_999
 """Largest satellite number in an OMM, and in two-line elements. In two-line elements, 0 replaces a larger
 number."""
@@ -221,7 +223,11 @@ def _lines(
 
 
 def _epoch(text: str, where: str) -> datetime:
-    """Return the time of an epoch that is given as a calendar date or as a year with a day of the year."""
+    """Return the time of an epoch that is given as a calendar date or as a year with a day of the year.
+
+    The time is rounded to the resolution of two-line elements. An epoch just before the end of a year
+    otherwise becomes a day of the year that does not exist.
+    """
     plain = text.strip().removesuffix("Z")
     day_of_year = re.fullmatch(r"(\d{4})-(\d{3})(T.*)", plain)
     try:
@@ -233,6 +239,7 @@ def _epoch(text: str, where: str) -> datetime:
         else:
             found = datetime.fromisoformat(plain)
         utc = found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+        utc = _SGP4_EPOCH + round((utc - _SGP4_EPOCH) / _RESOLUTION) * _RESOLUTION
     except (ValueError, OverflowError) as error:
         raise UsageError(
             f"{where}: EPOCH is {text!r}, but must have the form 2026-11-16T12:25:40.104192"

@@ -89,6 +89,17 @@ def test_two_fixes_with_velocities_determine_elements() -> None:
         fit_elements(dates[:1], np.zeros((1, 3)), np.zeros((1, 3)))
 
 
+def test_fixes_from_just_before_the_end_of_a_year_determine_elements() -> None:
+    known = TwoLineElements(*LINES)
+    start = julian_date("2027-01-01T00:00:00Z") - 2e-4 / 86_400.0
+    dates = start + np.array([0.0, 20.0]) / 1440.0
+    states = [known.at(float(date) - start + DATE) for date in dates]
+    positions = np.array([one.position for one in states])
+    made = fit_elements(dates, positions, np.array([one.velocity for one in states]))
+    assert made.lines[0][18:32] == "27001.00000000"
+    assert made.residuals.max() < 100.0
+
+
 def test_false_fixes_are_rejected() -> None:
     known = TwoLineElements(*LINES)
     dates = DATE + np.arange(0.0, 0.5, 0.004)

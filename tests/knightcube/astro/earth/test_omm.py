@@ -125,6 +125,19 @@ def test_an_omm_with_a_number_that_two_lines_cannot_hold_is_read() -> None:
     assert far(found.lines, LINES) < 10.0
 
 
+@pytest.mark.parametrize(
+    ("epoch", "written"),
+    [
+        ("2026-12-31T23:59:59.9999", "27001.00000000"),
+        ("2024-12-31T23:59:59.9999", "25001.00000000"),
+        ("2024-12-31T23:59:59.9990", "24366.99999999"),
+    ],
+)
+def test_an_epoch_just_before_the_end_of_a_year_becomes_a_day_that_exists(epoch: str, written: str) -> None:
+    [found] = read_elements(as_json(OMM | {"EPOCH": epoch}))
+    assert found.lines[0][18:32] == written
+
+
 @pytest.mark.parametrize("name", ["", "ISS (ZARYA)\n", "0 ISS (ZARYA)\r\n"])
 def test_two_lines_are_read_with_and_without_a_name(name: str) -> None:
     found = read_elements(f"{name}{LINES[0]}\r\n{LINES[1]}\n\n{name}{LINES[0]}\n{LINES[1]}")
