@@ -31,7 +31,7 @@ import serial
 from smbus2 import I2cFunc, SMBus, i2c_msg
 
 from hal.buses.smbus_byte import I2C_TIMEOUT
-from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+from hal.interfaces.errors import NotResponding, OutOfRange, OutputFull, Refused
 from hal.interfaces.wires import SECOND_NS, Clock
 
 _READ_TIMEOUT_S = 0.1  # longest time (s) until the thread notices that the port is to be closed
@@ -108,15 +108,17 @@ class PySerialPort:
         return chunks
 
     def send(self, data: bytes) -> None:
-        """Write bytes. Raises NotResponding if the port is lost or the output queue remains full."""
+        """Write bytes. Raises NotResponding if the port is lost, or OutputFull."""
         if self._failure:
             raise NotResponding(self._device, self._failure)
         try:
             with self._port_lock:
-                self._write(data)
+                written = self._write(data)
         except _PORT_ERRORS as error:
             message = f"writing failed ({error}): is the device still there?"
             raise NotResponding(self._device, message) from error
+        if written < len(data):
+            raise OutputFull(self._device, written)
 
     def set_baud_rate(self, baud_rate: int) -> None:
         """Change the baud rate. Raises NotResponding if the port rejects the baud rate."""
@@ -139,19 +141,21 @@ class PySerialPort:
         self._serial.close()
         self._failure = self._failure or "the port was closed"
 
-    def _write(self, data: bytes) -> None:
-        """Write bytes, and wait while the output queue is full. Raises TimeoutError.
+    def _write(self, data: bytes) -> int:
+        """Write bytes, and wait while the output queue is full. Return the number of written bytes.
 
         The method `write` of pyserial also raises an error if all bytes were written but the thread was
         suspended in between.
         """
         file, until_ns = self._serial.fileno(), self._clock.now_ns() + round(self._write_timeout * SECOND_NS)
-        while data:
+        written = 0
+        while written < len(data):
             with suppress(BlockingIOError):
-                data = data[os.write(file, data) :]
+                written += os.write(file, data[written:])
             left = max(until_ns - self._clock.now_ns(), 0) / SECOND_NS
-            if data and not select.select([], [file], [], left)[1]:
-                raise TimeoutError("the output queue is full")
+            if written < len(data) and not select.select([], [file], [], left)[1]:
+                break
+        return written
 
     def _open(self) -> serial.Serial:
         return serial.Serial(self._device, self.baud_rate, timeout=_READ_TIMEOUT_S, exclusive=True)

@@ -24,6 +24,14 @@ class NotResponding(DeviceError):
     """Raised if a device does not answer, for example because a port is closed or a bus hangs."""
 
 
+class OutputFull(NotResponding):
+    """Raised if the output queue of a port remains full; `written` is the number of bytes that it took."""
+
+    def __init__(self, device: str, written: int) -> None:
+        super().__init__(device, "writing failed (the output queue is full): is the device still there?")
+        self.written = written
+
+
 class _Answering:
     """Context manager of `answering`; a class, because a generator would be several times as slow."""
 

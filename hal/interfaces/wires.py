@@ -81,7 +81,7 @@ class SerialPort(Protocol):
         """
 
     def send(self, data: bytes) -> None:
-        """Queue bytes for sending. Raises NotResponding if the port is lost."""
+        """Queue bytes for sending. Raises NotResponding if the port is lost, or OutputFull."""
 
     def set_baud_rate(self, baud_rate: int) -> None:
         """Change the baud rate of the port."""

@@ -68,7 +68,7 @@ from knightcube.errors import KnightCubeError, UsageError
 _NICE = 10
 _KEYS_WAIT_NS = 60 * SECOND_NS
 """Time (ns) for which the start waits for the folder of keys, before it is rebuilt from the second record."""
-_WRITE_TIMEOUT_S = 0.5  # maximum wait for a radio that is slower than the configured rate
+_WRITE_TIMEOUT_S = 0.0  # a radio that is slower than the configured rate takes the rest of a frame later
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -258,8 +258,9 @@ class _LoopbackLine:
     def trust(self, sender: Any, now_ns: int) -> None:
         pass
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int:
         self.answers += len(frames)
+        return len(frames)
 
     def close(self) -> None:
         pass

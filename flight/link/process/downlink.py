@@ -348,8 +348,8 @@ class Downlink:
         """Play back the packets of `source` at the unused data rate; each b"" ends a call of `frames`."""
         self._source = source
 
-    def frames(self, now_ns: int) -> list[bytes]:
-        """Return the frames that are due at `now_ns`.
+    def frames(self, now_ns: int, live_only: bool = False) -> list[bytes]:
+        """Return the frames that are due at `now_ns`; if `live_only`, files and playback wait.
 
         Raises KnightCubeError if no frame can be protected. No further packets are then taken from the queues
         until the completed frames can be protected.
@@ -364,7 +364,7 @@ class Downlink:
                 late = next(
                     filter(None, (one.take() for one in (self._live, self._replay, self._filed))), None
                 )
-                made = late or self._next_live(now_ns) or self._next_in_turn()
+                made = late or self._next_live(now_ns) or ([] if live_only else self._next_in_turn())
             except KnightCubeError:
                 if not due:
                     raise

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from ipaddress import IPv4Address, IPv4Network
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -71,7 +72,7 @@ from flight.link.security import (
 )
 from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Packet
 from flight.link.telemetry.packets import Packer, TelemetryError, row_of
-from hal.interfaces.errors import DeviceError
+from hal.interfaces.errors import DeviceError, OutputFull
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
 from knightcube.errors import KnightCubeError, UsageError
 
@@ -85,7 +86,6 @@ _CONNECTIONS = 4
 _STRANGERS = 256
 """Maximum number of TCP connections that have not sent an authentic frame. If 200 unauthenticated clients
 connect per second, a new connection has 1.3 s for its first frame."""
-_UNSENT = 1 << 18
 _PIECE = 1 << 14
 _RECONNECT_NS = 5 * SECOND_NS
 
@@ -102,11 +102,42 @@ class Line(Protocol):
         """Record that a sender has sent an authentic frame; by default, nothing is recorded."""
         return
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames to all listeners. Never raises."""
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
+        """Send frames to all listeners. Never raises.
+
+        Returns how many frames, counted from the first, at least one listener takes, or None if nobody
+        listens. The caller sends the other frames again.
+        """
 
     def close(self) -> None:
         """Close the line. Calling `close` again has no effect."""
+
+
+class _Output:
+    """Output of a stream, which completes the last frame that was sent in part before it takes new frames."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def send(self, frames: Sequence[bytes], write: Callable[[bytes], int]) -> int:
+        """Send frames by `write`, which returns the number of written bytes. Return how many were begun."""
+        data, bounds = self._rest + b"".join(frames), [*accumulate(map(len, frames), initial=len(self._rest))]
+        written = write(data) if data else 0
+        begun = sum(begin < written for begin in bounds[:-1])
+        self._rest = data[written : bounds[begun]]
+        return begun
+
+    def clear(self) -> None:
+        """Discard the rest of the last frame, because the stream was lost."""
+        self._rest = b""
+
+
+def _write_to(line: socket.socket, data: bytes) -> int:
+    """Write to a socket without waiting. Return the number of written bytes. Raises OSError."""
+    try:
+        return line.send(data)
+    except BlockingIOError:
+        return 0
 
 
 class UdpLine:
@@ -163,15 +194,24 @@ class UdpLine:
         """Send telemetry to the authenticated `sender` for one minute."""
         self._heard[sender] = now_ns
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send each frame as one datagram to each listener."""
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
+        """Send each frame as one datagram to each listener, until the network takes no more datagrams."""
         self._heard = {who: at for who, at in self._heard.items() if now_ns - at < _HEARD_NS}
         fixed = () if self._fixed is None or self._fixed in self._heard else (self._fixed,)
-        units = [self._codes.telemetry.encode(frame) for frame in frames]
-        for listener in (*fixed, *self._heard):
-            for unit in units:
-                with contextlib.suppress(OSError):
-                    self._socket.sendto(unit, listener)
+        listeners = (*fixed, *self._heard)
+        if not listeners:
+            return None
+        for count, frame in enumerate(frames):
+            unit = self._codes.telemetry.encode(frame)
+            if not any([self._send(unit, listener) for listener in listeners]):
+                return count
+        return len(frames)
+
+    def _send(self, unit: bytes, listener: Any) -> bool:
+        """Send a datagram. Return whether the network has taken it."""
+        with contextlib.suppress(OSError):
+            return self._socket.sendto(unit, listener) == len(unit)
+        return False
 
     def close(self) -> None:
         """Close the socket."""
@@ -180,10 +220,10 @@ class UdpLine:
 
 @dataclass(slots=True)
 class _Connection:
-    """TCP connection: its decoder, its unsent bytes, and whether it has sent an authentic frame."""
+    """TCP connection: its decoder, its output, and whether it has sent an authentic frame."""
 
     stream: FrameDecoder
-    unsent: bytearray = field(default_factory=bytearray)
+    output: _Output = field(default_factory=_Output)
     trusted: bool = False
 
 
@@ -246,23 +286,18 @@ class TcpLine:
             self._make_room(trusted=True, most=_CONNECTIONS)
             state.trusted = True
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames to the authenticated connections, and close connections that do not read the frames."""
-        marked = b"".join(map(self._framing.wrap, frames))
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
+        """Send frames to the authenticated connections. A connection misses frames that it does not take."""
+        marked, begun = list(map(self._framing.wrap, frames)), list[int]()
         for connection, state in list(self._connections.items()):
             if not state.trusted:
                 continue
-            unsent = state.unsent
-            unsent.extend(marked)
             try:
-                del unsent[: connection.send(unsent) if unsent else 0]
-            except BlockingIOError:
-                pass
+                begun.append(state.output.send(marked, partial(_write_to, connection)))
             except OSError:
                 self._drop(connection)
-                continue
-            if len(unsent) > _UNSENT:
-                self._drop(connection)
+                begun.append(0)
+        return max(begun, default=None)
 
     def close(self) -> None:
         """Close all connections and the listening socket."""
@@ -306,7 +341,7 @@ class TncLine(Line):
         self._framing = framing
         self._stream = framing.stream()
         self._socket: socket.socket | None = None
-        self._unsent = bytearray()
+        self._output = _Output()
         self._next_ns = 0
 
     def receive(self) -> list[tuple[bytes, Any]]:
@@ -323,8 +358,8 @@ class TncLine(Line):
             self.close()
         return [(frame, None) for frame in self._stream.add(data)]
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send each frame as the data of one KISS frame, or discard it if the TNC cannot accept it."""
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int:
+        """Send each frame as the data of one KISS frame. Without a connection the TNC takes no frame."""
         if self._socket is None and now_ns >= self._next_ns:
             self._next_ns = now_ns + _RECONNECT_NS
             self._stream = self._framing.stream()
@@ -333,19 +368,16 @@ class TncLine(Line):
                 self._socket.setblocking(False)
                 self._socket.connect(self._address)
         if self._socket is None:
-            return
-        if len(self._unsent) < _UNSENT:
-            self._unsent.extend(b"".join(map(self._framing.wrap, frames)))
+            return 0
         try:
-            del self._unsent[: self._socket.send(self._unsent) if self._unsent else 0]
-        except BlockingIOError:
-            pass
+            return self._output.send(list(map(self._framing.wrap, frames)), partial(_write_to, self._socket))
         except OSError:
             self.close()
+            return 0
 
     def close(self) -> None:
         """Close the connection."""
-        self._unsent.clear()
+        self._output.clear()
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -358,7 +390,7 @@ class SerialLine(Line):
         """Use an open port, which reopens itself; if `framing` is None, frames follow sync markers."""
         self.name, self._port = name, port
         self._framing = framing or LinkCodes().on_board()
-        self._stream = self._framing.stream()
+        self._stream, self._output = self._framing.stream(), _Output()
 
     def receive(self) -> list[tuple[bytes, Any]]:
         """Return the received frames, or an empty list if the port is lost."""
@@ -368,11 +400,21 @@ class SerialLine(Line):
             return []
         return [(frame, None) for _, data in pieces for frame in self._stream.add(data)]
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames. Frames are discarded while the port is lost."""
-        with contextlib.suppress(DeviceError):
-            if frames:
-                self._port.send(b"".join(map(self._framing.wrap, frames)))
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int:
+        """Send frames. A port that is lost takes no frame."""
+        try:
+            return self._output.send(list(map(self._framing.wrap, frames)), self._write)
+        except DeviceError:
+            self._output.clear()
+            return 0
+
+    def _write(self, data: bytes) -> int:
+        """Write to the port. Return the number of written bytes. Raises DeviceError if the port is lost."""
+        try:
+            self._port.send(data)
+        except OutputFull as error:
+            return error.written
+        return len(data)
 
     def close(self) -> None:
         """Close the port."""
@@ -449,6 +491,40 @@ class StationSettings:
     foreign_modes: frozenset[Mode] = frozenset()
 
 
+class Transmitter:
+    """Sender of the due frames on all lines; frames that no line takes are sent again before other frames.
+
+    While nobody listens, live telemetry is discarded, and files and playback wait. The attribute `untaken`
+    counts the frames that a line did not take, at each attempt.
+    """
+
+    def __init__(self, lines: Sequence[Line], downlink: Downlink, now_ns: int) -> None:
+        self._lines, self._downlink, self._taken_ns = lines, downlink, now_ns
+        self._unsent: list[bytes] = []
+        self._listened = False  # whether anybody listened to the last frames
+        self.untaken = 0
+
+    def turn(self, now_ns: int) -> str:
+        """Send the due frames. Return why telemetry cannot be sent, or an empty text."""
+        problem, due = "", list[bytes]()
+        if not self._unsent or not self._listened:
+            try:
+                due = self._downlink.frames(now_ns, live_only=not self._listened)
+            except KnightCubeError as error:  # commands are accepted, such as a command that sets a new key
+                problem = str(error)
+        frames = self._unsent or due
+        taken = [count for line in self._lines if (count := line.send(frames, now_ns)) is not None]
+        self.untaken += sum(len(frames) - count for count in taken)
+        if taken or self._listened:  # otherwise the frames contain live telemetry only
+            self._unsent = frames[max(taken, default=0) :]
+        self._listened = bool(taken)
+        if not self._unsent or any(taken):
+            self._taken_ns = now_ns
+        elif taken and now_ns - self._taken_ns >= SECOND_NS:
+            return f"no telemetry can be sent on {', '.join(line.name for line in self._lines)}"
+        return problem
+
+
 class Station:
     """Satellite end of the link: processes received frames and sends telemetry."""
 
@@ -491,8 +567,8 @@ class Station:
         self._begun_ns = self._status_ns = self._label_ns = clock.now_ns()
         self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
-        self._problem = ""
-        self._keys_returned = False
+        self._problem, self._keys_returned = "", False
+        self._transmitter = Transmitter(lines, self._downlink, clock.now_ns())
         self._unpacked, self._unpacked_text = 0, ""
         self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
@@ -541,7 +617,8 @@ class Station:
             if self._problem and self._problem != complained:
                 complain(self._problem)
             complained = self._problem
-            if self.unreported != lost and self._clock.now_ns() - lost_ns >= SECOND_NS:
+            is_late = not self._problem and self.unreported != lost
+            if is_late and self._clock.now_ns() - lost_ns >= SECOND_NS:
                 lost, lost_ns = self.unreported, self._clock.now_ns()
                 complain(f"{lost} reports could not be sent: {self._unpacked_text or 'too many at once'}")
             due_ns = max(due_ns + pause_ns, self._clock.now_ns())
@@ -577,13 +654,7 @@ class Station:
             self._status_ns = now_ns + SECOND_NS
             self._report(*self._renewal.turn(self._gate.admitted, now_ns))
             self._status()
-        try:
-            frames = self._downlink.frames(now_ns)
-            self._problem = ""
-        except KnightCubeError as error:  # commands are still accepted, such as a command that sets a new key
-            self._problem, frames = str(error), []
-        for line in self._lines:
-            line.send(frames, now_ns)
+        self._problem = self._transmitter.turn(now_ns)
         self._beat()
         return self._received > before
 
@@ -779,7 +850,10 @@ class Station:
             "played_ns": self._downlink.played_ns,
             "unreported": self.unreported,
             "corrected": self._codes.commands.corrected,
+            "untaken": self._transmitter.untaken,
         }
+        if self._problem:  # a state that waits would displace reports of commands
+            return
         self._send(LINK, values)
         for progress in self._filing.status():
             self._send(TRANSFER, values_of(progress))

@@ -686,7 +686,7 @@ LINK = _packet(
     0x170,
     "1 Hz, of the link process; not in the flight log",
     "Counts of received frames, and counters of the security associations",
-    version=3,
+    version=4,
 )(
     counter("received", "frames received since the start of the link"),
     counter("admitted", "accepted frames"),
@@ -710,6 +710,7 @@ LINK = _packet(
     Field("played_ns", "i8", "ns", "mission time of the newest packet of the playback"),
     counter("unreported", "reports that were lost because of invalid values or newer reports"),
     counter("corrected", "wrong bits of telecommands that the BCH code has corrected"),
+    counter("untaken", "telemetry frames that a line did not take, counted for each line and attempt"),
 )
 
 VERIFICATION = _packet(

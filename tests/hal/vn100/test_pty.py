@@ -24,7 +24,7 @@ from hal.buses.linux_wires import PySerialPort
 from hal.buses.system import SystemClock
 from hal.drivers.vn100 import Vn100
 from hal.interfaces.devices import ImuReading
-from hal.interfaces.errors import CorruptData, NotResponding
+from hal.interfaces.errors import CorruptData, NotResponding, OutputFull
 from knightcube.astro.quaternion import angle_about_axis_y
 from sim_hal.emulators.serial_line import PtyLine
 from tests.hal.vn100.bench_line import MISSION
@@ -246,8 +246,14 @@ def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_r
     near, far = os.openpty()
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
     assert port._write_timeout < 1.0 / CONTROL_RATE_HZ
-    with pytest.raises(NotResponding, match="the output queue is full"):
+    with pytest.raises(OutputFull, match="the output queue is full") as full:
         port.send(bytes(1 << 20))  # no process reads the other end at this time
+    read = 0
+    os.set_blocking(near, False)
+    with suppress(BlockingIOError):
+        while True:
+            read += len(os.read(near, 1 << 20))
+    assert 0 < full.value.written == read
     os.close(near)
     port.close()
     os.close(far)

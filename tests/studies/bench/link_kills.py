@@ -208,9 +208,10 @@ class _SkyWire(Wire):
         self.up = frames
         self._way = way
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int:
         for frame in frames:
             self._way.put(frame)
+        return len(frames)
 
 
 class _GroundOut(GroundWire):

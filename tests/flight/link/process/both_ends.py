@@ -32,6 +32,8 @@ class Wire:
     def __init__(self) -> None:
         self.up: list[bytes] = []
         self.down: list[bytes] = []
+        self.takes: int | None = None  # most frames that the line takes in a call, or None for any number
+        self.listened = True
 
     def receive(self) -> list[tuple[bytes, Any]]:
         taken, self.up = self.up, []
@@ -40,8 +42,10 @@ class Wire:
     def trust(self, sender: Any, now_ns: int) -> None:
         pass
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        self.down += frames
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
+        taken = len(frames) if self.takes is None else min(self.takes, len(frames))
+        self.down += frames[:taken]
+        return taken if self.listened else None
 
     def close(self) -> None:
         pass
@@ -82,8 +86,8 @@ class StreamWire(Wire):
     def receive(self) -> list[tuple[bytes, Any]]:
         return [(frame, None) for data, _ in super().receive() for frame in self.received.add(data)]
 
-    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        super().send([self.noise(self.board.wrap(frame)) for frame in frames], now_ns)
+    def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
+        return super().send([self.noise(self.board.wrap(frame)) for frame in frames], now_ns)
 
     def ground(self) -> GroundWire:
         return GroundStream(self)

@@ -1,18 +1,23 @@
-"""Tests that link lines read floods in portions, accept only peers, and drop clients that do not read."""
+"""Tests that link lines read floods in portions, accept only peers, and report frames that were not sent."""
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from ipaddress import IPv4Network
+from unittest.mock import Mock
 
 import pytest
 
 from flight.link.coding import LinkCodes
 from flight.link.frames import SYNC, TelecommandHeader, close_frame
-from flight.link.process.station import AT_MOST, TcpLine, TncLine, UdpLine
+from flight.link.process import station
+from flight.link.process.station import AT_MOST, Line, SerialLine, TcpLine, TncLine, UdpLine
+from hal.buses.linux_wires import PySerialPort
+from hal.buses.system import SystemClock
 from knightcube.errors import UsageError
 
 FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")
@@ -126,22 +131,98 @@ def test_strangers_displace_the_oldest_stranger_and_no_connection_with_an_authen
     line.close()
 
 
-def test_a_connection_that_does_not_read_is_closed() -> None:
+@contextmanager
+def tcp_line() -> Iterator[tuple[TcpLine, int]]:
     line = TcpLine("127.0.0.1:0")
     with ExitStack() as stack:
-        caller, stranger = callers_of(line, stack, 2)
+        caller, _ = callers_of(line, stack, 2)
         caller.sendall(SYNC + FRAME)
-        ((frame, sender),) = received_by(line)
-        assert frame == FRAME
-        line.trust(sender, 0)
-        for _ in range(300):  # the total size exceeds the socket buffers
-            line.send([bytes(1 << 16)], 0)
-        assert sender not in line._connections
-        assert len(line._connections) == 1
-        stranger.setblocking(False)
-        with pytest.raises(BlockingIOError):
-            stranger.recv(1)
+        line.trust(received_by(line)[0][1], 0)
+        yield line, caller.fileno()
     line.close()
+
+
+@contextmanager
+def tnc_line() -> Iterator[tuple[TncLine, int]]:
+    with socket.create_server(("127.0.0.1", 0)) as tnc:
+        line = TncLine(f"127.0.0.1:{tnc.getsockname()[1]}", LinkCodes().on_board(kiss=True))
+        line.send([], 0)
+        with tnc.accept()[0] as connection:
+            yield line, connection.fileno()
+        line.close()
+
+
+@contextmanager
+def serial_line() -> Iterator[tuple[SerialLine, int]]:
+    near, far = os.openpty()
+    line = SerialLine("radio", PySerialPort(os.ttyname(far), 115200, SystemClock(), write_timeout=0.0))
+    yield line, near
+    line.close()
+    os.close(near)
+    os.close(far)
+
+
+@pytest.mark.parametrize("kind", [tcp_line, tnc_line, serial_line])
+def test_frames_that_a_slow_stream_does_not_take_are_known_and_none_is_sent_in_part(
+    kind: Callable[[], AbstractContextManager[tuple[Line, int]]],
+) -> None:
+    sent = [n.to_bytes(2, "big") * 500 for n in range(10_000)]
+    with kind() as (line, far):
+        stream = LinkCodes(frame_bytes=1000).on_ground(kind is tnc_line).stream()
+        waiting, received, refused = list(sent), list[bytes](), 0
+        while waiting or len(received) < len(sent):
+            batch = waiting[:7]
+            taken = line.send(batch, 0)
+            assert taken is not None
+            refused += taken < len(batch)
+            del waiting[:taken]
+            if taken < len(batch) or not waiting:
+                received += stream.add(os.read(far, 1 << 16))
+        assert refused > 1
+        assert received == sent
+
+
+def test_a_connection_that_does_not_read_delays_no_other_connection() -> None:
+    line = TcpLine("127.0.0.1:0")
+    assert line.send([FRAME], 0) is None, "nobody listens"
+    with ExitStack() as stack:
+        for caller in (callers := callers_of(line, stack, 3))[:2]:
+            caller.sendall(SYNC + FRAME)
+            line.trust(received_by(line)[0][1], 0)
+        frame, total = bytes(1 << 14), 0
+        while line.send([frame], 0):  # until all buffers are full
+            pass
+        callers[0].setblocking(False)
+        for _ in range(100):
+            with suppress(BlockingIOError):
+                while data := callers[0].recv(1 << 20):
+                    total += len(data)
+            assert line.send([frame], 0) == 1
+        callers[2].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            callers[2].recv(1)
+    line.close()
+
+
+def test_lines_report_that_they_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [b"one", b"two", b"three"]
+    with serial_line() as (serial, _), tcp_line() as (tcp, _):
+        serial.close()
+        assert serial.send(frames, 0) == 0
+        monkeypatch.setattr(station, "_write_to", Mock(side_effect=ConnectionResetError))
+        assert [tcp.send(frames, 0), tcp.send(frames, 0)] == [0, None]
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        address = f"127.0.0.1:{closed.getsockname()[1]}"
+    tnc = TncLine(address, LinkCodes().on_board(kiss=True))
+    assert [tnc.send(frames, n * 10**10) for n in range(3)] == [0, 0, 0]
+    udp = UdpLine("127.0.0.1:0")
+    assert udp.send(frames, 0) is None, "nobody listens"
+    udp.trust(("127.0.0.1", 9), 0)
+    outcomes = [3, OSError(errno.ENETUNREACH, "Network is unreachable"), 3, 5]
+    udp._socket, own = Mock(sendto=Mock(side_effect=outcomes)), udp._socket
+    assert udp.send(frames, 0) == 1
+    assert udp.send(frames[1:], 0) == 2
+    own.close()
 
 
 def test_a_tnc_line_without_a_free_file_descriptor_connects_later(monkeypatch: pytest.MonkeyPatch) -> None:

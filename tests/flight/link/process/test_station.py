@@ -412,6 +412,42 @@ def test_an_interval_of_the_archive_is_played_back_completely_beside_live_teleme
     assert link.obeyed == [], "a command of the link went to the flight"
 
 
+@pytest.mark.parametrize(("takes", "listened"), [(0, True), (1, True), (0, False)])
+def test_a_playback_waits_for_a_line_that_takes_no_frames(tmp_path: Path, takes: int, listened: bool) -> None:
+    link = BothEnds(tmp_path, rate=5e4)
+    old = timing_packets(4000)
+    link.record(*old)
+    link.turn(10.0)
+    link.packets.clear()
+    play = link.terminal.send(directives.pack(Play(0, 0.0, 1e3), 1))
+    link.turn(0.1)
+    link.wire.takes, link.wire.listened = takes, listened
+    link.turn(5.0)
+    assert link.station._downlink.playing
+    link.wire.takes, link.wire.listened = None, True
+    link.turn(10.0)
+    assert [one for channel, one in link.packets if channel == PLAYBACK] == old
+    assert link.stages(play) == ["accepted", "started", "completed"]
+    assert not (listened and link.terminal.lost_frames), "live telemetry is discarded while nobody listens"
+    assert (link.status()["untaken"] > 0) == listened
+    link.close()
+
+
+def test_a_line_that_takes_nothing_is_reported_once_and_loses_no_report(link: BothEnds) -> None:
+    said, turns = list[str](), iter([False] * 30_000)
+    link.turn(1.0)
+    link.wire.takes = 0
+    counters = [link.terminal.send(packet(Ping(n))) for n in range(3)]
+    link.station.run(lambda: next(turns, True), said.append, lambda: None)
+    assert said == ["no telemetry can be sent on wire"]
+    link.wire.takes = None
+    link.station.turn()
+    link.station.turn()
+    link.collect()
+    assert all("accepted" in link.stages(counter) for counter in counters)
+    assert link.station.unreported == 0
+
+
 @pytest.mark.parametrize("failures", [1, 3, 10**9])
 def test_a_playback_repeats_failed_reads_and_reports_what_it_could_not_read(
     link: BothEnds, monkeypatch: pytest.MonkeyPatch, failures: int
