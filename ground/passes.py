@@ -70,7 +70,7 @@ class Station(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def text(self) -> str:
         """The station as the text that `station_of` reads."""
         numbers = (self.latitude_deg, self.longitude_deg, self.height, self.mask_deg)
-        return ",".join([self.name.replace(",", " "), *(f"{number:g}" for number in numbers)])
+        return ",".join([self.name.replace(",", " "), *(f"{number:.12g}" for number in numbers)])
 
     def on_earth(self) -> GeographicPosition:
         """Return the position of the station for Skyfield."""

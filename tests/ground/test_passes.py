@@ -180,7 +180,8 @@ def test_the_claimed_error_of_the_times_grows_with_the_age_of_the_elements() -> 
 
 def test_stations_are_read_from_text_and_file(tmp_path: Path) -> None:
     assert station_of("Berlin,52.5,13.4,40") == BERLIN
-    assert station_of(BERLIN.text) == BERLIN
+    for station in (BERLIN, Station(name="Apia", latitude_deg=-13.8333333, longitude_deg=-171.7666667)):
+        assert station_of(station.text) == station
     file = tmp_path / "stations.yaml"
     file.write_text("stations:\n  - {name: Berlin, latitude_deg: 52.5, longitude_deg: 13.4, height: 40}\n")
     assert read_stations(file) == (BERLIN,)
