@@ -17,8 +17,9 @@ port in use are sent: UART 1, UART 2 or USB. The receiver reports its port in CF
 not answer, such as an M10, has only UART 1. With the default dynamic model ("portable"), a receiver rejects
 fixes above 12 km or 310 m/s, so the driver selects the model for the highest altitudes and speeds.
 No call blocks. If bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud
-rates. When it finds the receiver, it commands the configured baud rate. Consumer receivers stop working above
-18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
+rates. When it finds the receiver, it commands the configured baud rate. A receiver that refuses this rate is
+reported, and is used at its own rate as long as it sends fixes. Consumer receivers stop working above 18 km
+or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
 
 A receiver with the driver `nmea` sends sentences by itself, about once a second. The sentence RMC contains
 date, time, ground speed and course, and the sentence GGA contains the position with altitude, quality and
@@ -264,6 +265,8 @@ UNDECODED_NS = 10 * SECOND_NS
 """Time (ns) after which other baud rates are tried if bytes without a valid frame or sentence arrive."""
 _RETURN_NS = SECOND_NS // 2
 """Time (ns) from the command of a new baud rate until the port changes to this rate."""
+_RATE_COMMANDS = {CFG_PRT, CFG_VALSET}
+"""Commands that set the baud rate, in older and newer receivers."""
 _BITS = 10
 _SEMI_MAJOR_AXIS, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84, NGA.STND.0036
 _FASTEST = 12_000.0
@@ -308,6 +311,7 @@ class UbloxReceiver:
         self._rate_ns = now_ns  # time of the last change of the baud rate
         self._return_ns: int | None = None  # time at which the port returns to the configured baud rate
         self._found_rate = 0
+        self._rate_refusals: set[Kind] = set()  # refused commands of the baud rate
         self._refused = self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0
 
     def poll(self) -> list[GpsReading]:
@@ -362,26 +366,31 @@ class UbloxReceiver:
     def _condition(self) -> str:
         """Return the reason for a missing fix and the remedy, or an empty text if fixes arrive."""
         since_ns = self._clock.now_ns() - self._silence_ns
-        if self._fix_arrival_ns >= since_ns:
+        if self._fix_arrival_ns >= since_ns and not self._found_rate:
             return self._cause
-        if self._arrivals_ns["frame"] >= since_ns:
+        is_configured = self._port.baud_rate == self._own_rate
+        decoded_ns = max(since_ns, self._rate_ns) if is_configured else self._clock.now_ns() + 1
+        if self._arrivals_ns["frame"] >= decoded_ns:
             return f"UBX frames but no NAV-PVT: {self._refusal or 'the request was not answered'}"
-        if self._arrivals_ns["sentence"] >= since_ns:
+        if self._arrivals_ns["sentence"] >= decoded_ns:
             return (
                 "NMEA sentences but no UBX frame: check the wire from the host's TX to the receiver's RX, "
                 "and that the receiver is a u-blox 7 or newer"
             )
         if self._last_byte_ns >= since_ns and self._found_rate:
-            return (
-                f"the receiver sends at {self._found_rate} baud and does not change to {self._own_rate} "
-                f"baud: set `gps.baud_rate: {self._found_rate}`, and check that it is a u-blox 7 or newer"
-            )
+            return self._rate_problem()
         if self._last_byte_ns >= since_ns:
             return (
                 f"bytes but neither UBX frames nor NMEA sentences at {self._own_rate} baud: check "
                 "`gps.baud_rate` (factory settings: 9600 for u-blox 7 and 8, 38400 for M9, M10 and F9)"
             )
         return "no byte received: check power, the cable, and the port's name"
+
+    def _rate_problem(self) -> str:
+        return (
+            f"the receiver sends at {self._found_rate} baud and does not change to {self._own_rate} baud: "
+            f"set `gps.baud_rate: {self._found_rate}`, and check that it is a u-blox 7 or newer"
+        )
 
     def _reading(self, kind: Kind, payload: bytes, arrival_ns: int) -> GpsReading | None:
         if kind == ACK_NAK and len(payload) >= 2:
@@ -429,10 +438,17 @@ class UbloxReceiver:
         version = f"{self._protocol:g}" if self._protocol else "unknown"
         cure = "versions from 27 on need CFG-VALSET, older versions CFG-PRT and CFG-MSG"
         self._refusal = f"the receiver refused {name} (ACK-NAK, protocol version {version}): {cure}"
+        if self._return_ns is not None:
+            self._rate_refusals.add(command)
+            if self._rate_refusals >= _RATE_COMMANDS:
+                self._refusal = self._rate_problem()
 
     def _use_valset(self, wanted: bool) -> None:
-        """Select CFG-VALSET or the older commands, and configure at once after a change to CFG-VALSET."""
-        self._is_due = self._is_due or wanted > self._uses_valset
+        """Select CFG-VALSET or the older commands, and configure at once after a change to CFG-VALSET.
+
+        A new baud rate is commanded by both, so the command is not repeated for this reason.
+        """
+        self._is_due = self._is_due or (wanted > self._uses_valset and self._return_ns is None)
         self._uses_valset = wanted
 
     def _search_rate(self) -> None:
@@ -442,7 +458,10 @@ class UbloxReceiver:
         if self._return_ns is not None:
             if self._is_due:  # the receiver has reported that another of its ports is connected
                 self._command_rate(now_ns)
-            elif now_ns >= self._return_ns:
+            elif now_ns >= self._return_ns and not (
+                self._rate_refusals >= _RATE_COMMANDS
+                and now_ns - max(self._fix_arrival_ns, self._return_ns) < self._silence_ns
+            ):
                 self._return_ns, self._is_due = None, True
                 self._change_rate(self._own_rate)
         elif port.baud_rate == self._own_rate:
@@ -459,6 +478,7 @@ class UbloxReceiver:
     def _command_rate(self, now_ns: int) -> None:
         """Command the configured baud rate at the receiver's connected port, and ask which port this is."""
         self._return_ns, self._is_due = now_ns + _RETURN_NS, False
+        self._rate_refusals.clear()
         port = self._receiver_port if self._receiver_port in BAUD_RATE_KEYS else UART1
         rate = value_frame({BAUD_RATE_KEYS[port]: self._own_rate})
         # A receiver that has changed its baud rate would send the answer at the new one.

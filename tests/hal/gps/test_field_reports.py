@@ -17,7 +17,10 @@ from pyubx2 import UBXReader
 
 from hal.drivers.gps import (
     ACK_NAK,
+    AIRBORNE_4G,
     CFG_MSG,
+    CFG_PRT,
+    CFG_VALSET,
     NAV_PVT,
     ROLLOVER_NS,
     UART1,
@@ -362,6 +365,31 @@ def test_a_receiver_that_does_not_obey_is_named_with_its_baud_rate() -> None:
     assert gps.driver.link().sentences > 0
     gps.fly(8.0)
     assert "the receiver sends at 9600 baud and does not change to 115200 baud" in gps.driver.link().condition
+
+
+@pytest.mark.parametrize("fixes", [False, True])
+def test_a_receiver_that_refuses_each_command_is_named_and_used_at_its_own_baud_rate(
+    fixes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gps, commands = bench(), list[Kind]()
+
+    def refuse(kind: Kind, payload: bytes, now_ns: int) -> None:
+        commands.append(kind)
+        gps.line.device.write(frame(ACK_NAK, bytes(kind)), now_ns)
+
+    monkeypatch.setattr(gps.gps, "_execute", refuse)
+    gps.line.device.baud_rate, gps.gps._enabled, gps.gps._model = 9600, fixes, AIRBORNE_4G
+    readings = gps.fly(90.0)
+    link = gps.driver.link()
+    problem = "the receiver sends at 9600 baud and does not change to 115200 baud: set `gps.baud_rate: 9600`"
+    assert problem in link.condition
+    assert problem in link.refusal
+    assert {CFG_PRT, CFG_VALSET} == set(commands)
+    assert len(commands) <= 9, "a refused baud rate is not commanded again at once"
+    assert sum(reading.valid for reading in readings) == (80 if fixes else 0)
+    gps.gps._enabled = False
+    gps.fly(4.0)
+    assert gps.line.host.baud_rate != 9600, "without fixes the driver listens at the configured baud rate"
 
 
 def test_noise_on_the_line_does_not_lose_the_receiver() -> None:
