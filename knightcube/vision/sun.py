@@ -109,6 +109,11 @@ class SunStatus(Enum):
 
     The attribute `reason` of the solution states why the patch is not the Sun.
     """
+    AMBIGUOUS = "ambiguous"
+    """Several round discs have the size of the Sun, such as the Sun and a reflection in the lens.
+
+    The discs are the `candidates` of the solution.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,12 +163,14 @@ class SunSolution:
         reason: short reason why no Sun was found. If the Sun was found, `reason` is empty.
         sun: the measurement, or None unless the status is FOUND or PARTIAL.
         pixels_read: number of pixels that were read.
+        candidates: the measured discs, one of which may be the Sun, if the status is AMBIGUOUS.
     """
 
     status: SunStatus
     reason: str = ""
     sun: SunMeasurement | None = None
     pixels_read: int = 0
+    candidates: tuple[SunMeasurement, ...] = ()
 
     def __bool__(self) -> bool:
         """Return whether the Sun was found."""
@@ -244,8 +251,18 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if reasons or narrow:
             return SunSolution(SunStatus.NOT_THE_SUN, [*reasons, narrow][0], None, read)
         return SunSolution(SunStatus.NO_SUN, _nothing_bright(image, settings), None, read)
-    # If several bright patches are round, the largest patch is taken as the Sun.
+    return _chosen(found, read)
+
+
+def _chosen(found: list[SunMeasurement], read: int) -> SunSolution:
+    """Return the solution from the `found` discs of the size of the Sun, after `read` pixels were read."""
     sun = max(found, key=lambda one: one.radius)
+    # Dark pixels can divide one disc into several patches, whose circles coincide.
+    others = [one for one in found if float(one.direction @ sun.direction) < math.cos(sun.radius)]
+    if others:
+        discs = (sun, *others)
+        reason = f"{len(discs)} discs have the size of the Sun: one may be a reflection"
+        return SunSolution(SunStatus.AMBIGUOUS, reason, None, read, discs)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
 
@@ -686,7 +703,8 @@ def sun_of_cameras(
 
     The images (rows, columns), by camera index, were taken at one instant. A camera is not read if, according
     to the solar strings, the Sun cannot be in its field of view. A Sun direction that contradicts the
-    currents of the solar strings is rejected. Raises ValueError for another image size or non-finite pixels.
+    currents of the solar strings is rejected. If an image is ambiguous, the solar strings decide between its
+    discs. Raises ValueError for another image size or non-finite pixels.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}
@@ -697,15 +715,14 @@ def sun_of_cameras(
             continue
         camera = cameras[choice.index]
         solution = each[choice.index] = find_sun(image, camera.lens, settings)
-        sun = solution.sun
-        if sun is None:
-            reason = f"camera {choice.index}: {solution.reason}"
-            continue
-        direction = camera.in_body(sun.direction)
-        if not _contradicts(direction, strings):
-            covariance = np.asarray(camera.to_camera.T @ sun.covariance @ camera.to_camera)
-            return SunOfCameras(direction, covariance, choice.index, each)
-        reason = f"camera {choice.index}: its Sun direction contradicts the solar strings"
+        discs = solution.candidates if solution.sun is None else (solution.sun,)
+        suns = [one for one in discs if not _contradicts(camera.in_body(one.direction), strings)]
+        if len(suns) == 1:
+            covariance = np.asarray(camera.to_camera.T @ suns[0].covariance @ camera.to_camera)
+            return SunOfCameras(camera.in_body(suns[0].direction), covariance, choice.index, each)
+        reason = f"camera {choice.index}: {solution.reason}"
+        if discs and not suns:
+            reason = f"camera {choice.index}: its Sun direction contradicts the solar strings"
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return SunOfCameras(None, None, None, each, reason or strings.reason)
     covariance = strings.basis.T @ strings.tangent_covariance @ strings.basis

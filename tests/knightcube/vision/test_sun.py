@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flight.schema.devices import WideCamera
-from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.arrays import FloatArray, Image, tangent_basis
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import from_matrix, from_rotation_vector
 from knightcube.errors import UsageError
@@ -120,6 +120,36 @@ def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_
         # Limit that is exceeded in one of a thousand cases.
         assert off @ np.linalg.solve(solution.sun.tangent_covariance, off) < 14.0
         assert np.degrees(np.hypot(*off)) < 0.06
+
+
+def _with_reflection() -> Image:
+    """Return an image of the Sun's glare, and of a larger saturated disc on the other side of the axis."""
+    rays = CAMERA.unit_vectors(np.stack(np.meshgrid(np.arange(512.0), np.arange(512.0)), axis=-1))
+    sun, reflection = CAMERA.unit_vectors(np.array([[180.3, 300.8], [331.0, 210.0]]))
+    away = np.arccos(np.clip(rays @ sun, -1.0, 1.0))
+    frame = 200.0 * (np.radians(1.6) / np.maximum(away, 1e-3)) ** 2
+    frame[rays @ reflection > np.cos(np.radians(1.8))] = 255.0
+    noise = np.random.default_rng(32).normal(0.0, 1.0, frame.shape)
+    return np.asarray(np.clip(frame + noise, 0.0, 255.0).astype(np.uint8))
+
+
+def test_the_sun_and_a_reflection_of_its_size_are_ambiguous() -> None:
+    """Neither disc is reported as the Sun, and both are candidates. Solar strings decide between them."""
+    frame = _with_reflection()
+    solution = find_sun(frame, CAMERA)
+    assert solution.status is SunStatus.AMBIGUOUS
+    assert not solution
+    assert len(solution.candidates) == 2
+    truth = CAMERA.unit_vectors(np.array([[180.3, 300.8]]))[0]
+    assert max(float(one.direction @ truth) for one in solution.candidates) > np.cos(1e-3)
+    cameras = [MountedCamera(CAMERA, np.array([0.0, 0.0, 0.0, 1.0]))]
+    for sigma, camera in ((0.02, 0), (0.5, None)):
+        strings = CoarseSun(CoarseSunStatus.FOUND, truth, tangent_basis(truth), sigma**2 * np.eye(2))
+        found = sun_of_cameras({0: frame}, cameras, strings, LINEAR)
+        assert found.camera == camera
+        assert found.direction is not None
+        assert float(found.direction @ truth) > np.cos(1e-3)
+        assert ("2 discs" in found.reason) == (camera is None)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
