@@ -209,12 +209,16 @@ def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
     """Replace a file atomically and sync it to disk. Raises OSError."""
     beside = path.with_name(f".{path.name}.part")
     beside.unlink(missing_ok=True)
-    with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        file.write(data)
-        os.fchmod(file.fileno(), mode)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
+    try:
+        with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(data)
+            os.fchmod(file.fileno(), mode)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError:  # the part of a file that did not fit on the disk would keep the disk full
+        beside.unlink(missing_ok=True)
+        raise
     sync_folder(path.parent)
 
 
@@ -874,11 +878,9 @@ class Renewal:
             texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
             named = b"".join(path.read_bytes() for path in (*texts, board.configuration) if path.is_file())
             for path in board.kept.iterdir():
-                if path.name.startswith("index-"):
-                    if path.name.encode() not in named:
-                        path.unlink()
-                elif path.name not in {state.previous, GROUND}:
-                    shutil.rmtree(path)
+                is_index = path.name.startswith("index-") and path.name.encode() in named
+                if not is_index and path.name not in {state.previous, GROUND}:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def boot_id() -> str:

@@ -860,6 +860,30 @@ def test_a_copy_that_cannot_be_stored_leaves_the_earlier_copy(
     assert place.stored("ground") == before
 
 
+@pytest.mark.parametrize("name", [".index-0.part", "index-0", ".0.part/flight.yaml", "0/flight.yaml"])
+def test_what_an_interrupted_step_left_is_removed_after_a_confirmed_trial(
+    board: RenewedBoard, name: str
+) -> None:
+    activated(board)
+    left = board.own / "kept" / name
+    left.parent.mkdir(exist_ok=True)
+    left.write_bytes(b"a part of a file")
+    board.request("confirm")
+    board.step()
+    names = {path.name for path in (board.own / "kept").iterdir()}
+    assert names == {"ground", decoded((board.own / "state.a").read_bytes())["previous"]}
+
+
+def test_a_file_that_does_not_fit_on_the_disk_leaves_no_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A part of an index of 256 MiB would fill the disk, on which then no state could be stored."""
+    _fail_once(monkeypatch, renewal.os, "fsync", *range(3, 100))
+    with pytest.raises(OSError, match="Input/output"):
+        renewal.replace_file(tmp_path / "index", bytes(9))
+    assert not list(tmp_path.iterdir())
+
+
 def _bundle_of(path: Path, *names: str, size: int = 0, **headers: str) -> Path:
     """Write an unsigned bundle with files of zeros; `headers` are written into extended headers."""
     with tarfile.open(path, "w:xz") as archive:
