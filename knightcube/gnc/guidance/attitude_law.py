@@ -1,16 +1,16 @@
 """Attitude laws: the commanded attitude as a function of time, from two directions or a pointing target.
 
 An attitude law aligns one body axis exactly with a first direction, and a second body axis with a second
-direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, fixed in the
-orbital axes (nadir, velocity, orbit normal), or point to the Sun or to a point on the ground. If the roll is
-free, the second direction follows from the attitude at which the attitude law begins. The second direction is
-then fixed in the same axes, inertial or orbital, as the first direction, so that the body does not rotate
-about the first direction.
+direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, be nadir, the
+velocity or the orbit normal, or point to the Sun or to a point on the ground.
 
 The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
 `across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
 the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
-If the roll is free, the body keeps the roll angle of the time at which the attitude law begins.
+If the roll is free, the body keeps its roll angle at the time at which the attitude law begins. The free roll
+angle is measured from the celestial pole for the Sun, and from the orbit normal for all other targets. The
+body then rotates little about the pointing axis. No line through the satellite along the orbit normal hits
+the Earth, so a ground target is never near the orbit normal, where the roll would change fast.
 """
 
 from __future__ import annotations
@@ -169,19 +169,6 @@ def inertial(vector: FloatArray) -> Direction:
     return at
 
 
-def orbital(vector: FloatArray) -> Direction:
-    """Return the function of time that gives a direction (3,) fixed in orbital axes.
-
-    The orbital axes are the along-track direction, the negative orbit normal and the nadir direction.
-    """
-    fixed = _unit(np.asarray(vector, dtype=float))
-
-    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-        return np.asarray(fixed @ _orbital_axes(ephemeris, times))
-
-    return at
-
-
 def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
     """Return the function of time that gives the direction from the satellite to a point on the ground.
 
@@ -202,22 +189,21 @@ def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
 
 
 def free_roll(
-    axis: FloatArray, first: Direction, quaternion: FloatArray, ephemeris: Ephemeris, time: float
+    axis: FloatArray,
+    first: Direction,
+    second: Direction,
+    quaternion: FloatArray,
+    ephemeris: Ephemeris,
+    time: float,
 ) -> AttitudeLaw:
     """Return a law that aligns `axis` (3,) with `first` and keeps the roll of an attitude (4,) at `time`, s.
 
-    The roll is constant in inertial axes if the direction is inertially fixed, otherwise in orbital axes.
+    The attitude is first rotated by the smallest rotation that aligns `axis`. The roll is then constant
+    relative to the direction `second`.
     """
-    across = _any_across(axis)
-    shown = attitude_matrix(quaternion).T @ across
-    when = np.array([time])
-    wanted = first(ephemeris, when)[0]
-    # The second direction is rotated by the shortest rotation that aligns the axis with the first direction.
-    shown = _turned(attitude_matrix(quaternion).T @ axis, wanted, shown)
-    moved = float(np.linalg.norm(first(ephemeris, when + 10.0)[0] - wanted))
-    if moved < 1e-4:
-        return AttitudeLaw(axis, first, across, inertial(shown))
-    return AttitudeLaw(axis, first, across, orbital(_orbital_axes(ephemeris, when)[0] @ shown))
+    when, shown = np.array([time]), attitude_matrix(quaternion)
+    kept = _turned(first(ephemeris, when)[0], shown.T @ axis, second(ephemeris, when)[0])
+    return AttitudeLaw(axis, first, shown @ kept, second)
 
 
 def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
@@ -282,12 +268,6 @@ def approach(
     return at
 
 
-def _orbital_axes(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return the orbital axes as rows (n, 3, 3): along-track, minus orbit normal, nadir."""
-    down, right = nadir(ephemeris, times), -orbit_normal(ephemeris, times)
-    return np.stack([np.cross(right, down), right, down], axis=1)
-
-
 def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArray:
     """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
@@ -341,7 +321,8 @@ def law_of(
         return lambda _, times: np.broadcast_to(fixed, (len(times), 4))
     first, second = directions_of(target)
     if target.roll is None:
-        return free_roll(axes.pointing, first, quaternion, ephemeris, time).attitudes
+        second = POLE if target.goal is Goal.SUN else orbit_normal
+        return free_roll(axes.pointing, first, second, quaternion, ephemeris, time).attitudes
     turned = attitude_matrix(from_rotation_vector(target.roll * axes.pointing)) @ axes.across
     return AttitudeLaw(axes.pointing, first, turned, second).attitudes
 

@@ -18,19 +18,22 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.attitude_law import (
+    POLE,
     AttitudeLaw,
+    BodyAxes,
     Direction,
     approach,
     free_roll,
     ground,
     inertial,
+    law_of,
     nadir,
     orbit_normal,
-    orbital,
     references,
     sun,
     velocity,
 )
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.support.circular_orbits import JULIAN_DATE, RADIUS, RATE, circular
 
 ORBIT = circular(3000.0)
@@ -72,16 +75,40 @@ def test_rate_and_acceleration_predict_the_attitude() -> None:
 
 
 @pytest.mark.parametrize(
-    "first", [sun, inertial(np.array([0.2, -0.5, 1.0])), orbital(np.array([1.0, 1.0, 0.0]))]
+    ("first", "second"),
+    [(sun, POLE), (inertial(np.array([0.2, -0.5, 1.0])), POLE), (nadir, orbit_normal), (velocity, nadir)],
 )
-def test_a_free_roll_keeps_the_roll_that_there_is_and_turns_the_shortest_way(first: Direction) -> None:
+def test_a_free_roll_keeps_the_roll_that_there_is_and_turns_the_shortest_way(
+    first: Direction, second: Direction
+) -> None:
     start = normalise(np.array([0.3, -0.2, 0.5, 0.7]))
-    law = free_roll(Y, first, start, ORBIT, 100.0)
+    law = free_roll(Y, first, second, start, ORBIT, 100.0)
     wanted = law.attitudes(ORBIT, np.array([100.0]))[0]
     direction = first(ORBIT, np.array([100.0]))[0]
     np.testing.assert_allclose(attitude_matrix(wanted) @ direction, Y, atol=1e-9)
     away = np.arccos(np.clip(float(attitude_matrix(start)[1] @ direction), -1.0, 1.0))
     assert angle_between(start, wanted) == pytest.approx(away, abs=1e-6)
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.03])
+def test_a_pass_over_a_ground_target_with_a_free_roll_needs_only_the_rate_of_the_direction(
+    aside: float,
+) -> None:
+    """The body rotates about its pointing axis only as slowly as the Earth's rotation and the pass require.
+
+    A roll kept relative to a direction that the ground target passes would need many times the rate.
+    """
+    times, rng = np.arange(20.0, 600.0, 1.0), np.random.default_rng(6)
+    beneath = celestial_to_terrestrial(JULIAN_DATE) @ ORBIT.position_at(np.array([300.0]))[0]
+    longitude, latitude, _ = (float(part) for part in geodetic(beneath))
+    target = PointingTarget(Goal.GROUND, (latitude + aside, longitude))
+    direction = ground(*target.numbers)(ORBIT, times)
+    needed = np.linalg.norm(np.diff(direction, axis=0), axis=1).max()
+    for _ in range(20):
+        law = law_of(target, BodyAxes(Z, X), normalise(rng.standard_normal(4)), ORBIT, 20.0)
+        found = references(law, ORBIT, times)
+        np.testing.assert_allclose(attitude_matrix(found.quaternion)[:, 2], direction, atol=1e-9)
+        assert np.linalg.norm(found.rate, axis=1).max() < 1.1 * needed
 
 
 def test_an_approach_starts_with_the_body_s_attitude_and_rate_and_ends_in_the_law() -> None:
