@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flight.link.commands import CommandPacker, Ping
-from flight.link.files.units import UP, UnitPacker
+from flight.link.files.units import UP, FileData, UnitPacker, unit_of, unpack
 from flight.link.process import directives, filing
 from flight.link.process.directives import (
     CancelFile,
@@ -87,6 +87,26 @@ def test_a_file_goes_up_through_losses_and_restarts_and_waits_to_be_chosen(
     assert link.command(DeleteFile(name)) == "completed"
     assert not came.exists()
     assert (chosen / "flight.yaml").exists()
+    link.close()
+
+
+@pytest.mark.parametrize("listened", [True, False])
+def test_a_file_waits_for_a_line_that_takes_no_frames_and_no_part_is_sent_twice(
+    tmp_path: Path, listened: bool
+) -> None:
+    link = FiledEnds(tmp_path, rate=2e4)
+    data = bytes(range(256)) * 600
+    (link.place / "keys" / "files" / "received" / "file").write_bytes(data)
+    link.ask(SendFile("received/file"))
+    link.turn(2.0)
+    link.wire.takes, link.wire.listened = 0, listened
+    link.turn(5.0)  # after 10 s the receiver would request the missing data
+    link.wire.takes, link.wire.listened = None, True
+    link.until_closed()
+    assert [one.condition for one in link.ended] == [0]
+    contents = [unpack(unit_of(packet))[1] for channel, packet in link.packets if channel == FILES]
+    parts = [one for one in contents if isinstance(one, FileData)]
+    assert b"".join(part.data for part in parts) == data, "each part arrives once and in order"
     link.close()
 
 
