@@ -28,12 +28,23 @@ from msgspec import Meta
 from flight.link.files.units import HIGHEST_NUMBER
 from knightcube.errors import KnightCubeError, UsageError
 
+_TRIES = 3
+"""Number of attempts to read a file or to list a folder."""
+
 
 def read_regular(path: Path, most: int) -> bytes | None:
     """Return the content of a file of at most `most` bytes, or None if the file does not exist.
 
-    Type and size are checked first. Raises OSError, also for a longer file or a file that is not regular.
+    Type and size are checked first. Raises OSError, also for a longer file or a file that is not regular. The
+    file is read again after a failure, because a single failed disk access does not mean damage.
     """
+    for _ in range(_TRIES - 1):
+        with suppress(OSError):
+            return _read_once(path, most)
+    return _read_once(path, most)
+
+
+def _read_once(path: Path, most: int) -> bytes | None:
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -135,8 +146,6 @@ LONGEST_NAME = 96
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
 _MOST_PARTS = 4
 _KEPT_ENDINGS = 64
-_TRIES = 3
-"""Number of attempts to list a folder, because a single failed disk access does not mean damage."""
 _FREE_BYTES = 64 << 20
 """Free disk space (bytes) that received files must not use."""
 _COPY_FREE_BYTES = 1 << 20

@@ -483,13 +483,19 @@ class Receiver:
     def keep(self) -> None:
         """Sync the received data to disk, and then store the record of received ranges.
 
-        Raises FileError if the record cannot be stored.
+        Raises FileError if data or record cannot be stored. Data that were not synced are requested again.
         """
         if not self._dirty:
             return
-        if self._file >= 0:
-            with suppress(OSError):
+        try:
+            if self._file >= 0:
                 os.fdatasync(self._file)
+        except OSError as error:  # the kernel may have discarded all data since the last sync
+            self._ranges = Ranges(self.record.ranges)
+            if self._disk.failed(error, self.received_ns):
+                self.stop(Condition.FILESTORE_REJECTION, error.strerror or str(error))
+            raise FileError(f"{self.record.name}: cannot be stored: {error.strerror}") from error
+        self._disk.times = 0
         self.record = msgspec.structs.replace(self.record, ranges=tuple(self._ranges.pairs))
         self._store.save(self.record)
         self._dirty = False
@@ -541,7 +547,6 @@ class Receiver:
             if self._disk.failed(error, now_ns):
                 self.stop(Condition.FILESTORE_REJECTION, error.strerror or str(error))
             return
-        self._disk.reset(now_ns)
         self._ranges.add(offset, end)
         self._dirty = True
 
@@ -579,14 +584,15 @@ class Receiver:
             why = f"received bytes up to {self._ranges.end}, but the EOF states {size}"
             self.stop(Condition.SIZE_ERROR, why)
             return
-        if self._sum is None:
-            with suppress(OSError):
-                self._store.part(self.record).touch(0o600)
-            self._sum = FileSum(self._store.part(self.record), self.record.kind, size)
         try:
+            if self._sum is None:
+                self.keep()
+                with suppress(OSError):
+                    self._store.part(self.record).touch(0o600)
+                self._sum = FileSum(self._store.part(self.record), self.record.kind, size)
             value = self._sum.step()
-        except OSError as error:
-            if self._disk.failed(error, now_ns):
+        except (FileError, OSError) as error:
+            if self._disk.failed(error.__cause__ or error, now_ns):
                 self.stop(Condition.FILESTORE_REJECTION, str(error))
             return
         self._disk.reset(now_ns)

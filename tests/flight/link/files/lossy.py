@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from flight.link.files.store import Store
+from flight.link.files.store import FileError, Store
 from flight.link.files.transfer import CRC32, GROUND, SATELLITE, Entity, Origin, Progress
 from flight.link.files.units import Metadata
 
@@ -56,7 +57,8 @@ class Pair:
                 self.carried += 1
                 if self.draw.random() >= self.loss:
                     self.ends[other].take(unit, self.now_ns)
-            self.ends[number].keep(self.now_ns)
+            with suppress(FileError):  # `flight.link.process.filing` reports this error
+                self.ends[number].keep(self.now_ns)
         for number, end in self.ends.items():
             while end.ended:
                 self.ended[number].append(end.ended.popleft())

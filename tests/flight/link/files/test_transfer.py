@@ -521,7 +521,7 @@ class FailingDisk:
     """A disk on which each kind of access to a file of a transfer fails a number of times."""
 
     def __init__(self, failures: int, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.left = dict.fromkeys(("read", "write", "move"), failures)
+        self.left = dict.fromkeys(("read", "write", "move", "sync"), failures)
         opened, pwrite, replace = Path.open, os.pwrite, os.replace
 
         def open_(path: Path, mode: str = "r") -> Any:
@@ -536,6 +536,14 @@ class FailingDisk:
             self.access("move", one.suffix == ".part")
             replace(one, other)
 
+        def sync(file: int) -> None:
+            try:
+                self.access("sync", True)
+            except OSError:
+                pwrite(file, bytes(SIZE), 0)  # the kernel discards data that it could not write
+                raise
+
+        monkeypatch.setattr(os, "fdatasync", sync)
         monkeypatch.setattr(Path, "open", open_)
         monkeypatch.setattr(os, "pwrite", write)
         monkeypatch.setattr(os, "replace", move)
@@ -547,7 +555,7 @@ class FailingDisk:
 
 
 @pytest.mark.parametrize("source", [SATELLITE, GROUND])
-@pytest.mark.parametrize("access", ["read", "write", "move"])
+@pytest.mark.parametrize("access", ["read", "write", "move", "sync"])
 def test_a_failed_access_to_the_disk_is_repeated_for_half_a_minute_before_the_transfer_is_given_up(
     tmp_path: Path, file: Path, source: int, access: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -566,7 +574,7 @@ def test_a_failed_access_to_the_disk_is_repeated_for_half_a_minute_before_the_tr
     assert [one.condition for one in pair.ended[source]] == [0, Condition.FILESTORE_REJECTION]
     assert 25e9 < pair.now_ns - begun_ns < 120e9
     attempts = failures - disk.left[access]
-    assert attempts < 30 or access == "write", "each attempt is followed by a pause"
+    assert attempts < 30 or access in {"write", "sync"}, "each attempt is followed by a pause"
     assert not pair.store(other).incoming()
 
 
@@ -613,3 +621,24 @@ def test_a_new_file_is_stored_only_if_its_folder_was_synced_to_disk(
     ]
     assert synced == [tmp_path, tmp_path]
     assert (tmp_path / "a").read_bytes() == b"three"
+
+
+def test_a_record_that_cannot_be_read_once_continues_its_transfer(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    pair.send(SATELLITE, file, "down")
+    opened, failed = os.open, set[str]()
+
+    def fail_once(path: Any, *given: Any, **options: Any) -> int:
+        if str(path).endswith(".json") and str(path) not in failed:
+            failed.add(str(path))
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return opened(path, *given, **options)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "open", fail_once)
+        pair.kill(SATELLITE)
+    assert len(failed) == 2
+    pair.until_closed()
+    assert pair.received(GROUND, "down") == file.read_bytes()
