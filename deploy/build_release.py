@@ -60,16 +60,24 @@ class Build:
         if not self._options.dry_run:
             self._remove_incomplete()
             release.mkdir(parents=True)
-        python = self._environment(release)
-        self._test(python)
+        try:
+            self._fill(release, wanted)
+        except BaseException:  # a release that does not fit on the disk would keep the disk full
+            with suppress(OSError):
+                _remove(release)
+            raise
+        sys.stdout.write(f"{release.name}\n")
+        return 0
+
+    def _fill(self, release: Path, wanted: str) -> None:
+        """Build and test a release, whose sources have the digest `wanted`."""
+        self._test(self._environment(release))
         if not self._options.dry_run:
             (release / SOURCE).write_text(wanted, encoding="ascii")
             shutil.copyfile(self._source / _BOARD_LOCK, release / LOCK)
             _write(self._prefix / _NUMBER, f"{release.name.rpartition('+')[2]}\n")
             os.sync()  # the manifest is written after the files that it lists are on disk
             _write(release / MANIFEST, manifest_text(release))
-        sys.stdout.write(f"{release.name}\n")
-        return 0
 
     def _environment(self, release: Path) -> Path:
         """Create the virtual environment of a release, and return the path of its Python interpreter."""

@@ -337,6 +337,12 @@ class Board:
         beside.replace(path)
         sync_folder(self.prefix)
 
+    def remove(self, release: str) -> None:
+        """Remove a release, beginning with its manifest, without which it is incomplete. Raises OSError."""
+        path = self.prefix / "releases" / release
+        (path / "manifest").unlink(missing_ok=True)
+        shutil.rmtree(path)
+
     def python(self, release: str) -> Path:
         """Return the Python interpreter of a release."""
         return self.prefix / "releases" / release / "venv/bin/python"
@@ -720,6 +726,18 @@ class Renewal:
         if done.returncode != 0:
             raise Refused((done.stderr.strip().splitlines() or ["the build failed"])[-1])
         name = done.stdout.split()[-1]
+        try:
+            self._check_built(name)
+        except Refused:
+            with suppress(OSError):  # the present release has the same sources if it was not built again
+                if name not in {board.linked("current"), board.linked("previous")}:
+                    board.remove(name)
+            raise
+        return name
+
+    def _check_built(self, name: str) -> None:
+        """Raise Refused if a release refuses the present configuration or cannot open bundles."""
+        board = self._board
         dropin = Path(__file__).resolve().with_name("board_dropin.py")
         checked = board.run([board.python(name), "-I", "-B", dropin, board.configuration], 120.0)
         if checked.returncode != 0:
@@ -731,7 +749,6 @@ class Renewal:
             self._opened("release", again, [name], again / "trusted")
         except Refused as error:  # after two such releases, no bundle could be opened any more
             raise Refused(f"the release cannot open bundles: {error}") from error
-        return name
 
     def _begin_revert(self, problem: str) -> None:
         """Return to the version before the trial."""
@@ -873,8 +890,7 @@ class Renewal:
             named_releases = {board.linked("current"), board.linked("previous")}
             for path in (board.prefix / "releases").iterdir():
                 if path.name not in named_releases:
-                    (path / "manifest").unlink(missing_ok=True)
-                    shutil.rmtree(path)
+                    board.remove(path.name)
             texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
             named = b"".join(path.read_bytes() for path in (*texts, board.configuration) if path.is_file())
             for path in board.kept.iterdir():

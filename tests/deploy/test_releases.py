@@ -211,6 +211,7 @@ def test_a_release_that_fails_its_self_test_changes_nothing(board: FakeBoard) ->
     )
     assert done.returncode == 1
     assert "install: failed: " in done.stderr
+    assert sorted(path.name for path in (board.prefix / "releases").iterdir()) == [FIRST, SECOND]
     assert board.fly()[0] == "new"
     board.install("newest")
     assert board.fly()[0] == "newest"

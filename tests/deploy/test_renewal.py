@@ -436,6 +436,7 @@ def test_a_release_that_cannot_open_bundles_is_refused(board: RenewedBoard) -> N
     result, text = board.reports(request)[-1]
     assert (result, "the release cannot open bundles" in text) == ("failed", True), text
     assert board.release() == "old"
+    assert [path.name for path in (board.files.prefix / "releases").iterdir()] == [FIRST]
 
 
 def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> None:
