@@ -18,7 +18,7 @@ import zlib
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -786,8 +786,9 @@ class Entity:
         """Store received data durably, once a second or `at_once`. Raises FileError if the disk fails."""
         if at_once or now_ns - self._kept_ns >= _KEEP_NS:
             self._kept_ns = now_ns
-            for receiver in self._in.values():
-                receiver.keep()
+            with ExitStack() as stack:  # stores each transfer, also if another transfer cannot be stored
+                for receiver in self._in.values():
+                    stack.callback(receiver.keep)
 
     def close(self, now_ns: int) -> None:
         """Store received data durably and close the files. Raises FileError if the disk fails."""

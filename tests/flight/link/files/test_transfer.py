@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from flight.link.files import store
-from flight.link.files.store import FileError, Incoming, Store, problem_of_name
+from flight.link.files.store import FileError, Incoming, Outgoing, Store, problem_of_name
 from flight.link.files.transfer import (
     CRC32,
     CRC32C,
@@ -642,3 +642,23 @@ def test_a_record_that_cannot_be_read_once_continues_its_transfer(
     assert len(failed) == 2
     pair.until_closed()
     assert pair.received(GROUND, "down") == file.read_bytes()
+
+
+@pytest.mark.parametrize("damaged", [1, 2])
+def test_a_transfer_that_cannot_be_stored_does_not_prevent_the_storage_of_the_others(
+    tmp_path: Path, damaged: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Store(tmp_path)
+    end, save = Entity(SATELLITE, folder, lambda _: "", SIZE, 0), folder.save
+
+    def fail(record: Outgoing | Incoming) -> None:
+        if record.number == damaged:
+            raise FileError("no space left")
+        save(record)
+
+    monkeypatch.setattr(folder, "save", fail)
+    for number in (1, 2):
+        end.take(pack(Transaction(GROUND, number, SATELLITE), Metadata(SIZE, "a", "a", CRC32)), 0)
+    with pytest.raises(FileError, match="no space left"):
+        end.keep(0, at_once=True)
+    assert [record.number for record in folder.incoming()] == [3 - damaged]
