@@ -30,7 +30,13 @@ from knightcube.astro.arrays import (
 from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import ArgumentError, InputError
-from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole, check_camera
+from knightcube.vision.camera.lens import (
+    CameraKnowledge,
+    CameraModel,
+    Pinhole,
+    check_camera,
+    check_knowledge,
+)
 from knightcube.vision.frame import Bins, check_detector, grey_image
 from knightcube.vision.frame_job import BIN_SIZES, binned_settings, found_in_image, in_whole_image
 from knightcube.vision.lens_knowledge import LensKnowledge
@@ -57,9 +63,6 @@ _LEAST_FOV_ERROR = 0.001
 """Minimum uncertainty of a field of view without a calibrated lens, as a fraction of the field of view."""
 _UNIT_TOLERANCE = 1e-3
 """Largest deviation of the length of a predicted quaternion from 1."""
-_DEVIATIONS = {"focal_length": "(relative)", "centre": "px", "distortion": "(relative)"}
-_DEVIATIONS |= {"line_time": "s", "psf_sigma": "px"}
-"""Units of the standard deviations in `CameraKnowledge`, by the name of the attribute."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,14 +234,8 @@ class StarTracker:
         self._settings = SolveSettings() if settings is None else settings
         check_type("settings", self._settings, SolveSettings)
         check_detector(self._settings.likelihood, LikelihoodSettings)
-        if not isinstance(self._settings.lens, CameraKnowledge | None):
-            raise ArgumentError(
-                "settings.lens",
-                f"{self._settings.lens!r}: give a CameraKnowledge, as CameraKnowledge(**accuracy)",
-            )
-        for name, unit in _DEVIATIONS.items():
-            if (value := getattr(self._settings.lens, name, None)) is not None:
-                checked_deviation(f"settings.lens.{name}", value, unit)
+        if self._settings.lens is not None:
+            check_knowledge("settings.lens", self._settings.lens)
         if not isinstance(learn, bool):
             raise ArgumentError("learn", f"{brief(learn)}: give True or False")
         self._learn = learn

@@ -6,6 +6,7 @@ import ast
 import builtins
 import importlib
 import inspect
+import math
 import re
 import subprocess
 import sys
@@ -36,6 +37,7 @@ from knightcube import (
     find_nadir,
     plan_step,
 )
+from knightcube.vision.camera.lens import CameraKnowledge
 from knightcube.vision.horizon import settings
 from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement
 from knightcube.vision.objects.detect import DetectedObjects, SpaceObject
@@ -439,6 +441,32 @@ def test_an_impossible_detector_is_refused(
     given = {"rate": [0, 0.1, 0]} if function is detect_objects else {}
     with pytest.raises(ArgumentError, match=f"settings.{name}: "):
         function(IMAGE, CAMERA, exposure=1.0, settings=settings(**{name: wrong}), **given)
+
+
+@pytest.mark.parametrize(
+    ("knowledge", "text"),
+    [
+        (None, "settings.knowledge: None: give a CameraKnowledge"),
+        (
+            CameraKnowledge(focal_length=-1.0),
+            "settings.knowledge.focal_length: -1.0: give a standard deviation",
+        ),
+        (CameraKnowledge(centre=math.nan), "settings.knowledge.centre: nan: give a standard deviation"),
+        (CameraKnowledge(covariance=((1.0,),)), "settings.knowledge.covariance: .* shape"),
+    ],
+    ids=["none", "negative", "nan", "shape"],
+)
+def test_a_rate_needs_valid_deviations_of_the_camera(knowledge: Any, text: str) -> None:
+    with pytest.raises(ArgumentError, match=text):
+        estimate_rate(IMAGE, CAMERA, 0.5, settings=LikelihoodSettings(knowledge=knowledge))
+
+
+def test_settings_of_rates_and_objects_have_their_kinds() -> None:
+    wrong = LikelihoodSettings(rate_model="linear")  # type: ignore[arg-type]  # wrong on purpose
+    with pytest.raises(ArgumentError, match="rate_model: 'linear': give one of auto, constant, accelerating"):
+        estimate_rate(IMAGE, CAMERA, 0.5, settings=wrong)
+    with pytest.raises(ArgumentError, match=r"bounds: .* shape \(3,\)"):
+        ObjectSettings(bounds=(8.0, 10.0))  # type: ignore[arg-type]  # wrong on purpose
 
 
 @pytest.mark.parametrize("line_time", [0.02, -0.02, float("inf")])

@@ -30,7 +30,9 @@ from knightcube.astro.arrays import (
     Image,
     brief,
     check_numbers,
+    checked_deviation,
     checked_number,
+    finite_array,
     float_rows,
 )
 from knightcube.astro.quaternion import attitude_matrix
@@ -832,6 +834,23 @@ class CameraKnowledge:
         line_time = None if self.line_time is None else self.line_time * size
         centre, psf_sigma = self.centre / size, self.psf_sigma / size
         return replace(self, centre=centre, line_time=line_time, covariance=covariance, psf_sigma=psf_sigma)
+
+
+_DEVIATIONS = {"focal_length": "(relative)", "centre": "px", "distortion": "(relative)"}
+_DEVIATIONS |= {"line_time": "s", "psf_sigma": "px"}
+"""Units of the standard deviations in `CameraKnowledge`, by the name of the attribute."""
+
+
+def check_knowledge(name: str, knowledge: object) -> None:
+    """Raise ArgumentError unless the argument `name` is a `CameraKnowledge` with valid deviations."""
+    if not isinstance(knowledge, CameraKnowledge):
+        text = f"{brief(knowledge)}: give a CameraKnowledge, as CameraKnowledge(**accuracy)"
+        raise ArgumentError(name, text)
+    for each, unit in _DEVIATIONS.items():
+        if (value := getattr(knowledge, each)) is not None:
+            checked_deviation(f"{name}.{each}", value, unit)
+    if knowledge.covariance is not None:
+        finite_array(f"{name}.covariance", knowledge.covariance, (5, 5))
 
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, finite_array
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +92,9 @@ class ObjectSettings:
         streak_sigma: standard deviation, per axis, of the midpoint of a streak that is too short to locate
             its ends, px.
         end_floor: minimum standard deviation of an end of an object's streak, px, due to faint stars.
+
+    Raises:
+        ArgumentError: unless the bounds are three finite numbers.
     """
 
     bounds: tuple[float, float, float] = (8.0, 10.0, 10.0)
@@ -110,6 +113,9 @@ class ObjectSettings:
     worst_fit: float = 2.5
     streak_sigma: float = 0.1
     end_floor: float = 0.2
+
+    def __post_init__(self) -> None:
+        finite_array("bounds", self.bounds, (3,))
 
 
 @dataclass(frozen=True, slots=True)

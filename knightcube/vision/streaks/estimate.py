@@ -21,12 +21,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import chain, islice
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, finite_array
-from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, brief, finite_array
+from knightcube.errors import ArgumentError
+from knightcube.vision.camera.lens import (
+    CameraModel,
+    Pinhole,
+    check_knowledge,
+    image_of_camera,
+    streak_camera,
+)
 from knightcube.vision.frame import check_detector, raw_counts, saturation_count
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import FaintStars
@@ -74,6 +82,7 @@ from knightcube.vision.streaks.streak_result import (
     REASONS,
     LikelihoodSettings,
     MotionResult,
+    RateModel,
     StreakStatus,
     admit,
     direction_of_time,
@@ -442,10 +451,15 @@ def estimate_rate(
 
     Raises:
         ArgumentError: if the image is not an array of finite numbers of the size of the camera, if exposure
-            or prior deviation is not a positive number, or if the prior rate is not three finite numbers.
+            or prior deviation is not a positive number, if the prior rate is not three finite numbers, or if
+            the settings are impossible.
     """
     settings = LikelihoodSettings() if settings is None else settings
     check_detector(settings, LikelihoodSettings)
+    check_knowledge("settings.knowledge", settings.knowledge)
+    if settings.rate_model not in get_args(RateModel):
+        text = f"{brief(settings.rate_model)}: give one of {', '.join(get_args(RateModel))}"
+        raise ArgumentError("settings.rate_model", text)
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     settings = settings.in_units_of(unit, zero)
     prior = None if prior_rate is None else finite_array("prior_rate", prior_rate, (3,))
