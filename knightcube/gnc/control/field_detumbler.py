@@ -394,7 +394,7 @@ class FieldDetumbler:
             return
         if age_ns < 0:
             self._advance(time_ns)
-        starts = self._filter.restarts
+        starts, revisions = self._filter.restarts, self._filter.revisions
         accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
         if accepted:
             self._accepted_ns = time_ns
@@ -410,6 +410,8 @@ class FieldDetumbler:
                 self._bounded = self._agreed >= TRUSTED and sigma < BOUNDED
         if self._filter.restarts != starts or (not accepted and not self.trusted):
             self._distrust()
+        elif self._filter.revisions != revisions:
+            self._plan = None  # the plan belongs to the rotation of another estimate
         longest_ns = DRIFT / self.rate_sigma / _SECOND
         self._act_ns = round(min(self._schedule.act_ns, max(longest_ns, self._shortest_ns)))
 

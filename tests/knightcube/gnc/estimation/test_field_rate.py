@@ -63,6 +63,23 @@ def test_all_three_components_of_the_rate_are_found_and_the_claim_is_honest(degr
     assert found.restarts == 0
 
 
+@pytest.mark.parametrize("seed", [8, 10, 22])
+def test_the_wrong_one_of_two_spins_about_the_field_is_not_claimed(seed: int) -> None:
+    """In each of these tumbles, a single filter converges to a wrong rate that predicts the field well."""
+    rng = np.random.default_rng(seed)
+    rate = rng.standard_normal(3)
+    times = np.arange(0.0, 40.0, 0.2)
+    states = tumbling(0.2 * rate / np.linalg.norm(rate), INERTIA, times, np.zeros(3))
+    found = FieldRate(settings())
+    for state in states:
+        found.advance(np.zeros(3), 0.2)
+        found.measure(state[3:] + NOISE * rng.standard_normal(3))
+        error = found.rate - state[:3]
+        square = float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) if found.started else 0.0
+        assert square < 36.0
+    assert found.restarts == 0
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_an_inertia_off_by_several_per_cent_is_found_from_the_tumble(seed: int) -> None:
     turned = attitude_matrix(from_rotation_vector(np.array([0.0, 0.03, -0.02])))
