@@ -242,7 +242,8 @@ class StepReplay:
         """Process the last two steps again with unknown dipoles if the gyro contradicts the dipoles.
 
         The earlier of the two steps is included, because the deviation may have begun during that step. The
-        mean rate of that step shows only a part of the deviation.
+        mean rate of that step shows only a part of the deviation. The gyro bias may have changed instead of
+        the rate, so the bias counts as unknown too, until stars show which of the two has changed.
         """
         steps, refused = self.steps, self.refused_gyros > 0
         now_ns = steps[-1].end_ns
@@ -254,14 +255,19 @@ class StepReplay:
             first = max(len(steps) - 2, 0)
             for k in range(first, len(steps)):
                 steps[k].doubt = self._settings.dipole_limit
+            steps[first].doubts_gyro = True
             self.take_again(first)
 
-    def doubt_since(self, since_ns: int) -> set[int]:
-        """Process the steps since a time again with unknown dipoles, and return the measurements used."""
+    def doubt_since(self, since_ns: int, *, gyro: bool = False) -> set[int]:
+        """Process the steps since a time again with unknown dipoles, and return the measurements used.
+
+        If `gyro` is true, the gyro bias may also have changed since this time.
+        """
         steps = self.steps
         first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
         for k in range(first, len(steps)):
             steps[k].doubt = self._settings.dipole_limit
+            steps[k].doubts_gyro |= gyro and k == first
         return self.take_again(first)
 
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
@@ -303,16 +309,17 @@ class StepReplay:
             self.free.renew(block, self.free.layout.prior[block, block], self._memories)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat the dipoles since `since_ns` as unknown if the gate then accepts the attitude `refused`.
+        """Treat dipoles and gyro bias since `since_ns` as unknown if the gate then accepts `refused`.
 
-        Dipole errors that are too small to be measured by the gyro accumulate in the attitude.
+        Dipole errors and changes of the gyro bias that are too small to be noticed in the gyro rates
+        accumulate in the attitude, which then contradicts the attitude `refused`.
         """
-        doubts = [step.doubt for step in self.steps]
-        used = self.doubt_since(min(since_ns, refused.time_ns))
+        doubts = [(step.doubt, step.doubts_gyro) for step in self.steps]
+        used = self.doubt_since(min(since_ns, refused.time_ns), gyro=True)
         if id(refused) in used:
             return used
-        for step, doubt in zip(self.steps, doubts, strict=True):
-            step.doubt = doubt
+        for step, (doubt, doubts_gyro) in zip(self.steps, doubts, strict=True):
+            step.doubt, step.doubts_gyro = doubt, doubts_gyro
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
@@ -421,6 +428,8 @@ class StepReplay:
             change = self._rate_change(step, since, step.impulse - free.impulse(since))
             noise = settings.gyro_noise**2 / step.samples
             spread = COIL_ERROR**2 * float(change @ change) + noise
+            if step.doubts_gyro:
+                free.widen(_GYRO_BIAS)
             refused = not free.gyro(step.gyro, spread * _EYE, change, since)
             tested = states.ALL_NAMES if step.dipole.any() else states.BODY_NAMES
             self._innovation = tested, free.newest_square
@@ -466,6 +475,7 @@ class StepReplay:
 
 FIELD_STRENGTH = 5e-5
 """Largest magnetic field (T) in a low orbit."""
+_GYRO_BIAS = np.arange(states.GYRO.start, states.GYRO.stop)
 REFUSALS_TO_RESTART = 3
 """Number of consecutive contradicting attitudes after which an accurate estimate is restarted."""
 

@@ -131,6 +131,7 @@ class FilterStep:
         field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None if there are none.
         late: measurements whose time lies in the step, oldest first.
         before: the estimate at the beginning of the step, or None if there was none.
+        doubts_gyro: whether the gyro bias may have changed during the step.
     """
 
     begin_ns: int
@@ -148,6 +149,7 @@ class FilterStep:
     spread: FloatArray | None = None
     late: list[Measurement] = dataclasses.field(default_factory=list)
     before: FreeMemory | None = None
+    doubts_gyro: bool = False
 
     @property
     def seconds(self) -> float:

@@ -90,6 +90,7 @@ class Flown:
         self.alternates = False  # if set, the commanded dipole alternates between +x and -z
         self.field: FloatArray | None = None  # field (T) that a stuck magnetometer repeats
         self.magnet: FloatArray = np.zeros(3)  # error (T) that is added to the field
+        self.bias = BIAS  # bias (rad/s) of the gyro
         self.has_gyro = True
 
     def fly(self, seconds: float) -> None:
@@ -149,7 +150,7 @@ class Flown:
         noise = self.generator.standard_normal(6)
         field = attitude_matrix(self.attitude) @ FIELD + 1e-7 * noise[3:] + self.magnet
         field = field if self.field is None else self.field
-        rate, nothing = self.rate + BIAS + 1e-4 * noise[:3], np.zeros(3)
+        rate, nothing = self.rate + self.bias + 1e-4 * noise[:3], np.zeros(3)
         rate = rate if self.has_gyro else np.full(3, np.nan)
         return ImuReading(self.time_ns, self.time_ns, self.time_ns, IDENTITY, rate, field, nothing)
 
@@ -362,6 +363,31 @@ def test_a_rate_from_streaks_is_used() -> None:
     rate = MeanRateMeasurement(since_ns, until_ns, flown.rate, 1e-10 * np.eye(3))
     flown.filter.measure_late([rate], used.extend)
     assert used == [True]
+
+
+@pytest.mark.parametrize("pulses", [False, True])
+@pytest.mark.parametrize("jump", [1e-4, 3e-4, 1e-3, -2e-3])
+def test_a_jump_of_the_gyro_bias_is_estimated_without_a_wrong_claim(jump: float, pulses: bool) -> None:
+    """After a jump of the gyro bias, attitude, rate and bias stay within their claims.
+
+    The gyro alone cannot show whether the bias or the rate has changed.
+    """
+    flown = acquired(pulses=pulses)
+    for _ in range(6):
+        flown.fly(5.0)
+        assert flown.see(52 * PERIOD_NS)
+    flown.bias = BIAS + np.array([0.0, jump, 0.0])
+    for _ in range(6):
+        for _ in range(5):
+            flown.fly(1.0)
+            found = flown.filter.at(flown.time_ns)
+            error = to_rotation_vector(multiply(found.quaternion, conjugate(flown.attitude)))
+            sigma = np.sqrt(np.diag(found.covariance))
+            assert (np.abs(error) < 5.0 * sigma[ATTITUDE]).all()
+            assert (np.abs(found.rate - flown.rate) < 5.0 * sigma[RATE]).all()
+        flown.see(52 * PERIOD_NS)
+    assert flown.filter.restarts == 0
+    assert found.bias == pytest.approx(flown.bias, abs=1e-4)
 
 
 def test_uncertain_currents_increase_the_uncertainty() -> None:
