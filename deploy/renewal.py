@@ -451,6 +451,16 @@ class Renewal:
         except OSError as error:  # the present step continues, and the next step writes the reports again
             sys.stderr.write(f"renewal: cannot write the status: {error}\n")
 
+    def _store(self, **changes: Any) -> None:
+        """Change and store the state. Raises OSError without a change if no copy can be written."""
+        before = {name: getattr(self._state, name) for name in changes}
+        vars(self._state).update(changes)
+        try:
+            self._save()
+        except OSError:
+            vars(self._state).update(before)
+            raise
+
     def _report(self, request: str, result: str, name: str, text: str) -> None:
         """Add a report for the link, and a line in the journal."""
         number = 1 + (self._state.reports[-1][0] if self._state.reports else 0)
@@ -602,8 +612,8 @@ class Renewal:
             new = board.keep("", staging / "set")
             if new == old:
                 raise Refused(f"this {kind} is in use already")
-        state.trial = Trial(what, kind, version, name, old, new, "install", left_s, despite, before, session)
-        self._save()
+        trial = Trial(what, kind, version, name, old, new, "install", left_s, despite, before, session)
+        self._store(trial=trial)
         self._continue()
 
     def _copy_bundle(self, kind: str, name: str, expected: str, path: Path) -> None:
@@ -651,14 +661,13 @@ class Renewal:
             raise Refused("flight or link is not running: confirm the trial when both run")
         if other := self._other_release(trial):
             raise Refused(f"flight or link run release {other} instead")
-        state.versions[kind] = trial.version
-        if trial.what == "configuration":
-            state.previous = trial.old
-        state.trial = None
+        previous = trial.old if trial.what == "configuration" else state.previous
+        self._store(trial=None, previous=previous, versions={**state.versions, kind: trial.version})
         text = f"{kind} {trial.version} is kept"
         self._report(trial.request, "completed", "activate", text)
         self._report(name, "completed", "confirm", text)
-        self._save()
+        with suppress(OSError):  # the end of the step stores the reports again
+            self._save()
         self._tidy()
 
     def _withdraw(self, name: str, kind: str) -> None:
@@ -823,8 +832,7 @@ class Renewal:
             stored = board.stored(name) if name else None
             if stored is None or hashlib.sha256(stored[CONFIGURATION]).hexdigest() == current:
                 return False
-        state.returning = [what, name, current, request, word, text]
-        self._save()
+        self._store(returning=[what, name, current, request, word, text])
         self._return()
         return True
 

@@ -796,6 +796,31 @@ def test_a_return_that_fails_is_tried_again_and_blocks_no_request(board: Renewed
     assert board.reports(withdrawn)[-1][0] == "completed"
 
 
+@pytest.mark.parametrize("word", ["activate", "confirm", "withdraw"])
+def test_a_request_that_cannot_be_stored_is_reported_as_failed_and_not_executed_later(
+    board: RenewedBoard, word: str
+) -> None:
+    began = activated(board)
+    if word != "confirm":
+        board.request("confirm")
+        board.step()
+    third = board.bundle("configuration", board.changed("third"), 2)
+    request = board.activate(third) if word == "activate" else board.request(word)
+    save, fails = renewal.Renewal._save, iter([False, True])
+
+    def saved(step: Any) -> None:
+        if next(fails, False):
+            raise OSError(28, "No space left on device")
+        save(step)
+
+    with patch.object(renewal.Renewal, "_save", saved):
+        board.step()
+    board.step()
+    assert [result for result, _ in board.reports(request)] == ["failed"]
+    assert board.flown() == "second"
+    assert board.reports(began)[-1][0] == ("started" if word == "confirm" else "completed")
+
+
 def test_a_trial_ends_although_no_stored_configuration_is_intact(board: RenewedBoard) -> None:
     request = activated(board)
     shutil.rmtree(board.own / "kept")
