@@ -8,10 +8,10 @@ therefore added so that the total torque has no component along the field. A tor
 disturbs the pointing of the body axis least. Unless the field is normal to the Sun direction, both axes
 normal to this direction are controlled simultaneously, while the body may roll about the Sun direction. The
 added torque about the direction of the Sun is reduced if the body rolls fast. The direction of the Sun is
-propagated through an eclipse (`PropagatedSun`). If the direction of the Sun is unknown, the rate of the body
-is only damped. The residual dipole moment, which causes the largest torque on a light body, is estimated and
-cancelled (`ResidualDipole`). The coils are off while the field is measured. The coils are driven only after
-the fields measured in two consecutive pauses agree.
+propagated through an eclipse (`PropagatedSun`). If the direction of the Sun is unknown, or if the body is too
+fast, the rotation is only damped. The residual dipole moment, which causes the largest torque on a light
+body, is estimated and cancelled (`ResidualDipole`). The coils are off while the field is measured. The coils
+are driven only after the fields measured in two consecutive pauses agree.
 """
 
 from __future__ import annotations
@@ -153,6 +153,9 @@ FASTEST_ROLL = 0.0105
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
 """Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the pointing
 law demands at most the fraction `SHARE` of the torque that the coils can produce."""
+BRAKING = 4.4e-3
+"""Gain (1/s) of the torque that only damps the rotation, twice the rotation rate of the field in a polar
+orbit. With a higher gain, the momentum aligns with the field and remains (`share_in_rotating_field`)."""
 RESIDUAL = 0.05
 """Largest estimated residual dipole moment, as a fraction of the coils' limit."""
 _FIELD = 3e-5
@@ -265,14 +268,15 @@ class SunAcquisition:
     def _torque(self, field: FloatArray) -> FloatArray:
         """Return the commanded torque (3,) N m, which is normal to the field while the Sun is tracked."""
         seeking, sun, rate = self._seeking, self._sun.direction, self._rate
-        speed = seeking.speed
-        torque: FloatArray = (-2.0 * DAMPING * speed * seeking.inertia) @ rate
+        momentum = seeking.inertia @ rate
         if sun is None:
-            return torque
+            return -BRAKING * momentum
         square, roll = float(rate @ rate), float(rate @ sun)
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
-            return torque
-        torque = torque + (speed**2 * seeking.inertia) @ _rotation_to_sun(seeking.axis, sun)
+            return -BRAKING * momentum
+        speed = seeking.speed
+        torque = (speed**2 * seeking.inertia) @ _rotation_to_sun(seeking.axis, sun)
+        torque -= 2.0 * DAMPING * speed * momentum
         # A torque about the Sun direction cancels the torque along the field.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun

@@ -77,6 +77,14 @@ def test_without_a_sun_the_body_is_damped() -> None:
     assert np.all(np.diff(speed) < 0.02)
 
 
+def test_a_rotation_along_the_field_is_removed_while_the_field_rotates() -> None:
+    """The field rotates by 190 deg; with a higher gain, the momentum follows the field and remains."""
+    along = np.array([1.5e-5, 1e-5, 3e-5])
+    _, speed = fly(None, np.radians(0.8) * along / np.linalg.norm(along), 1500.0)
+    assert speed[-1] < 0.3 * speed[0]
+    assert speed.max() < 1.02 * speed[0]
+
+
 def test_a_sun_that_is_no_longer_measured_is_propagated_by_the_gyro_and_then_forgotten() -> None:
     law, rate = seeker(), np.array([0.0, 0.002, 0.0])
     law.update_sun(0, Z)
