@@ -79,6 +79,7 @@ from knightcube.vision.objects.streak_ends import (
     chord_outward,
     expected_sigma,
     extend,
+    flashes_of_objects,
     measure_streaks,
     near_border,
     pixels_of_region,
@@ -621,6 +622,26 @@ class Judge:
         gained = light.chi_square - found.chi_square
         return SpaceObject(ends, sigma, fired, found.flux, gained, rate, direction, other)
 
+    def joined(self, found: list[SpaceObject]) -> list[SpaceObject]:
+        """Return the objects `found`, with the flashes of a tumbling object as one object."""
+        groups = flashes_of_objects(np.array([one.endpoints for one in found]).reshape(-1, 2, 2))
+        return [self._joined([found[k] for k in group]) for group in groups]
+
+    def _joined(self, flashes: list[SpaceObject]) -> SpaceObject:
+        """Return one object from its `flashes` along a line. Its ends may be dark for as long as a gap."""
+        if len(flashes) == 1:
+            return flashes[0]
+        every = np.array([one.endpoints for one in flashes])
+        line = every[-1].mean(axis=0) - every[0].mean(axis=0)
+        every = np.where(((every[:, 1] - every[:, 0]) @ line < 0.0)[:, None, None], every[:, ::-1], every)
+        gap = float(np.linalg.norm(every[1:, 0] - every[:-1, 1], axis=1).max())
+        ends, sigma = np.array([every[0, 0], every[-1, 1]]), np.full(2, gap / math.sqrt(3.0))
+        both = [(self._among_stars(way), way) for way in (ends, ends[::-1])]
+        (rate, direction), ends = min(both, key=lambda each: each[0][0])
+        flux, gained = (sum(each) for each in zip(*((o.flux, o.improvement) for o in flashes), strict=True))
+        other = max(each[0][0] for each in both)
+        return SpaceObject(ends, sigma, flashes[0].fired, flux, gained, rate, direction, other)
+
     def _located(
         self, ends: FloatArray, light: StarLight, stars: Sequence[FloatArray], improvement: float
     ) -> tuple[LocatedEnds, StarLight, Explanation] | None:
@@ -743,6 +764,7 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
     settled += [label for label, one in zip(every, judged, strict=True) if judge.explained(one, label)]
     found = [one.candidate for one in judged if one.candidate is not None]
     found += judge.merged(settled, strange)
+    found = judge.joined(found)
     verdicts = tuple(one.verdict for one in judged)
     found.sort(key=lambda candidate: -candidate.flux)
     count = len(labels)

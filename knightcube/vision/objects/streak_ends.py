@@ -702,3 +702,40 @@ def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
     midpoint = endpoints.mean(axis=1)
     centre, _, rank, _ = np.linalg.lstsq(chord, np.sum(chord * midpoint, axis=-1), rcond=1e-9)
     return np.asarray(centre) if rank == 2 else np.full(2, np.nan)
+
+
+_ASIDE_PX = 1.0
+"""Largest distance (px) of the ends of flashes from their common line."""
+_LIT = 0.2
+"""Minimum length of all flashes of an object, as a fraction of the length of the line from first to last."""
+
+
+def flashes_of_objects(ends: FloatArray) -> list[list[int]]:
+    """Return the indices of the streaks (n, 2, 2), px, of each object, each list in the order along a line.
+
+    A tumbling object flashes, so that its streak has gaps. Streaks on a common line that do not overlap, and
+    that are long enough compared with the gaps, are flashes of one object.
+    """
+    groups: list[list[int]] = []
+    for index in range(len(ends)):
+        for group in groups:
+            if (joined := _along_one_line(ends, [*group, index])) is not None:
+                group[:] = joined
+                break
+        else:
+            groups.append([index])
+    return groups
+
+
+def _along_one_line(ends: FloatArray, group: list[int]) -> list[int] | None:
+    """Return the indices `group` of streaks (n, 2, 2), px, in their order along a line, or None."""
+    points = ends[group].reshape(-1, 2) - ends[group].reshape(-1, 2).mean(axis=0)
+    along, aside = np.linalg.svd(points, full_matrices=False)[2]
+    places = np.sort((points @ along).reshape(-1, 2), axis=1)
+    order = np.argsort(places[:, 0])
+    first, last = places[order, 0], places[order, 1]
+    lit = float(np.sum(last - first))
+    apart = bool(np.all(first[1:] > last[:-1]))
+    if not apart or lit < _LIT * (last[-1] - first[0]) or np.abs(points @ aside).max() > _ASIDE_PX:
+        return None
+    return [group[k] for k in order]

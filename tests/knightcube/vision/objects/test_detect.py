@@ -367,6 +367,28 @@ def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: f
     np.testing.assert_allclose(found.endpoints, [place, place], atol=0.3)
 
 
+def test_the_flashes_of_a_tumbling_object_are_one_object() -> None:
+    """An object that flashes in three of five parts of its path is reported once, from end to end."""
+    path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 90.0 / _FOCAL, 0.3), _ROTATION)
+    fifth = len(path) // 5
+    flashes = [(path[k * fifth : (k + 1) * fifth], 4.0) for k in (0, 2, 4)]
+    found = detect_objects(
+        frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 6, flashes, _FAINTEST),
+        _FRAME_CAMERA.pinhole,
+        _ROTATION,
+        1.0,
+        ObjectSettings(gain=_SETTINGS.gain, saturation=_SETTINGS.saturation),
+    )
+    assert len(found.objects) == 1
+    ends = found.objects[0].endpoints
+    missed = np.linalg.norm(ends[:, None] - path[[0, 5 * fifth - 1]], axis=2).min(axis=1)
+    assert missed.max() < 1.0
+    gap = 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
+    assert found.objects[0].sigma == pytest.approx(np.full(2, gap / math.sqrt(3.0)), rel=0.15)
+    away = np.arccos(min(1.0, float(found.directions[0] @ _PLACE)))
+    assert away < 3.0 * math.sqrt(0.5 * np.trace(found.covariance[0]))
+
+
 def test_an_object_that_saturates_8_bits_is_found_without_a_stated_saturation() -> None:
     motion = motion_across(_PLACE, 25.0 / _FOCAL, 0.3)
     path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)

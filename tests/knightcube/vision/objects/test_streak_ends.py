@@ -21,6 +21,7 @@ from knightcube.vision.objects.streak_ends import (
     extend,
     find_corners,
     find_regions,
+    flashes_of_objects,
     gaussian_derivative_kernel,
     gaussian_kernel,
     gradient,
@@ -393,3 +394,29 @@ def test_corners_are_the_centres_of_intensity_around_peaks() -> None:
     assert len(find_corners(response, mask, 0.03, 1, response)) == 3
     mask[3, 4] = False
     assert find_corners(response, mask, 0.05, 1, response)[-1] == pytest.approx([9.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    ("spans", "expected"),
+    [
+        ([(40.0, 50.0), (0.0, 10.0), (20.0, 30.0)], [[0, 2, 1]]),
+        ([(0.0, 10.0), (5.0, 15.0)], [[0], [1]]),
+        ([(0.0, 3.0), (60.0, 63.0)], [[0], [1]]),
+        ([(0.0, 0.0), (60.0, 60.0)], [[0], [1]]),
+    ],
+    ids=["flashes", "overlapping", "far apart", "points"],
+)
+@pytest.mark.parametrize("aside", [0.0, 8.0])
+def test_streaks_along_one_line_are_flashes_of_one_object(
+    spans: list[tuple[float, float]], expected: list[list[int]], aside: float
+) -> None:
+    """Flashes are joined if they lie on one line, do not overlap and are not far apart.
+
+    If the streaks are displaced by 8 px from each other, they are different objects.
+    """
+    along, across = np.array([0.8, 0.6]), np.array([-0.6, 0.8])
+    ends = np.array([[x * along + aside * k * across for x in span] for k, span in enumerate(spans)])
+    # The order of a group is that along the line, in either direction.
+    found = [min(group, group[::-1]) for group in flashes_of_objects(ends + 100.0)]
+    assert found == (expected if aside == 0.0 else [[k] for k in range(len(ends))])
+    assert flashes_of_objects(np.zeros((0, 2, 2))) == []
