@@ -51,7 +51,7 @@ class LikelihoodSettings:
             let a score test decide.
         line_time: delay between the exposures of successive rows, s. The line time is positive for a rolling
             shutter and 0 for a global shutter. If the line time is None, it is unknown, and the fit assumes 0
-            with a large uncertainty.
+            with a standard deviation of 30 us. State the line time of a slower shutter.
         threshold_sigmas: threshold of the 3 x 3 sums for bright regions, in standard deviations.
         most_stars: maximum number of bright stars that determine the motion.
         most_neighbours: maximum number of fainter stars that are fitted because they overlap bright stars.
