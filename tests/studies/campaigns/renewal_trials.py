@@ -84,7 +84,7 @@ def run(case: Case) -> Result:
             board.step(seconds)
             ends.services()
             ends.turn(1.5)
-        stays = any("stays" in r.text and r.stage is Stage.COMPLETED for r in ends.reports())
+        kept = any(r.name == "activate" and r.stage is Stage.COMPLETED for r in ends.reports())
         flown = board.flown(), ends.flown_release()
         answers = ends.answers() and all(ends.up.values())
         texts = [report.text for report in ends.reports() if report.name == "activate"]
@@ -97,7 +97,7 @@ def run(case: Case) -> Result:
         "which": which,
         "answers": answers,
         "killed": killed,
-        "stays": stays,
+        "kept": kept,
         "texts": texts,
     }
 
@@ -157,7 +157,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         for result in results
         if result["which"] == "another"
         or not result["answers"]
-        or (result["which"] == "new") != result["stays"]
+        or (result["which"] == "new") != result["kept"]
         or (result["flaw"] not in {"", "reacts"} and result["which"] != "old")
     ]
     which = Counter(f"{result['kind']} {result['flaw'] or 'good'}: {result['which']}" for result in results)

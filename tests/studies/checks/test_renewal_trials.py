@@ -21,7 +21,7 @@ pytestmark = [
 )
 def test_the_old_or_the_new_version_flies_and_the_link_answers(kind: str, flaw: str, which: str) -> None:
     result = run(Case("0", (3, len(flaw)), {"kind": kind, "flaw": flaw, "confirmed": True}))
-    assert (result["which"], result["answers"]) == (which, True), result
+    assert (result["which"], result["answers"], result["kept"]) == (which, True, which == "new"), result
 
 
 def test_every_flaw_of_each_kind_is_tried() -> None:
