@@ -25,6 +25,7 @@ from hal.buses.system import SystemClock
 from hal.drivers.vn100 import Vn100
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import CorruptData, NotResponding, OutputFull
+from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.quaternion import angle_about_axis_y
 from sim_hal.emulators.serial_line import PtyLine
 from tests.hal.vn100.bench_line import MISSION
@@ -45,14 +46,15 @@ def served(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
         yield str(link), process
     finally:
         process.terminate()
-        process.communicate(timeout=5)
+        process.communicate(timeout=60)
     assert not link.is_symlink()
 
 
-def readings_for(seconds: float, driver: Vn100, clock: SystemClock) -> list[ImuReading]:
+def readings_of(count: int, driver: Vn100, clock: SystemClock) -> list[ImuReading]:
+    """Return at least `count` readings, for which a busy machine may need up to a minute."""
     readings: list[ImuReading] = []
-    end_ns = clock.now_ns() + round(seconds * 1e9)
-    while clock.now_ns() < end_ns:
+    end_ns = clock.now_ns() + 60 * SECOND_NS
+    while len(readings) < count and clock.now_ns() < end_ns:
         clock.sleep_until_ns(clock.now_ns() + 5_000_000)
         readings += driver.poll()
     return readings
@@ -64,21 +66,23 @@ def test_the_driver_sets_the_unit_up_and_reads_at_40_hz(served: tuple[str, subpr
     port = PySerialPort(name, 115200, clock)
     driver = Vn100(port, clock, MISSION)
     driver.configure()
-    readings = readings_for(1.5, driver, clock)
+    readings = readings_of(60, driver, clock)
     driver.close()
     driver.close()
     with pytest.raises(NotResponding, match="closed"):
         driver.poll()
-    assert len(readings) == pytest.approx(60, abs=8)
+    assert len(readings) >= 60
     times = np.array([r.device_time_ns for r in readings])
-    assert set(np.diff(times)) == {25_000_000}
+    periods = np.diff(times) / 25_000_000
+    assert np.median(periods) == 1.0
+    assert (periods % 1.0 == 0.0).all()  # a busy machine loses whole messages
     angles = np.array([angle_about_axis_y(r.quaternion) for r in readings])
     slope = np.polyfit(times * 1e-9, angles, 1)[0]
-    # 60 angles with an error of 2 mrad, over 1.5 s, determine the rate to 0.6 mrad/s.
+    # 60 angles with an error of 2 mrad, over at least 1.5 s, determine the rate to 0.6 mrad/s.
     assert slope == pytest.approx(np.radians(3.0), abs=3e-3)
     assert driver.link().discarded_bytes < 200  # end of a message that was cut when the port was opened
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=5) == 0
+    assert process.wait(timeout=60) == 0
 
 
 def test_a_wrong_baud_rate_is_named_as_the_probable_cause(served: tuple[str, subprocess.Popen[str]]) -> None:
