@@ -422,14 +422,14 @@ class StepReplay:
     def _end(self, step: FilterStep) -> None:
         """Apply the mean gyro and magnetometer readings of a step at its end."""
         free, settings, refused = self.free, self._settings, False
+        if step.doubts_gyro:
+            free.widen(_GYRO_BIAS)
         if step.samples:
             since = (step.end_ns - step.gyro_ns) / SECOND_NS
             # A coil that is driven only during a part of the step does not change the rate uniformly.
             change = self._rate_change(step, since, step.impulse - free.impulse(since))
             noise = settings.gyro_noise**2 / step.samples
             spread = COIL_ERROR**2 * float(change @ change) + noise
-            if step.doubts_gyro:
-                free.widen(_GYRO_BIAS)
             refused = not free.gyro(step.gyro, spread * _EYE, change, since)
             tested = states.ALL_NAMES if step.dipole.any() else states.BODY_NAMES
             self._innovation = tested, free.newest_square
