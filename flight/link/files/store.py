@@ -16,6 +16,7 @@ import os
 import re
 import shutil
 import stat
+import weakref
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -109,12 +110,22 @@ def overwrite(path: Path, data: bytes) -> bool:
     return True
 
 
-def make_folder(folder: Path) -> None:
-    """Create a folder with its parents, and sync each new name to disk. Raises OSError."""
-    if not folder.is_dir():
-        make_folder(folder.parent)
-        folder.mkdir(mode=0o700, exist_ok=True)
+def make_folder(folder: Path, mode: int = 0o700) -> None:
+    """Create a folder with this mode and its parents with default rights, and sync each new name to disk.
+
+    Raises OSError.
+    """
+    if folder.is_dir():
+        return
+    if folder.parent != folder:
+        make_folder(folder.parent, 0o777)
+    folder.mkdir(mode, exist_ok=True)
+    try:
         make_lasting(folder.parent)
+    except OSError:  # the next attempt must sync the parent again
+        with suppress(OSError):
+            folder.rmdir()
+        raise
 
 
 def remove_unfinished(folder: Path) -> None:
@@ -242,9 +253,11 @@ class Store:
         try:
             for path in (self._folder, self.received):
                 make_folder(path)
-            self._identity = _identity(self._folder)
+            # The inode number of a folder is constant on each file system only while the folder is open.
+            self._open = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
             raise UsageError(f"{folder}: cannot be made: {error.strerror or error}") from error
+        weakref.finalize(self, os.close, self._open)
         numbers = _read(self._folder / "numbers.json", _Numbers) or _Numbers()
         self.last, self.endings = numbers.last, numbers.endings
 
@@ -296,12 +309,18 @@ class Store:
         return self._path(record).with_suffix(".part")
 
     def place(self, record: Incoming) -> None:
-        """Move a completely received file to its final path. Raises FileError if the file cannot be moved."""
+        """Move a completely received file to its final path, or sync the path if the file was moved before.
+
+        Raises FileError if the file cannot be moved; a further call repeats the failed operation.
+        """
         assert record.name is not None
         target = self.received / record.name
         try:
             make_folder(target.parent)
-            os.replace(self.part(record), target)
+            try:
+                os.replace(self.part(record), target)
+            except FileNotFoundError:
+                target.stat()
             make_lasting(target.parent)
         except OSError as error:
             raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
@@ -332,17 +351,11 @@ class Store:
         A folder that was mounted later belongs to other transfers, whose records must not be replaced.
         """
         try:
-            if _identity(self._folder) != self._identity:
+            if not os.path.samestat(self._folder.stat(), os.fstat(self._open)):
                 raise FileError(f"{self._folder}: another folder is mounted there: restart this program")
         except OSError as error:
             raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
         write_whole(path, to_record(msgspec.json.encode(values)))
-
-
-def _identity(folder: Path) -> tuple[int, int]:
-    """Return device and inode number of a folder. Raises OSError."""
-    found = folder.stat()
-    return found.st_dev, found.st_ino
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -603,6 +603,68 @@ def test_a_new_name_is_synced_to_disk_in_each_folder(tmp_path: Path, monkeypatch
     assert synced == [folder.received, folder.received / "elements"]
 
 
+@pytest.mark.parametrize("failing", ["received", "received/elements"])
+def test_a_file_is_placed_only_if_each_new_name_was_synced_to_disk(
+    tmp_path: Path, failing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, record = Store(tmp_path), Incoming(GROUND, 7, "elements/a", 4)
+    folder.part(record).write_bytes(b"data")
+    synced: list[Path] = []
+
+    def sync(path: Path) -> None:
+        synced.append(path)
+        if path == tmp_path / failing and synced.count(path) == 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(store, "make_lasting", sync)
+    with pytest.raises(FileError, match="Input/output error"):
+        folder.place(record)
+    folder.place(record)
+    assert synced.count(tmp_path / failing) == 2
+    assert (folder.received / "elements" / "a").read_bytes() == b"data"
+    (folder.received / "elements" / "a").unlink()
+    with pytest.raises(FileError, match="No such file"):
+        folder.place(record)
+
+
+def test_only_the_folder_itself_is_closed_to_other_users(tmp_path: Path) -> None:
+    (tmp_path / "usual").mkdir()
+    store.make_folder(tmp_path / "a" / "b")
+    modes = [path.stat().st_mode & 0o777 for path in (tmp_path / "a", tmp_path / "a" / "b")]
+    assert modes == [(tmp_path / "usual").stat().st_mode & 0o777, 0o700]
+
+
+def test_records_are_written_on_a_file_system_without_constant_inode_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On such a file system, a folder that is not open has a new inode number at each access."""
+    place, stat, numbers = tmp_path / "transfers", os.stat, iter(range(1, 1000))
+
+    def renumbered(path: object, **options: bool) -> os.stat_result:
+        found = stat(path, **options)  # type: ignore[arg-type]  # as called
+        if str(path) != str(place) or _opened(place):
+            return found
+        return os.stat_result((found.st_mode, next(numbers), *found[2:]))
+
+    monkeypatch.setattr(os, "stat", renumbered)
+    folder = Store(tmp_path)
+    for number in (1, 2):
+        folder.save(Incoming(GROUND, number))
+    assert len(folder.incoming()) == 2
+    assert _opened(place) == 1
+    del folder
+    assert _opened(place) == 0
+
+
+def _opened(folder: Path) -> int:
+    """Return how many descriptors of this process are open for a folder."""
+    found = 0
+    for number in os.listdir("/proc/self/fd"):
+        with suppress(FileNotFoundError):
+            found += os.readlink(f"/proc/self/fd/{number}") == os.path.realpath(folder)
+    return found
+
+
 def test_a_new_file_is_stored_only_if_its_folder_was_synced_to_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
