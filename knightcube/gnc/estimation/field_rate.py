@@ -66,6 +66,10 @@ _EQUAL = 0.1
 """Normalised square of the difference of two rates below which the less probable estimate is discarded."""
 _CURVATURE = 1.0
 """Correlation time (s) of the gyroscopic acceleration that is of second order in the error of the rate."""
+_NOISE_STEP = 1.05
+"""Factor by which each sample changes the estimated median of the field noise."""
+_NOISIER = 1.2
+"""Least ratio of the estimated to the configured field noise at which the estimate is used."""
 _IMPROBABLE = 25.0
 """Largest difference of two estimates' log-likelihoods at which the less probable estimate is kept."""
 _EYE: FloatArray = np.eye(SIZE)
@@ -78,7 +82,8 @@ class FieldRateSettings:
 
     Attributes:
         inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
-        field_sigma: standard deviation of a field measurement per axis, including constant errors, T.
+        field_sigma: standard deviation of a field measurement per axis, including constant errors, T. If the
+            strength of the field varies more from sample to sample, a larger standard deviation is used.
         rate_start: initial standard deviation of the rate along the field, rad/s.
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
@@ -151,6 +156,7 @@ class FieldRate:
         self._unknown = _Estimate(settings, _NONE, _NONE, np.zeros((SIZE, SIZE)), 0.0)
         self.restarts = self.revisions = 0
         self._is_reset = False  # whether the filter is unchanged since the last reset
+        self._noise = FieldNoise(settings.field_sigma, settings.longest_gap)
         self.restart()
 
     def restart(self) -> None:
@@ -216,6 +222,7 @@ class FieldRate:
         """Propagate the state by `seconds` under a dipole moment (3,) A m^2 of the coils, body axes."""
         self._is_reset = False
         self._since += seconds
+        self._noise.advance(seconds)
         propagated = [estimate.advance(dipole, seconds) for estimate in self._estimates]
         if any(propagated):
             self._set_covariance()
@@ -228,10 +235,11 @@ class FieldRate:
         if not np.all(np.isfinite(field)):
             return False
         self._is_reset = False
+        self._noise.add(math.sqrt(float(field @ field)))
         if not self._estimates:
             self._start(field)
             return True
-        if self._apply(FIELD, self._settings.field_sigma, lambda estimate: estimate.turned(field, age)):
+        if self._apply(FIELD, self._noise.sigma, lambda estimate: estimate.turned(field, age)):
             self._refused = 0
             return True
         self._refused += 1
@@ -339,7 +347,7 @@ class FieldRate:
 
     def _start(self, field: FloatArray) -> None:
         """Add a field sample, and start the filter if the last three samples agree."""
-        settings = self._settings
+        settings, field_sigma = self._settings, self._noise.sigma
         if self._since > settings.longest_gap:
             self._waiting.clear()
         self._waiting.append((self._since, field))
@@ -352,7 +360,7 @@ class FieldRate:
         if min(span_a, span_b) <= 0.0 or square == 0.0:  # a failed sensor may read zero
             return
         strength = math.sqrt(square)
-        noise = settings.gate_sigma * math.sqrt(2.0) * settings.field_sigma
+        noise = settings.gate_sigma * math.sqrt(2.0) * field_sigma
         if max(abs(math.sqrt(float(b @ b)) - strength) for b in (first, middle)) > noise:
             return
         rates = rate_across(first, middle, span_a), rate_across(middle, last, span_b)
@@ -361,14 +369,14 @@ class FieldRate:
             return
         span = span_a + span_b
         rate = 0.5 * (rates[0] + rates[1])
-        across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
+        across = 2.0 * (field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
         # Between the samples, the spin about the field rotates the perpendicular rate component in body axes.
         across += (float(rate @ rate) * span) ** 2
         along = settings.rate_start**2 + float(rate @ rate)
         axis = last / strength
         covariance = np.zeros((SIZE, SIZE))
         covariance[RATE, RATE] = across * np.eye(3) + _SPIN_VARIANCE * along * np.outer(axis, axis)
-        covariance[FIELD, FIELD] = settings.field_sigma**2 * np.eye(3)
+        covariance[FIELD, FIELD] = field_sigma**2 * np.eye(3)
         covariance[CHANGE, CHANGE] = settings.change_start**2 * np.eye(3)
         covariance[INERTIA, INERTIA] = inertia_covariance(np.asarray(settings.inertia), settings.errors)
         for square, probability in _SPINS:
@@ -379,6 +387,45 @@ class FieldRate:
                 )
             )
         self._set_covariance()
+
+
+class FieldNoise:
+    """The noise of the magnetometer, estimated from the strength of the field, which no rotation changes.
+
+    The strength changes slowly, so the second differences of consecutive samples contain only noise. Their
+    median is followed, because outliers hardly affect it.
+    """
+
+    def __init__(self, sigma: float, longest_gap: float) -> None:
+        """Begin with the configured standard deviation `sigma`, T per axis.
+
+        Samples that follow each other within `longest_gap` s are compared.
+        """
+        self._configured, self._longest_gap = sigma, longest_gap
+        self._ratio = 1.0  # ratio of the estimated to the configured noise
+        self._since = 0.0
+        self._strengths: list[float] = []
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of a sample, T per axis."""
+        return self._configured * (self._ratio if self._ratio > _NOISIER else 1.0)
+
+    def advance(self, seconds: float) -> None:
+        """Add `seconds` to the time since the last sample."""
+        self._since += seconds
+
+    def add(self, strength: float) -> None:
+        """Add the strength of a field sample, T."""
+        if self._since > self._longest_gap:
+            self._strengths.clear()
+        self._since = 0.0
+        self._strengths = [*self._strengths[-2:], strength]
+        if len(self._strengths) == 3:
+            first, middle, last = self._strengths
+            median = 0.6745 * math.sqrt(6.0) * self._configured
+            is_larger = abs(first - 2.0 * middle + last) > self._ratio * median
+            self._ratio = max(1.0, self._ratio * (_NOISE_STEP if is_larger else 1.0 / _NOISE_STEP))
 
 
 class _Estimate:

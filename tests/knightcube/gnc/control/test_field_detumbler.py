@@ -87,12 +87,13 @@ def fly(
     late: float = 0.0,
     body: Body | None = None,
     seed: int = 4,
+    noise: float = 1e-7,
 ) -> FloatArray:
     """Return the magnitude (n,), rad/s, of the rate in each cycle.
 
     The field rotates `sooner` times as fast as in orbit. Samples are `late` s older than the last command.
-    The function `gyro` returns the measured rate. If `body` is given, the magnitude is computed from the
-    energy and the mean moment of inertia.
+    The function `gyro` returns the measured rate. The noise of the magnetometer is `noise`, T per axis. If
+    `body` is given, the magnitude is computed from the energy and the mean moment of inertia.
     """
     law, rng = detumbler(body), np.random.default_rng(seed)
     limit, inertia = (LIMIT, INERTIA) if body is None else (body.limit, body.inertia)
@@ -108,7 +109,7 @@ def fly(
             @ FIELD
         )
         past = attitude_matrix(from_rotation_vector(-late * rate)) @ field if late else field
-        sample = past + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
+        sample = past + OWN_FIELD * dipole + noise * rng.standard_normal(3)
         if rng.uniform() < spikes:
             sample = sample + 1e-4 * rng.standard_normal(3)
         law.dipole(now_ns)
@@ -499,6 +500,11 @@ def test_neither_of_two_quantities_grows_and_a_feasible_dipole_is_not_set_to_zer
         assert all(float(left @ one) <= 1e-8 for one in grows)
         idle += not np.cross(left, field).any()
     assert idle < 100
+
+
+def test_a_magnetometer_noisier_than_configured_detumbles_the_body() -> None:
+    speeds = fly(np.array([0.1, -0.05, 0.08]), 360.0, noise=1e-6)
+    assert speeds[-1] < 0.1 * speeds[0]
 
 
 def test_detumbling_by_the_magnetometer_is_as_recorded() -> None:

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, derivative, from_rotation_vector
 from knightcube.gnc.estimation.field_rate import INERTIA as INERTIA_ERROR
-from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings, _stepped
+from knightcube.gnc.estimation.field_rate import RATE, FieldNoise, FieldRate, FieldRateSettings, _stepped
 from tests.support.compiled_forms import assert_forms_agree
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
@@ -142,6 +142,40 @@ def test_one_outlier_is_refused_and_repeated_contradictions_restart_the_filter()
         found.measure(-last[3:])
     assert found.restarts == 1
     assert not found.started
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 4.0])
+def test_the_noise_of_the_magnetometer_is_estimated_despite_outliers(factor: float) -> None:
+    noise, rng = FieldNoise(NOISE, longest_gap=0.2), np.random.default_rng(6)
+    sigmas = []
+    for _ in range(600):
+        noise.advance(0.1)
+        outlier = 1e-5 if rng.uniform() < 0.02 else 0.0
+        noise.add(5e-5 + factor * NOISE * rng.standard_normal() + outlier)
+        sigmas.append(noise.sigma)
+    assert np.mean(sigmas[200:]) == pytest.approx(factor * NOISE, rel=0.2)
+
+
+def test_samples_far_apart_do_not_show_the_noise() -> None:
+    noise = FieldNoise(NOISE, longest_gap=0.2)
+    for strength in (5e-5, 4e-5, 3e-5, 5e-5) * 20:
+        noise.advance(0.3)
+        noise.add(strength)
+    assert noise.sigma == NOISE
+
+
+def test_a_magnetometer_noisier_than_configured_gives_an_honest_rate() -> None:
+    times = np.arange(0.0, 100.0, 0.2)
+    rng, found = np.random.default_rng(2), FieldRate(settings())
+    states = tumbling(np.radians([8.0, 4.0, -5.0]), INERTIA, times, np.zeros(3))
+    restarts = []
+    for state in states:
+        found.advance(np.zeros(3), 0.2)
+        found.measure(state[3:] + 4.0 * NOISE * rng.standard_normal(3))
+        restarts.append(found.restarts)
+    assert restarts[-1] == restarts[len(times) // 3]
+    error = found.rate - states[-1][:3]
+    assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3
 
 
 def test_two_samples_too_far_apart_start_nothing() -> None:
