@@ -361,9 +361,8 @@ class Downlink:
         due: list[bytes] = []
         while self._credit >= self._frame_bytes:
             try:
-                late = next(
-                    filter(None, (one.take() for one in (self._live, self._replay, self._filed))), None
-                )
+                framers = (self._live,) if live_only else (self._live, self._replay, self._filed)
+                late = next(filter(None, (one.take() for one in framers)), None)
                 made = late or self._next_live(now_ns) or ([] if live_only else self._next_in_turn())
             except KnightCubeError:
                 if not due:

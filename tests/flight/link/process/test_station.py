@@ -591,6 +591,24 @@ def test_telemetry_returns_at_the_rate_of_the_line_after_a_time_without_keys() -
     assert sum(made[26:]) >= 4
 
 
+def test_a_playback_frame_that_could_not_be_protected_waits_for_a_listener() -> None:
+    keys: list[str] = []
+
+    def seal(header: bytes, data: bytes) -> bytes:
+        if not keys:
+            raise KnightCubeError("no key")
+        return header + bytes(14) + data + bytes(16)
+
+    downlink = Downlink(1, 128, 1e5, seal, lambda: None)
+    downlink.play(iter([idle_packet(120)]))
+    downlink.frames(0)
+    with pytest.raises(KnightCubeError):
+        downlink.frames(SECOND_NS)
+    keys.append("a key")
+    assert downlink.frames(2 * SECOND_NS, live_only=True) == []
+    assert downlink.frames(3 * SECOND_NS)
+
+
 @pytest.mark.parametrize("damage", [b"", b"\0", b"x" * 40])
 def test_damaged_directives_are_refused_in_words(damage: bytes) -> None:
     good = directives.pack(Play(0, 1.0, 2.0), 5)
