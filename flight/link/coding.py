@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -176,6 +176,8 @@ class Code(Protocol):
 _WRONG_MARKER_BITS = 3
 """Maximum number of wrong bits in a sync marker that is accepted directly after a valid codeblock. At a bit
 error rate of 0.8 %, at which the Reed-Solomon code fails, one of 8,000 markers has more wrong bits."""
+_RECENT_BLOCKS = 256
+"""Number of kept codeblocks, because each line sends the same frames, and frames that no line took again."""
 
 
 class TelemetryCode:
@@ -185,6 +187,7 @@ class TelemetryCode:
         """Encode frames of `frame_bytes` bytes, with `depth` interleaved Reed-Solomon codewords."""
         self._kind = randomiser
         self._code = None if depth is None else ReedSolomon(depth)
+        self._encode = bytes if self._code is None else lru_cache(_RECENT_BLOCKS)(self._code.encode)
         self._unit_bytes = frame_bytes + _PARITY * (depth or 0)
 
     @property
@@ -199,7 +202,7 @@ class TelemetryCode:
 
     def encode(self, frame: bytes) -> bytes:
         """Return the codeblock of a frame, without sync marker."""
-        return randomised(frame if self._code is None else self._code.encode(frame), self._kind)
+        return randomised(self._encode(frame), self._kind)
 
     def decode(self, unit: bytes) -> bytes:
         """Return the frame in a codeblock."""

@@ -12,12 +12,13 @@ from unittest.mock import Mock
 
 import pytest
 
-from flight.link.coding import LinkCodes
+from flight.link.coding import LinkCodes, ReedSolomon
 from flight.link.frames import SYNC, TelecommandHeader, close_frame
 from flight.link.process import station
 from flight.link.process.station import AT_MOST, Line, SerialLine, TcpLine, TncLine, UdpLine
 from hal.buses.linux_wires import PySerialPort
 from hal.buses.system import SystemClock
+from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError
 
 FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")
@@ -223,6 +224,21 @@ def test_lines_report_that_they_are_lost(monkeypatch: pytest.MonkeyPatch) -> Non
     assert udp.send(frames, 0) == 1
     assert udp.send(frames[1:], 0) == 2
     own.close()
+
+
+def test_a_frame_that_is_sent_again_on_several_lines_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    encode = Mock(side_effect=bytes)
+    monkeypatch.setattr(ReedSolomon, "encode", encode)
+    codes, frames = LinkCodes(223, "long", 1), [bytes([n]) * 223 for n in range(90)]
+    udp = UdpLine("127.0.0.1:0", codes=codes)
+    udp.trust(("127.0.0.1", 9), 0)
+    monkeypatch.setattr(udp, "_send", Mock(return_value=False))
+    lost = Mock(send=Mock(side_effect=NotResponding("radio", "the port is lost")))
+    lines = [udp, SerialLine("radio", lost, codes.on_board()), SerialLine("tnc", lost, codes.on_board(True))]
+    for _ in range(50):
+        assert [line.send(frames, 0) for line in lines] == [0, 0, 0]
+    assert encode.call_count == len(frames)
+    udp.close()
 
 
 def test_a_tnc_line_without_a_free_file_descriptor_connects_later(monkeypatch: pytest.MonkeyPatch) -> None:
