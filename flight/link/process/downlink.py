@@ -331,6 +331,16 @@ class Downlink:
         return self._queue.thinned
 
     @property
+    def waiting(self) -> int:
+        """Number of queued reports."""
+        return len(self._urgent)
+
+    @property
+    def frame_s(self) -> float:
+        """Time (s) between two frames at the data rate of the line."""
+        return self._frame_bytes / self._rate
+
+    @property
     def playing(self) -> bool:
         """Whether a playback is running."""
         return self._source is not None

@@ -459,6 +459,11 @@ _UTC_WAIT_NS = 120 * SECOND_NS
 """Longest time (ns) for which scheduled commands wait for the UTC of the flight."""
 _RESERVED_BLOCK = 4096
 _REFUSALS_A_SECOND = 4
+_STALL_NS = 10 * SECOND_NS
+"""Shortest time (ns) after which a line that takes no frame is reported, because a slow line needs seconds
+for a frame."""
+_STATUS_WAITING = 16
+"""Largest number of queued reports at which a status of the link is added."""
 _HIGHEST_REPORTED = 2**63 - 1
 """Largest frame counter and mission time (ns) that fit into a report. Received counters have 96 bits."""
 
@@ -498,8 +503,10 @@ class Transmitter:
     counts the frames that a line did not take, at each attempt.
     """
 
-    def __init__(self, lines: Sequence[Line], downlink: Downlink, now_ns: int) -> None:
-        self._lines, self._downlink, self._taken_ns = lines, downlink, now_ns
+    def __init__(self, lines: Sequence[Line], downlink: Downlink) -> None:
+        self._lines, self._downlink = lines, downlink
+        self._stall_ns = max(_STALL_NS, round(2 * downlink.frame_s * SECOND_NS))
+        self._refused_ns: dict[str, int] = {}  # since when each line that takes no frame refuses all frames
         self._unsent: list[bytes] = []
         self._listened = False  # whether anybody listened to the last frames
         self.untaken = 0
@@ -513,16 +520,17 @@ class Transmitter:
             except KnightCubeError as error:  # commands are accepted, such as a command that sets a new key
                 problem = str(error)
         frames = self._unsent or due
-        taken = [count for line in self._lines if (count := line.send(frames, now_ns)) is not None]
+        counts = {line.name: line.send(frames, now_ns) for line in self._lines}
+        taken = [count for count in counts.values() if count is not None]
         self.untaken += sum(len(frames) - count for count in taken)
         if taken or self._listened:  # otherwise the frames contain live telemetry only
             self._unsent = frames[max(taken, default=0) :]
         self._listened = bool(taken)
-        if not self._unsent or any(taken):
-            self._taken_ns = now_ns
-        elif taken and now_ns - self._taken_ns >= SECOND_NS:
-            return f"no telemetry can be sent on {', '.join(line.name for line in self._lines)}"
-        return problem
+        if frames:
+            refusing = [name for name, count in counts.items() if count == 0]
+            self._refused_ns = {name: self._refused_ns.get(name, now_ns) for name in refusing}
+        stalled = [name for name, at_ns in self._refused_ns.items() if now_ns - at_ns >= self._stall_ns]
+        return problem or (f"no telemetry can be sent on {', '.join(stalled)}" if stalled else "")
 
 
 class Station:
@@ -568,7 +576,7 @@ class Station:
         self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
         self._problem, self._keys_returned = "", False
-        self._transmitter = Transmitter(lines, self._downlink, clock.now_ns())
+        self._transmitter = Transmitter(lines, self._downlink)
         self._unpacked, self._unpacked_text = 0, ""
         self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
@@ -852,7 +860,7 @@ class Station:
             "corrected": self._codes.commands.corrected,
             "untaken": self._transmitter.untaken,
         }
-        if self._problem:  # a state that waits would displace reports of commands
+        if self._downlink.waiting > _STATUS_WAITING:  # a status that waits would displace reports of commands
             return
         self._send(LINK, values)
         for progress in self._filing.status():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -34,9 +34,11 @@ from flight.link.telemetry.definitions import (
 )
 from flight.link.telemetry.log import SegmentStore
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, compile_layouts, crc16
+from flight.schema.sections import LinkCoding
+from ground.link.terminal import TerminalSettings
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError
-from tests.flight.link.process.both_ends import BothEnds
+from tests.flight.link.process.both_ends import BothEnds, Wire
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.flight.link.vaults import frame_with
 
@@ -233,7 +235,7 @@ def test_reports_that_newer_ones_displace_are_counted(tmp_path: Path) -> None:
         for _ in range(300):
             link.terminal.send(b"no packet")
         link.station.turn()
-        assert link.station.unreported == 300 + 2 - 256, "a refusal each, and two states of the link"
+        assert link.station.unreported == 300 + 1 - 256, "a refusal each, and the first state of the link"
 
 
 def test_a_log_that_states_any_time_does_not_end_the_link(link: BothEnds) -> None:
@@ -446,6 +448,52 @@ def test_a_line_that_takes_nothing_is_reported_once_and_loses_no_report(link: Bo
     link.collect()
     assert all("accepted" in link.stages(counter) for counter in counters)
     assert link.station.unreported == 0
+
+
+def test_a_line_that_is_slow_is_not_reported_and_carries_the_status_once_a_second(tmp_path: Path) -> None:
+    """A radio of 960 bytes/s needs 1.3 s for a coded frame of 1115 bytes."""
+    coding, said, turns = LinkCoding(reed_solomon=5), list[str](), iter([False] * 5_000)
+    settings = TerminalSettings(frame_bytes=1115, coding=coding)
+    link = BothEnds(tmp_path, 960.0, settings, codes=settings.codes())
+    output, written = station._Output(), 0
+    board, begun_ns = link.codes.on_board(), link.clock.now_ns()
+
+    def write(data: bytes) -> int:
+        nonlocal written
+        room = 960 * (link.clock.now_ns() - begun_ns) // SECOND_NS - written
+        link.wire.down.append(data[:room])
+        written += min(room, len(data))
+        return min(room, len(data))
+
+    def send(frames: Sequence[bytes], now_ns: int) -> int:
+        return output.send(list(map(board.wrap, frames)), write)
+
+    link.wire.send = send  # type: ignore[method-assign]
+    link.station.run(lambda: next(turns, True), said.append, lambda: None)
+    link.collect()
+    assert said == []
+    assert link.station._transmitter.untaken > 100
+    assert len(link.of("link")) > 90
+    link.close()
+
+
+def test_only_lines_that_take_nothing_are_reported_beside_a_line_that_works(link: BothEnds) -> None:
+    lost, unused, turns, said = Wire(), Wire(), iter([False] * 5_000), list[str]()
+    lost.name, lost.takes, unused.name, unused.listened = "lost", 0, "unused", False
+    sent = timing_packets(300)
+    lines = link.station._lines
+    assert isinstance(lines, list)
+    lines += [lost, unused]
+    link.turn(1.0)
+    link.record(*sent)
+    counter = link.terminal.send(packet(Ping(1)))
+    link.turn(1.0)
+    assert link.stages(counter) == ["accepted", "started", "completed"]
+    assert link.of("cycle_timing") == sent
+    link.station.run(lambda: next(turns, True), said.append, lambda: None)
+    link.collect()
+    assert said == ["no telemetry can be sent on lost"]
+    assert len(link.of("link")) > 90
 
 
 @pytest.mark.parametrize("failures", [1, 3, 10**9])
