@@ -88,6 +88,9 @@ _STRANGERS = 256
 connect per second, a new connection has 1.3 s for its first frame."""
 _PIECE = 1 << 14
 _RECONNECT_NS = 5 * SECOND_NS
+_DEAD_NS = 300 * SECOND_NS
+"""Time (ns) after which a TCP connection that takes no frame is closed. A peer that reads 960 bytes/s takes
+no frame for up to 126 s, because the kernel frees large parts of the buffers at once."""
 
 
 class Line(Protocol):
@@ -225,6 +228,7 @@ class _Connection:
     stream: FrameDecoder
     output: _Output = field(default_factory=_Output)
     trusted: bool = False
+    refused_ns: int | None = None  # since when the connection takes no frame
 
 
 class TcpLine:
@@ -287,7 +291,7 @@ class TcpLine:
             state.trusted = True
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
-        """Send frames to the authenticated connections. A connection misses frames that it does not take."""
+        """Send frames to the authenticated connections, and close those that take none for five minutes."""
         marked, begun = list(map(self._framing.wrap, frames)), list[int]()
         for connection, state in list(self._connections.items()):
             if not state.trusted:
@@ -297,6 +301,10 @@ class TcpLine:
             except OSError:
                 self._drop(connection)
                 begun.append(0)
+            if begun[-1] or state.refused_ns is None:
+                state.refused_ns = None if begun[-1] or not frames else now_ns
+            elif now_ns - state.refused_ns >= _DEAD_NS:
+                self._drop(connection)
         return max(begun, default=None)
 
     def close(self) -> None:

@@ -205,6 +205,25 @@ def test_a_connection_that_does_not_read_delays_no_other_connection() -> None:
     line.close()
 
 
+def test_a_connection_that_takes_nothing_is_closed_and_a_slow_or_unused_one_is_kept() -> None:
+    frame, minute, step = bytes(1 << 14), 60 * 10**9, 10**9
+    with tcp_line() as (line, far):
+        assert line.send([frame], 0) == 1
+        assert line.send([frame], 60 * minute) == 1, "nothing was due for an hour"
+        begin = 60 * minute
+        for _ in range(3):  # the peer reads every four minutes
+            while line.send([frame], begin):
+                pass
+            assert None not in [line.send([frame], begin + n * step) for n in range(240)]
+            begin += 4 * minute
+            while not line.send([frame], begin):
+                os.read(far, 1 << 20)
+        while line.send([frame], begin):
+            pass
+        taken = [line.send([frame] * (n % 2), begin + n * step) for n in range(600)]
+        assert taken.index(None) > 300, "times without due frames neither shorten nor extend the limit"
+
+
 def test_lines_report_that_they_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [b"one", b"two", b"three"]
     with serial_line() as (serial, _), tcp_line() as (tcp, _):
