@@ -402,6 +402,7 @@ class FileSession:
 
         Raises KnightCubeError if a packet cannot be sent. The next call sends this packet again.
         """
+        self.entity.work(now_ns)
         self.entity.keep(now_ns)
         if self._asked is not None and now_ns >= self._asked[1]:
             self._send(self._asked[0], now_ns)

@@ -18,7 +18,8 @@ import shutil
 import stat
 import weakref
 import zlib
-from collections.abc import Iterator
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -176,6 +177,69 @@ class FileError(KnightCubeError):
     """Raised if a file operation or transfer is not possible. The error text states the reason."""
 
 
+class Ranges:
+    """Set of byte offsets in a file, stored as sorted, disjoint, half-open ranges."""
+
+    def __init__(self, pairs: Iterable[tuple[int, int]] = ()) -> None:
+        self._begins: list[int] = []
+        self._ends: list[int] = []
+        for begin, end in pairs:
+            self.add(begin, end)
+
+    def __bool__(self) -> bool:
+        return bool(self._begins)
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Byte ranges (begin, end) in ascending order."""
+        return list(zip(self._begins, self._ends, strict=True))
+
+    @property
+    def total(self) -> int:
+        """Total number of bytes in all ranges."""
+        return sum(self._ends) - sum(self._begins)
+
+    def cover(self, size: int) -> bool:
+        """Return whether the set contains all byte offsets below `size`."""
+        return size == 0 or (bool(self._begins) and self._begins[0] == 0 and self._ends[0] >= size)
+
+    @property
+    def end(self) -> int:
+        """End of the last byte range, 0 for an empty set."""
+        return self._ends[-1] if self._ends else 0
+
+    def add(self, begin: int, end: int) -> None:
+        """Add a byte range and merge it with overlapping or adjacent ranges."""
+        if begin >= end:
+            return
+        first = bisect_left(self._ends, begin)
+        last = bisect_right(self._begins, end)
+        if first < last:
+            begin, end = min(begin, self._begins[first]), max(end, self._ends[last - 1])
+        self._begins[first:last], self._ends[first:last] = [begin], [end]
+
+    def take(self, most: int) -> tuple[int, int]:
+        """Remove and return at most `most` bytes of the first range. Raises IndexError for an empty set."""
+        begin, end = self._begins[0], min(self._ends[0], self._begins[0] + most)
+        self._begins[0] = end
+        if end == self._ends[0]:
+            del self._begins[0], self._ends[0]
+        return begin, end
+
+    def gaps(self, begin: int, size: int, most: int) -> list[tuple[int, int]]:
+        """Return the first `most` byte ranges between `begin` and `size` that are missing from the set."""
+        found: list[tuple[int, int]] = []
+        index = bisect_right(self._ends, begin)
+        while begin < size and len(found) < most:
+            known = index < len(self._begins)
+            end = min(self._begins[index], size) if known else size
+            if begin < end:
+                found.append((begin, end))
+            begin = self._ends[index] if known else size
+            index += 1
+        return found
+
+
 class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of an outgoing transfer of file `path`, sent as `name`; `origin` identifies the command."""
 
@@ -307,6 +371,18 @@ class Store:
     def part(self, record: Incoming) -> Path:
         """Return the path of the data of an incomplete incoming file."""
         return self._path(record).with_suffix(".part")
+
+    def has_file(self, record: Incoming) -> bool:
+        """Return whether the file of a complete transfer is on the disk, or may be on a disk that fails."""
+        for path in (self.part(record), self.received / str(record.name)):
+            try:
+                path.stat()
+            except FileNotFoundError:
+                continue
+            except OSError:
+                return True
+            return True
+        return False
 
     def place(self, record: Incoming) -> None:
         """Move a completely received file to its final path, or sync the path if the file was moved before.

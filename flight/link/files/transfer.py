@@ -5,7 +5,8 @@ the process is killed, at most one second of data is requested again. Each EOF i
 repeated EOFs.
 
 A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next
-protocol data unit (PDU) whenever one can be sent. Replies are sent first, followed by PDUs of the open
+protocol data unit (PDU) whenever one can be sent, and regularly lets the entity check and store complete
+files. Replies are sent first, followed by PDUs of the open
 transfers in round-robin order. No method of an entity waits, and the caller states the current time. State
 that must survive a restart of the process is stored on disk (`flight.link.files.store`).
 """
@@ -15,9 +16,8 @@ from __future__ import annotations
 import errno
 import os
 import zlib
-from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 from fastcrc import crc32
 
-from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Store, problem_of_name
+from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Ranges, Store, problem_of_name
 from flight.link.files.units import (
     FILE_DATA_OVERHEAD,
     LONGEST_UNIT,
@@ -91,69 +91,6 @@ def add(kind: int, value: int, data: bytes) -> int:
         return crc32.iscsi(data, value)
     words = np.frombuffer(data + bytes(-len(data) % 4), dtype=">u4")
     return (value + int(words.sum(dtype=np.uint64))) % (1 << 32)
-
-
-class Ranges:
-    """Set of byte offsets in a file, stored as sorted, disjoint, half-open ranges."""
-
-    def __init__(self, pairs: Iterable[tuple[int, int]] = ()) -> None:
-        self._begins: list[int] = []
-        self._ends: list[int] = []
-        for begin, end in pairs:
-            self.add(begin, end)
-
-    def __bool__(self) -> bool:
-        return bool(self._begins)
-
-    @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Byte ranges (begin, end) in ascending order."""
-        return list(zip(self._begins, self._ends, strict=True))
-
-    @property
-    def total(self) -> int:
-        """Total number of bytes in all ranges."""
-        return sum(self._ends) - sum(self._begins)
-
-    def cover(self, size: int) -> bool:
-        """Return whether the set contains all byte offsets below `size`."""
-        return size == 0 or (bool(self._begins) and self._begins[0] == 0 and self._ends[0] >= size)
-
-    @property
-    def end(self) -> int:
-        """End of the last byte range, 0 for an empty set."""
-        return self._ends[-1] if self._ends else 0
-
-    def add(self, begin: int, end: int) -> None:
-        """Add a byte range and merge it with overlapping or adjacent ranges."""
-        if begin >= end:
-            return
-        first = bisect_left(self._ends, begin)
-        last = bisect_right(self._begins, end)
-        if first < last:
-            begin, end = min(begin, self._begins[first]), max(end, self._ends[last - 1])
-        self._begins[first:last], self._ends[first:last] = [begin], [end]
-
-    def take(self, most: int) -> tuple[int, int]:
-        """Remove and return at most `most` bytes of the first range. Raises IndexError for an empty set."""
-        begin, end = self._begins[0], min(self._ends[0], self._begins[0] + most)
-        self._begins[0] = end
-        if end == self._ends[0]:
-            del self._begins[0], self._ends[0]
-        return begin, end
-
-    def gaps(self, begin: int, size: int, most: int) -> list[tuple[int, int]]:
-        """Return the first `most` byte ranges between `begin` and `size` that are missing from the set."""
-        found: list[tuple[int, int]] = []
-        index = bisect_right(self._ends, begin)
-        while begin < size and len(found) < most:
-            known = index < len(self._begins)
-            end = min(self._begins[index], size) if known else size
-            if begin < end:
-                found.append((begin, end))
-            begin = self._ends[index] if known else size
-            index += 1
-        return found
 
 
 _SOON = 4
@@ -259,7 +196,7 @@ class Sender:
         self._stopped: Condition | None = None
         self._sum_of_sent = 0  # checksum of the transmitted data of a cancelled transfer
         self._timer = Timer(ASK_NS, now_ns)
-        self._disk = DiskTimer(now_ns)
+        self._data_disk, self._sum_disk = DiskTimer(now_ns), DiskTimer(now_ns)
 
     @property
     def sent(self) -> int:
@@ -315,7 +252,7 @@ class Sender:
             name = self.record.name
             return Metadata(self.record.size, name, name, self.record.kind)
         if self._wanted:
-            return None if self._disk.waits(now_ns) else self._segment(now_ns)
+            return None if self._data_disk.waits(now_ns) else self._segment(now_ns)
         if not self._end_due and self._timer.due(now_ns):
             self._end_due = True
         if self._end_due and self._sum is None:
@@ -335,12 +272,12 @@ class Sender:
                 file.seek(begin)
                 data = file.read(end - begin)
         except OSError as error:
-            if not self._disk.failed(error, now_ns):
+            if not self._data_disk.failed(error, now_ns):
                 self._wanted.add(begin, end)
                 return None
             data, reason = b"", error.strerror or str(error)
         else:
-            self._disk.reset(now_ns)
+            self._data_disk.reset(now_ns)
             reason = "it has become shorter"
         if len(data) < end - begin:
             self.cancel(Condition.FILESTORE_REJECTION, f"{self.record.name}: {reason}")
@@ -349,11 +286,11 @@ class Sender:
         return FileData(begin, data)
 
     def _continue_checksum(self, now_ns: int) -> None:
-        if self._sum is None or (self._stopped is None and self._disk.waits(now_ns)):
+        if self._sum is None or (self._stopped is None and self._sum_disk.waits(now_ns)):
             return
         try:
             value = self._sum.step()
-            self._disk.reset(now_ns)
+            self._sum_disk.reset(now_ns)
             if value is None:
                 return
             self._sum = None
@@ -365,7 +302,7 @@ class Sender:
                 self._save(self.record)
         except OSError as error:
             if self._stopped is None:
-                if not self._disk.failed(error, now_ns):
+                if not self._sum_disk.failed(error, now_ns):
                     return
                 self.cancel(Condition.FILESTORE_REJECTION, str(error))
             self._sum = None  # the transmitted data can no longer be read
@@ -402,6 +339,7 @@ class Receiver:
         record: state of the transfer, which `keep` writes to disk.
         closed: whether the sender has acknowledged the end of the transfer or no longer answers.
         said: text about the end of the transfer.
+        unplaced: whether the complete file has not been moved to its final path yet.
     """
 
     def __init__(
@@ -425,13 +363,12 @@ class Receiver:
         self._requested_to: int | None = None  # offset up to which gaps are requested in the current round
         self._sum: FileSum | None = None
         self._finish = Timer(FINISHED_NS, now_ns - FINISHED_NS)
-        self._disk = DiskTimer(now_ns)
-        self._unplaced = False  # whether the received file has not been moved to its final path yet
+        self._data_disk, self._disk = DiskTimer(now_ns), DiskTimer(now_ns)  # of the data, and of the end
+        self.unplaced = False
         # A transfer that continues after a restart requests its missing ranges at once.
         age_ns = SILENT_NS if record.name is not None else 0
         self._lack, self._silence = (Timer(period, now_ns - age_ns) for period in (LACK_NS, SILENT_NS))
-        # A damaged file must not keep the link from starting.
-        if record.finished is not None and record.finished[1] and os.path.exists(store.part(record)):
+        if record.finished is not None and record.finished[1] and store.has_file(record):
             self._place(now_ns)
 
     @property
@@ -452,7 +389,7 @@ class Receiver:
                 self._store_segment(offset, data, now_ns)
             case Eof():
                 return self._end(content, now_ns)
-            case Ack(code=Code.FINISHED) if self.record.finished is not None:
+            case Ack(code=Code.FINISHED) if self.record.finished is not None and not self.unplaced:
                 self.closed = True
             case _:
                 pass
@@ -460,13 +397,9 @@ class Receiver:
 
     def next(self, now_ns: int) -> Content | None:
         """Return the content of the next PDU to send, or None if no PDU is due."""
-        if self.record.finished is not None and not self._unplaced:
+        if self.record.finished is not None and not self.unplaced:
             return self._next_finished(now_ns)
-        if self._unplaced or self._is_complete():
-            if not self._disk.waits(now_ns):
-                (self._place if self._unplaced else self._continue_check)(now_ns)
-            return None
-        if self.record.suspended:
+        if self.unplaced or self._is_complete() or self.record.suspended:
             return None
         timer = self._lack if self.record.end is not None else self._silence
         if self._requested_to is None and timer.due(now_ns):
@@ -474,16 +407,25 @@ class Receiver:
             self._requested_to = 0
         return None if self._requested_to is None else self._next_request(self._requested_to)
 
+    def work(self, now_ns: int) -> bool:
+        """Execute one step of the check or storage of a complete file. Return whether a step was due."""
+        due = self.unplaced or (self.record.finished is None and self._is_complete())
+        if not due or self._disk.waits(now_ns):
+            return False
+        (self._place if self.unplaced else self._continue_check)(now_ns)
+        return True
+
     def suspend(self, suspended: bool) -> None:
         """Suspend or resume the requests for missing data. Raises FileError if the disk cannot be written."""
         self.record = msgspec.structs.replace(self.record, suspended=suspended)
         self._dirty = True
-        self.keep()
+        self._store.save(self.record)
 
-    def keep(self) -> None:
+    def keep(self, now_ns: int) -> None:
         """Sync the received data to disk, and then store the record of received ranges.
 
-        Raises FileError if data or record cannot be stored. Data that were not synced are requested again.
+        Raises FileError if data or record cannot be stored. Data that were not synced are requested again. A
+        sync without new ranges does not end a failure, because the kernel reports a failed write only once.
         """
         if not self._dirty:
             return
@@ -492,25 +434,35 @@ class Receiver:
                 os.fdatasync(self._file)
         except OSError as error:  # the kernel may have discarded all data since the last sync
             self._ranges = Ranges(self.record.ranges)
-            if self._disk.failed(error, self.received_ns):
+            if self._data_disk.failed(error, now_ns):
                 self.stop(Condition.FILESTORE_REJECTION, error.strerror or str(error))
             raise FileError(f"{self.record.name}: cannot be stored: {error.strerror}") from error
-        self._disk.times = 0
-        self.record = msgspec.structs.replace(self.record, ranges=tuple(self._ranges.pairs))
+        ranges = tuple(self._ranges.pairs)
+        if ranges != self.record.ranges:
+            self._data_disk.reset(now_ns)
+        self.record = msgspec.structs.replace(self.record, ranges=ranges)
         self._store.save(self.record)
         self._dirty = False
 
     def close(self) -> None:
         """Close the file."""
-        if self._file >= 0:
-            os.close(self._file)
-        self._file = -1
+        file, self._file = self._file, -1
+        if file >= 0:
+            with suppress(OSError):  # the data have been synced, or are requested again
+                os.close(file)
 
     def stop(self, condition: int, why: str) -> None:
         """End the transfer and reject further data. A transfer that has ended keeps its result."""
         if self.record.finished is None:
             kept = FileStatus.REJECTED if condition == Condition.FILESTORE_REJECTION else FileStatus.DISCARDED
             self._conclude(condition, complete=False, kept=kept, why=why)
+
+    def give_up(self, why: str) -> None:
+        """Close the transfer. A complete file that has not been moved to its final path is rejected."""
+        if self.unplaced:
+            self._reject(why)
+        self.stop(Condition.CANCELLED, why)
+        self.closed = True
 
     def _begin(self, metadata: Metadata) -> None:
         # If the disk fails here, nothing is recorded, and the metadata are requested again.
@@ -537,6 +489,8 @@ class Receiver:
             if self.record.name is not None:
                 self.stop(Condition.SIZE_ERROR, f"received data beyond the {known} bytes of the file")
             return
+        if self._is_complete():  # a failure must not damage data that are checked
+            return
         try:
             if self._file < 0:
                 path = self._store.part(self.record)
@@ -544,7 +498,7 @@ class Receiver:
             if os.pwrite(self._file, data, offset) != len(data):
                 return
         except OSError as error:
-            if self._disk.failed(error, now_ns):
+            if self._data_disk.failed(error, now_ns):
                 self.stop(Condition.FILESTORE_REJECTION, error.strerror or str(error))
             return
         self._ranges.add(offset, end)
@@ -586,9 +540,8 @@ class Receiver:
             return
         try:
             if self._sum is None:
-                self.keep()
-                with suppress(OSError):
-                    self._store.part(self.record).touch(0o600)
+                self.keep(now_ns)
+                self._store.part(self.record).touch(0o600)
                 self._sum = FileSum(self._store.part(self.record), self.record.kind, size)
             value = self._sum.step()
         except (FileError, OSError) as error:
@@ -609,18 +562,22 @@ class Receiver:
 
     def _place(self, now_ns: int) -> None:
         """Move the received file to its final path, or try again later after a failed access to the disk."""
-        self._unplaced = True
+        self.unplaced = True
         try:
-            self.keep()  # the record is stored first, so that a restart can move the file
+            self.keep(now_ns)  # the record is stored first, so that a restart can move the file
             self.close()
             self._store.place(self.record)
-            self._unplaced = False
+            self.unplaced = False
         except FileError as error:
             if not self._disk.failed(error.__cause__, now_ns):
                 return
-            self._unplaced = False
-            condition, kept = Condition.FILESTORE_REJECTION, FileStatus.REJECTED
-            self._conclude(condition, complete=False, kept=kept, why=str(error))
+            self._reject(str(error))
+
+    def _reject(self, why: str) -> None:
+        """End the transfer of a complete file that cannot be moved to its final path."""
+        self.unplaced = False
+        condition, kept = Condition.FILESTORE_REJECTION, FileStatus.REJECTED
+        self._conclude(condition, complete=False, kept=kept, why=why)
 
     def _next_finished(self, now_ns: int) -> Content | None:
         if not self._finish.due(now_ns):
@@ -767,7 +724,7 @@ class Entity:
         self._clear()
 
     def unit(self, now_ns: int) -> bytes | None:
-        """Return the next PDU to send, or None if no PDU is due. Raises FileError if the disk fails."""
+        """Return the next PDU to send, or None if no PDU is due."""
         if self._replies:
             return self._replies.popleft()
         sides: list[Sender | Receiver] = [*self._out.values(), *self._in.values()]
@@ -776,11 +733,16 @@ class Entity:
             side = sides[self._turn]
             content = side.next(now_ns)
             if content is not None:
-                found = pack(self._transaction(side), content)
-                self._clear()
-                return found
-        self._clear()
+                return pack(self._transaction(side), content)
         return None
+
+    def work(self, now_ns: int) -> None:
+        """Execute one step of the check or storage of a received file, and close ended transfers.
+
+        The method must be called regularly, also while no PDU can be sent.
+        """
+        any(receiver.work(now_ns) for receiver in self._in.values())
+        self._clear()
 
     def keep(self, now_ns: int, *, at_once: bool = False) -> None:
         """Store received data durably, once a second or `at_once`. Raises FileError if the disk fails."""
@@ -788,7 +750,7 @@ class Entity:
             self._kept_ns = now_ns
             with ExitStack() as stack:  # stores each transfer, also if another transfer cannot be stored
                 for receiver in self._in.values():
-                    stack.callback(receiver.keep)
+                    stack.callback(receiver.keep, now_ns)
 
     def close(self, now_ns: int) -> None:
         """Store received data durably and close the files. Raises FileError if the disk fails."""
@@ -828,11 +790,13 @@ class Entity:
         return receiver.take(content, now_ns)
 
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
-        """Open an incoming transfer; if too many are open, end the least recently active transfer."""
+        """Open an incoming transfer; if too many are open, end the least recently active transfer.
+
+        A complete file that waits for its storage is ended only if all open transfers wait.
+        """
         if len(self._in) >= MOST_OPEN:
-            oldest = min(self._in.values(), key=lambda receiver: receiver.received_ns)
-            oldest.stop(Condition.CANCELLED, "given up for a newer one")
-            oldest.closed = True
+            oldest = min(self._in.values(), key=lambda one: (one.unplaced, one.received_ns))
+            oldest.give_up("given up for a newer one")
             self._clear()
         found = self._in[record.source, record.number] = self._receiver(record, now_ns)
         return found

@@ -110,16 +110,13 @@ class Filing:
 
     def packet(self, now_ns: int, time_ns: int) -> bytes | None:
         """Return the next packet for the ground at mission time `time_ns` (ns), None if no packet is due."""
-        try:
-            unit = self._entity.unit(now_ns)
-        except (FileError, OSError) as error:
-            self._problem = str(error)
-            return None
+        unit = self._entity.unit(now_ns)
         return None if unit is None else self._units.pack(unit, time_ns)
 
     def turn(self, now_ns: int) -> list[Report]:
         """Execute one step of each long operation and return the reports of finished operations."""
         try:
+            self._entity.work(now_ns)
             self._entity.keep(now_ns)
             self._problem = ""
         except (FileError, OSError) as error:

@@ -125,6 +125,7 @@ def test_units_damaged_on_the_way_make_no_other_file(
     old: list[bytes] = []
     for turn in range(TURNS):
         for number, to in other.items():
+            ends[number].work(turn * TURN_NS)
             for _ in range(8):
                 unit = ends[number].unit(turn * TURN_NS)
                 if unit is None:

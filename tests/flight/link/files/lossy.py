@@ -57,6 +57,7 @@ class Pair:
                 self.carried += 1
                 if self.draw.random() >= self.loss:
                     self.ends[other].take(unit, self.now_ns)
+            self.ends[number].work(self.now_ns)
             with suppress(FileError):  # `flight.link.process.filing` reports this error
                 self.ends[number].keep(self.now_ns)
         for number, end in self.ends.items():

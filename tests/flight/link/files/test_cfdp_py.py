@@ -124,6 +124,7 @@ class Ends:
         until = self.now_ns + round(seconds * 1e9)
         while self.now_ns < until:
             self.now_ns += round(STEP_S * 1e9)
+            self.ours.work(self.now_ns)
             self.ours.keep(self.now_ns)
             for _ in range(8):
                 if (unit := self.ours.unit(self.now_ns)) is not None and self._arrives():

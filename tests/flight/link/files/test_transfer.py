@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import zlib
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from flight.link.files import store
-from flight.link.files.store import FileError, Incoming, Outgoing, Store, problem_of_name
+from flight.link.files.store import FileError, Incoming, Outgoing, Ranges, Store, problem_of_name
 from flight.link.files.transfer import (
     CRC32,
     CRC32C,
@@ -24,11 +25,13 @@ from flight.link.files.transfer import (
     NO_CHECKSUM,
     SATELLITE,
     Entity,
-    Ranges,
+    Origin,
     add,
 )
 from flight.link.files.units import (
     MOST_REQUESTS,
+    Ack,
+    Code,
     Condition,
     Eof,
     FileData,
@@ -217,7 +220,8 @@ def test_bytes_beyond_the_end_that_came_before_the_metadata_are_left_out_of_the_
     checksum = zlib.crc32(b"abc")
     for unit in (FileData(0, b"abcdef"), Eof(0, checksum, 3), Metadata(3, "a", "a", CRC32)):
         end.take(pack(transaction, unit), 0)
-    answers = [unpack(answer)[1] for answer in (end.unit(0) for _ in range(4)) if answer is not None]
+    end.work(0)
+    answers = [unpack(answer)[1] for answer in iter(lambda: end.unit(0), None)]
     assert [one.condition for one in answers if isinstance(one, Finished)] == [6]
     assert not (tmp_path / str(SATELLITE) / "received" / "a").exists()
 
@@ -453,8 +457,8 @@ def test_a_file_that_was_received_whole_is_not_reported_as_cancelled(tmp_path: P
     end.take(pack(transaction, Metadata(4, "a", "a", CRC32)), 0)
     end.take(pack(transaction, FileData(0, data)), 0)
     end.take(pack(transaction, Eof(0, zlib.crc32(data), 4)), 0)
-    while end.unit(0) is not None or end.transfers()[0].condition is None:
-        pass
+    while end.transfers()[0].condition is None:
+        end.work(0)
     assert pair.received(SATELLITE, "a") == data
     if displaced:
         for number in range(10, 10 + MOST_OPEN):
@@ -522,6 +526,7 @@ class FailingDisk:
 
     def __init__(self, failures: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.left = dict.fromkeys(("read", "write", "move", "sync"), failures)
+        self.unsynced: list[tuple[int, int]] = []  # offset and length of each write since the last sync
         opened, pwrite, replace = Path.open, os.pwrite, os.replace
 
         def open_(path: Path, mode: str = "r") -> Any:
@@ -530,6 +535,7 @@ class FailingDisk:
 
         def write(file: int, data: bytes, offset: int) -> int:
             self.access("write", offset > SIZE // 2)
+            self.unsynced.append((offset, len(data)))
             return pwrite(file, data, offset)
 
         def move(one: Path, other: Path) -> None:
@@ -537,10 +543,12 @@ class FailingDisk:
             replace(one, other)
 
         def sync(file: int) -> None:
-            try:
-                self.access("sync", True)
+            writes, self.unsynced = self.unsynced, []
+            try:  # the kernel reports a failed write only once
+                self.access("sync", any(offset > SIZE // 2 for offset, _ in writes))
             except OSError:
-                pwrite(file, bytes(SIZE), 0)  # the kernel discards data that it could not write
+                for offset, length in writes:  # the kernel discards data that it could not write
+                    pwrite(file, bytes(length), offset)
                 raise
 
         monkeypatch.setattr(os, "fdatasync", sync)
@@ -576,6 +584,187 @@ def test_a_failed_access_to_the_disk_is_repeated_for_half_a_minute_before_the_tr
     attempts = failures - disk.left[access]
     assert attempts < 30 or access in {"write", "sync"}, "each attempt is followed by a pause"
     assert not pair.store(other).incoming()
+
+
+@pytest.mark.parametrize("lasting", [True, False])
+def test_failed_syncs_are_counted_until_new_data_are_kept(
+    tmp_path: Path, lasting: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel reports a failed write once, so that the next sync without new data succeeds."""
+    end, transaction = Entity(SATELLITE, Store(tmp_path), lambda _: "", SIZE, 0), Transaction(2, 1, SATELLITE)
+    disk = FailingDisk(0, monkeypatch)
+    end.take(pack(transaction, Metadata(SIZE, "a", "a", CRC32)), 0)
+    for attempt in range(60):
+        disk.left["sync"] = int(lasting or attempt % 2 == 0)
+        offset = SIZE - 1 - (0 if lasting else attempt // 2)
+        end.take(pack(transaction, FileData(offset, b"x")), 3 * attempt * 10**9)
+        for second in (1, 2):
+            with suppress(FileError):
+                end.keep((3 * attempt + second) * 10**9)
+    (progress,) = end.transfers()
+    expected = (Condition.FILESTORE_REJECTION, 0) if lasting else (None, 30)
+    assert (progress.condition, progress.done) == expected
+
+
+class _WithoutSegments(io.BufferedReader):
+    """A file that can be read only in long portions."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is not None and size < 1000:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().read(size)
+
+
+def test_data_that_cannot_be_read_end_the_transfer_although_its_checksum_can_be_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "long"
+    with path.open("wb") as file:
+        file.truncate(64 << 20)
+    end = Entity(SATELLITE, Store(tmp_path / "files"), lambda _: "", SIZE, 0)
+    end.send(path, "long", GROUND, CRC32, 0, 0, Origin())
+    monkeypatch.setattr(Path, "open", lambda path, _: _WithoutSegments(io.FileIO(path)))
+    seconds, sent = 0, list[Any]()
+    while not any(isinstance(content, Eof) for content in sent):
+        seconds += 1
+        unit = end.unit(seconds * 10**9)
+        sent += [] if unit is None else [unpack(unit)[1]]
+    assert sent[-1] == Eof(Condition.FILESTORE_REJECTION, 0, 0)
+    assert 25 < seconds < 60
+
+
+def _give(end: Entity, number: int, name: str, now_ns: int = 0) -> None:
+    """Give an end all PDUs of a short file."""
+    for content in (Metadata(4, name, name, CRC32), FileData(0, b"data"), Eof(0, zlib.crc32(b"data"), 4)):
+        end.take(pack(Transaction(GROUND, number, SATELLITE), content), now_ns)
+
+
+def _contents(end: Entity, now_ns: int) -> list[Any]:
+    """Return the contents of all PDUs that an end sends."""
+    return [unpack(unit)[1] for unit in iter(lambda: end.unit(now_ns), None)]
+
+
+def test_a_record_that_can_never_be_stored_ends_its_transfer_after_half_a_minute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Store(tmp_path)
+    end = Entity(SATELLITE, folder, lambda _: "", SIZE, 0)
+
+    def fail(record: Outgoing | Incoming) -> None:
+        raise FileError("input/output error") from OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(folder, "save", fail)
+    _give(end, 1, "a")
+    seconds = 0
+    while end.transfers()[0].condition is None:
+        seconds += 1
+        end.work(seconds * 10**9)
+    assert end.transfers()[0].condition == Condition.FILESTORE_REJECTION
+    assert 25 < seconds < 60
+
+
+def test_a_failed_sync_of_a_complete_file_is_counted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end = Entity(SATELLITE, Store(tmp_path), lambda _: "", SIZE, 0)
+    disk = FailingDisk(0, monkeypatch)
+    attempts = 0
+
+    def sync(_: int) -> None:
+        nonlocal attempts
+        attempts += 1
+        disk.left["sync"] = 1
+        disk.access("sync", True)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    for minute in range(10):
+        _give(end, 1, "a", minute * 60 * 10**9)
+        end.work((minute * 60 + 50) * 10**9)
+    assert end.transfers()[0].condition == Condition.FILESTORE_REJECTION
+    assert attempts == 7
+
+
+@pytest.mark.parametrize("waiting", [MOST_OPEN - 1, MOST_OPEN])
+def test_a_complete_file_that_waits_for_its_storage_is_not_deleted_as_received(
+    tmp_path: Path, waiting: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end = Entity(SATELLITE, Store(tmp_path), lambda _: "", SIZE, 0)
+    with monkeypatch.context() as failing:
+        disk = FailingDisk(0, failing)
+        disk.left["move"] = 100
+        for number in range(1, MOST_OPEN + 1):
+            name, transaction = f"f{number}", Transaction(GROUND, number, SATELLITE)
+            end.take(pack(transaction, Metadata(4, name, name, CRC32)), number)
+            if number <= waiting:
+                _give(end, number, name, number)
+        for _ in range(4 * MOST_OPEN):
+            end.work(MOST_OPEN)
+        assert [one.condition for one in end.transfers()].count(0) == waiting
+        _give(end, 9, "f9", MOST_OPEN)
+    (ended,) = end.ended
+    if waiting == MOST_OPEN:
+        assert (ended.number, ended.condition) == (1, Condition.FILESTORE_REJECTION)
+    else:
+        assert (ended.number, ended.condition) == (MOST_OPEN, Condition.CANCELLED)
+    for second in range(60):
+        end.work(second * 10**9)
+    names = {path.name for path in (tmp_path / "received").iterdir()}
+    assert names == {f"f{number}" for number in range(1, 10) if number != ended.number}
+
+
+def test_a_file_that_cannot_be_examined_at_the_start_is_stored_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, stat = Store(tmp_path), os.stat
+    folder.save(Incoming(GROUND, 1, "a", 4, finished=(0, True, 2)))
+    folder.part(Incoming(GROUND, 1)).write_bytes(b"data")
+
+    def fail(path: Any, **options: bool) -> os.stat_result:
+        if str(path).endswith(".part"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return stat(path, **options)
+
+    with monkeypatch.context() as failing:
+        failing.setattr(os, "stat", fail)
+        FailingDisk(1, failing)
+        end = Entity(SATELLITE, folder, lambda _: "", SIZE, 0)
+    assert _contents(end, 0) == []
+    end.take(pack(Transaction(GROUND, 1, SATELLITE), Ack(Code.FINISHED, 0, 2)), 0)
+    end.work(3 * 10**9)
+    assert (folder.received / "a").read_bytes() == b"data"
+    assert _contents(end, 3 * 10**9) == [Finished(0, True, 2)]
+
+
+@pytest.mark.parametrize("deleted", [False, True])
+def test_the_move_of_a_complete_file_is_synced_after_a_restart_unless_the_file_was_deleted(
+    tmp_path: Path, deleted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Store(tmp_path)
+    folder.save(Incoming(GROUND, 1, "a", 4, finished=(0, True, 2)))
+    if not deleted:
+        (folder.received / "a").write_bytes(b"data")
+    synced, sync = list[Path](), store.make_lasting
+
+    def noted(path: Path) -> None:
+        synced.append(path)
+        sync(path)
+
+    monkeypatch.setattr(store, "make_lasting", noted)
+    end = Entity(SATELLITE, folder, lambda _: "", SIZE, 0)
+    assert (folder.received in synced) != deleted
+    assert _contents(end, 0) == [Finished(0, True, 2)]
+
+
+def test_data_that_are_received_again_do_not_change_a_complete_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end = Entity(SATELLITE, Store(tmp_path), lambda _: "", SIZE, 0)
+    _give(end, 1, "a")
+    monkeypatch.setattr(os, "pwrite", lambda *_: pytest.fail("the file was written again"))
+    end.take(pack(Transaction(GROUND, 1, SATELLITE), FileData(0, b"data")), 0)
+    end.work(0)
+    end.work(0)
+    assert (tmp_path / "received" / "a").read_bytes() == b"data"
 
 
 def test_records_are_not_written_into_a_folder_that_is_mounted_later(tmp_path: Path) -> None:

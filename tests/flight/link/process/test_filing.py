@@ -110,6 +110,16 @@ def test_a_file_waits_for_a_line_that_takes_no_frames_and_no_part_is_sent_twice(
     link.close()
 
 
+@pytest.mark.parametrize("listened", [True, False])
+def test_an_uplinked_file_is_stored_while_the_satellite_cannot_send(link: FiledEnds, listened: bool) -> None:
+    link.wire.takes, link.wire.listened = 0, listened
+    path = config(link, np.random.default_rng(3).bytes(20_000))
+    link.session.put(path, "configuration/flight.yaml", link.clock.now_ns())
+    link.turn(5.0)
+    came = link.place / "keys" / "files" / "received" / "configuration" / "flight.yaml"
+    assert came.read_bytes() == path.read_bytes()
+
+
 def test_only_the_last_selected_file_of_a_kind_is_kept(link: FiledEnds) -> None:
     folder = link.place / "keys" / "files"
     for name in ("a.tle", "b.tle"):
