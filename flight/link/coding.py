@@ -187,7 +187,7 @@ class TelemetryCode:
         """Encode frames of `frame_bytes` bytes, with `depth` interleaved Reed-Solomon codewords."""
         self._kind = randomiser
         self._code = None if depth is None else ReedSolomon(depth)
-        self._encode = bytes if self._code is None else lru_cache(_RECENT_BLOCKS)(self._code.encode)
+        self._block = lru_cache(_RECENT_BLOCKS)(self._encoded)
         self._unit_bytes = frame_bytes + _PARITY * (depth or 0)
 
     @property
@@ -202,7 +202,10 @@ class TelemetryCode:
 
     def encode(self, frame: bytes) -> bytes:
         """Return the codeblock of a frame, without sync marker."""
-        return randomised(self._encode(frame), self._kind)
+        return self._block(frame)
+
+    def _encoded(self, frame: bytes) -> bytes:
+        return randomised(frame if self._code is None else self._code.encode(frame), self._kind)
 
     def decode(self, unit: bytes) -> bytes:
         """Return the frame in a codeblock."""

@@ -12,7 +12,8 @@ from unittest.mock import Mock
 
 import pytest
 
-from flight.link.coding import LinkCodes, ReedSolomon
+from flight.link import coding
+from flight.link.coding import LinkCodes, ReedSolomon, randomised
 from flight.link.frames import SYNC, TelecommandHeader, close_frame
 from flight.link.process import station
 from flight.link.process.station import AT_MOST, Line, SerialLine, TcpLine, TncLine, UdpLine
@@ -246,8 +247,9 @@ def test_lines_report_that_they_are_lost(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_frame_that_is_sent_again_on_several_lines_is_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    encode = Mock(side_effect=bytes)
+    encode, randomise = Mock(side_effect=bytes), Mock(side_effect=randomised)
     monkeypatch.setattr(ReedSolomon, "encode", encode)
+    monkeypatch.setattr(coding, "randomised", randomise)
     codes, frames = LinkCodes(223, "long", 1), [bytes([n]) * 223 for n in range(90)]
     udp = UdpLine("127.0.0.1:0", codes=codes)
     udp.trust(("127.0.0.1", 9), 0)
@@ -256,7 +258,7 @@ def test_a_frame_that_is_sent_again_on_several_lines_is_encoded_once(monkeypatch
     lines = [udp, SerialLine("radio", lost, codes.on_board()), SerialLine("tnc", lost, codes.on_board(True))]
     for _ in range(50):
         assert [line.send(frames, 0) for line in lines] == [0, 0, 0]
-    assert encode.call_count == len(frames)
+    assert encode.call_count == randomise.call_count == len(frames)
     udp.close()
 
 
