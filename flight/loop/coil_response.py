@@ -148,8 +148,8 @@ class ResponseSettings:
         sure: standard deviation of a gain below which the gain is used to assess a coil.
         settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed,
             or None if their field is small compared with the Earth's.
-        disturbance: function that returns the largest expected acceleration (rad/s^2) by disturbance torques
-            at a time (ns), or None if the disturbance is constant within a fit.
+        disturbance: function that returns the largest expected accelerations (3,), rad/s^2, by disturbance
+            torques at a time (ns), or None if the disturbance is constant within a fit.
     """
 
     inertia: FloatArray
@@ -165,7 +165,7 @@ class ResponseSettings:
     errors: BodyErrors = field(default_factory=BodyErrors)
     sure: float = 0.25
     settle_ns: int | None = None
-    disturbance: Callable[[int], float] | None = None
+    disturbance: Callable[[int], FloatArray] | None = None
 
 
 _PERSISTENCE = 3
@@ -264,7 +264,7 @@ class CoilResponse:
         self._expected[coils + 2 :][each] = -1.0
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0,) * coils)])
         self._known_ns = self._last_ns = 0
-        self._disturbed_ns, self._disturbance = -_DISTURBANCE_NS, 0.0
+        self._disturbed_ns, self._disturbance = -_DISTURBANCE_NS, np.zeros(3)
         self.gain: FloatArray = np.ones(coils)
         self.largest: FloatArray = np.full(coils, LARGEST_GAIN)
         self.reset()
@@ -283,7 +283,8 @@ class CoilResponse:
         # Equations (f, p + 1) of each bin for f free axes: coefficients of p parameters, and acceleration.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
-        self.fastest = self._walk = 0.0
+        self.fastest = 0.0
+        self._walks = [0.0] * len(self._free)
         # The newest fit determines the weights of the inertia error modes.
         self._weights: FloatArray = np.zeros(len(self._gyroscopic) // 3 - 1)
         # Bins of the last `_MEMORY_NS`: time (ns), equations (3, p + 1), and last field (3,), T.
@@ -420,7 +421,7 @@ class CoilResponse:
         Bins from before a fault would hide the fault from a fit over all bins.
         """
         rows = np.concatenate(self._rows).reshape(len(self._rows), len(self._free), -1)
-        self._walk = self._disturbance_walk()
+        self._walks = self._disturbance_walks()
         counts = [len(rows)]
         while counts[-1] // 2 >= self._settings.least_bins:
             counts.append(counts[-1] // 2)
@@ -509,24 +510,23 @@ class CoilResponse:
         # The span is rounded to ns, so that equal spans use the stored matrix.
         span = round(span, 9)
         variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
-        whitening = whitenings(counts, settings.model_error**2, variance, self._walk * span)
-        white = whitening @ rows.reshape(len(rows), -1)
-        return np.asarray(white.reshape(len(counts), -1, rows.shape[2]))
+        white = [
+            whitenings(counts, settings.model_error**2, variance, walk * span) @ rows[:, axis]
+            for axis, walk in enumerate(self._walks)
+        ]
+        return np.concatenate(white, axis=1)
 
-    def _disturbance_walk(self) -> float:
-        """Return the variance per second, (rad/s^2)^2/s, of the random walk of the disturbance.
+    def _disturbance_walks(self) -> list[float]:
+        """Return the variances (f,) per second, (rad/s^2)^2/s, of the random walks of the disturbances.
 
-        The disturbance is assumed to change by its own magnitude while the body rotates by 1 rad. The result
+        Each disturbance is assumed to change by its own magnitude while the body rotates by 1 rad. The result
         is rounded to a power of two, so that few whitening matrices are needed.
         """
         disturbance = self._settings.disturbance
         if disturbance is not None and not 0 <= self._last_ns - self._disturbed_ns < _DISTURBANCE_NS:
             self._disturbed_ns, self._disturbance = self._last_ns, disturbance(self._last_ns)
-        largest = self._disturbance
-        if largest <= 0.0:
-            return 0.0
-        walk = 2.0 * largest**2 * max(self._speeds[-1], _SLOWEST_ROTATION)
-        return float(2.0 ** round(math.log2(walk)))
+        walks = 2.0 * self._disturbance[self._free] ** 2 * max(self._speeds[-1], _SLOWEST_ROTATION)
+        return [2.0 ** round(math.log2(walk)) if walk > 0.0 else 0.0 for walk in walks.tolist()]
 
 
 @functools.cache

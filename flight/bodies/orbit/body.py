@@ -601,13 +601,14 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
     full = tuple(config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia = config.craft.inertia_matrix()
     settle_ns = round(config.detumble.settle * SECOND_NS)
-    air, dipole = np.array(config.largest_torques()) / float(np.linalg.eigvalsh(inertia)[0])
+    air, dipole = config.largest_torques()
+    per_torque = np.linalg.norm(np.linalg.inv(inertia), axis=1)
 
-    def disturbance(time_ns: int) -> float:
-        """Return the largest acceleration (rad/s^2) by disturbances, without drag if the orbit is unknown."""
+    def disturbance(time_ns: int) -> FloatArray:
+        """Return the largest accelerations (3,), rad/s^2, without drag if the orbit is unknown."""
         state = environment.state(time_ns)
         density = 0.0 if state is None else mean_density(float(np.linalg.norm(state.position)))
-        return float(dipole + air * density)
+        return np.asarray((dipole + air * density) * per_torque)
 
     # A coil's torque is detected more slowly than on the testbed, whose magnetic field is 16 times stronger.
     response = ResponseSettings(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -535,7 +536,8 @@ def _point_in_dense_air(
     """
     settings = ResponseSettings(
         INERTIAS, 0.65 * np.eye(3), 2.8e-4, bin_samples=40, bins=40, least_bins=8, model_error=3e-5,
-        torsion=1e-6, damping=1e-4, disturbance=None if disturbance is None else lambda _: disturbance,
+        torsion=1e-6, damping=1e-4,
+        disturbance=None if disturbance is None else lambda _: np.full(3, disturbance),
     )  # fmt: skip
     response, generator = CoilResponse(settings), np.random.default_rng(seed)
     angle, rate, currents = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -568,3 +570,29 @@ def test_no_healthy_coil_looks_reversed_in_dense_air() -> None:
         misled += _point_in_dense_air(None, seed)[0][Finding.REVERSED]
     assert misled > 0, "a fit that assumes a constant disturbance is misled"
     assert _point_in_dense_air(3e-4, 1, (-1, 1, 1))[0][Finding.REVERSED] > 0, "a reversed coil is still found"
+
+
+def _constant(value: FloatArray, _: int) -> FloatArray:
+    return value
+
+
+def test_a_disturbance_about_one_axis_affects_only_the_gains_that_act_about_it() -> None:
+    """The field is along y, so coil x acts only about z, and coil z only about x."""
+    sigmas = []
+    for size in (0.0, 3e-3):
+        disturbance = np.array([size, 0.0, 0.0])
+        settings = ResponseSettings(
+            INERTIAS, 0.65 * np.eye(3), 2.8e-4, model_error=3e-5, disturbance=partial(_constant, disturbance)
+        )
+        response, generator = CoilResponse(settings), np.random.default_rng(2)
+        rate, field, currents = np.zeros(3), np.array([0.0, 3e-5, 0.0]), np.zeros(3)
+        for cycle in range(800):
+            if cycle % 40 == 0:
+                currents = generator.uniform(-0.148, 0.148, 3)
+            response.commanded(cycle * TICK_NS, tuple(currents.tolist()))
+            rate = rate + np.cross(0.65 * currents, field) / MOMENTS / 40
+            noise = 2.8e-4 * generator.standard_normal(3)
+            response.observe_motion((cycle + 1) * TICK_NS, rate + noise, field)
+        sigmas.append(response.sigma)
+    assert sigmas[1][0] == pytest.approx(sigmas[0][0], rel=0.05)
+    assert sigmas[1][2] > 1.5 * sigmas[0][2]
