@@ -296,7 +296,7 @@ def _sync(folder: Path) -> None:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file, empty if the file is missing, damaged or cannot be read."""
+    """Return the text of a file, or an empty string if the file is missing, damaged or unreadable."""
     with suppress(OSError, ValueError):
         return path.read_text(encoding="ascii")
     return ""

@@ -177,7 +177,8 @@ _WRONG_MARKER_BITS = 3
 """Maximum number of wrong bits in a sync marker that is accepted directly after a valid codeblock. At a bit
 error rate of 0.8 %, at which the Reed-Solomon code fails, one of 8,000 markers has more wrong bits."""
 _RECENT_BLOCKS = 256
-"""Number of kept codeblocks, because each line sends the same frames, and frames that no line took again."""
+"""Number of codeblocks that are kept for reuse, because all lines send the same frames, and because a frame
+that no line accepted is sent again."""
 
 
 class TelemetryCode:

@@ -148,8 +148,8 @@ class ResponseSettings:
         sure: standard deviation of a gain below which the gain is used to assess a coil.
         settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed,
             or None if their field is small compared with the Earth's.
-        disturbance: function that returns the largest expected accelerations (3,), rad/s^2, by disturbance
-            torques at a time (ns), or None if the disturbance is constant within a fit.
+        disturbance: function that returns the largest expected accelerations (3,), rad/s^2, that
+            disturbance torques cause at a time (ns), or None if the disturbance is constant within a fit.
     """
 
     inertia: FloatArray

@@ -446,7 +446,7 @@ class UbloxReceiver:
     def _use_valset(self, wanted: bool) -> None:
         """Select CFG-VALSET or the older commands, and configure at once after a change to CFG-VALSET.
 
-        A new baud rate is commanded by both, so the command is not repeated for this reason.
+        During a change of the baud rate nothing is repeated, because both kinds of commands were sent for it.
         """
         self._is_due = self._is_due or (wanted > self._uses_valset and self._return_ns is None)
         self._uses_valset = wanted

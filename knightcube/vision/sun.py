@@ -110,7 +110,7 @@ class SunStatus(Enum):
     The attribute `reason` of the solution states why the patch is not the Sun.
     """
     AMBIGUOUS = "ambiguous"
-    """Several round discs have the size of the Sun, such as the Sun and a reflection in the lens.
+    """Two or more round discs have the size of the Sun, for example the Sun and its reflection in the lens.
 
     The discs are the `candidates` of the solution.
     """

@@ -309,10 +309,12 @@ class StepReplay:
             self.free.renew(block, self.free.layout.prior[block, block], self._memories)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat dipoles and gyro bias since `since_ns` as unknown if the gate then accepts `refused`.
+        """Process the steps since `since_ns` again with unknown dipoles and gyro bias.
 
-        Dipole errors and changes of the gyro bias that are too small to be noticed in the gyro rates
-        accumulate in the attitude, which then contradicts the attitude `refused`.
+        The result is kept only if the gate then accepts the attitude `refused`, which it rejected before.
+        Small dipole errors and changes of the gyro bias are not noticed in the gyro rates, but accumulate in
+        the estimated attitude, which then contradicts the measured attitude. Returns the object IDs of the
+        late measurements used.
         """
         doubts = [(step.doubt, step.doubts_gyro) for step in self.steps]
         used = self.doubt_since(min(since_ns, refused.time_ns), gyro=True)

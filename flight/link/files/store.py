@@ -37,8 +37,9 @@ _TRIES = 3
 def read_regular(path: Path, most: int) -> bytes | None:
     """Return the content of a file of at most `most` bytes, or None if the file does not exist.
 
-    Type and size are checked first. Raises OSError, also for a longer file or a file that is not regular. The
-    file is read again after a failure, because a single failed disk access does not mean damage.
+    Raises OSError if the file cannot be read, is longer than the limit, or is not a regular file. Type and
+    size are checked before the file is read. A failed read is repeated, because a single failed disk access
+    does not mean damage.
     """
     for _ in range(_TRIES - 1):
         with suppress(OSError):
@@ -373,7 +374,10 @@ class Store:
         return self._path(record).with_suffix(".part")
 
     def has_file(self, record: Incoming) -> bool:
-        """Return whether the file of a complete transfer is on the disk, or may be on a disk that fails."""
+        """Return whether the file of a complete transfer is on the disk.
+
+        Returns True also if this cannot be checked because accesses to the disk fail.
+        """
         for path in (self.part(record), self.received / str(record.name)):
             try:
                 path.stat()

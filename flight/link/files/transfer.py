@@ -131,7 +131,8 @@ _DISK_NS = 2_000_000_000
 _DISK_TRIES = 6
 """Number of repeated attempts after a failed access to the disk; the attempts take about half a minute."""
 _LASTING = {None, errno.ENOENT, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
-"""Error numbers of failures that a further attempt would not end; None is a file that is too short."""
+"""Error numbers (errno) of permanent failures, for which a further attempt is useless. None stands for a file
+that is too short."""
 
 
 class DiskTimer(Timer):
@@ -425,7 +426,8 @@ class Receiver:
         """Sync the received data to disk, and then store the record of received ranges.
 
         Raises FileError if data or record cannot be stored. Data that were not synced are requested again. A
-        sync without new ranges does not end a failure, because the kernel reports a failed write only once.
+        sync without new ranges does not reset the timer of the attempts, because the kernel reports a failed
+        write only once.
         """
         if not self._dirty:
             return
@@ -792,7 +794,8 @@ class Entity:
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
         """Open an incoming transfer; if too many are open, end the least recently active transfer.
 
-        A complete file that waits for its storage is ended only if all open transfers wait.
+        The transfer of a complete file that is not yet stored is ended early only if every open
+        transfer waits to store its file.
         """
         if len(self._in) >= MOST_OPEN:
             oldest = min(self._in.values(), key=lambda one: (one.unplaced, one.received_ns))

@@ -89,8 +89,9 @@ connect per second, a new connection has 1.3 s for its first frame."""
 _PIECE = 1 << 14
 _RECONNECT_NS = 5 * SECOND_NS
 _DEAD_NS = 300 * SECOND_NS
-"""Time (ns) after which a TCP connection that takes no frame is closed. A peer that reads 960 bytes/s takes
-no frame for up to 126 s, because the kernel frees large parts of the buffers at once."""
+"""Time (ns) after which a TCP connection that accepts no frame is closed. Even if a peer reads steadily at
+960 bytes/s, no frame fits into the socket buffers for up to 126 s, because the kernel frees the buffers in
+large blocks."""
 
 
 class Line(Protocol):
@@ -471,7 +472,7 @@ _STALL_NS = 10 * SECOND_NS
 """Shortest time (ns) after which a line that takes no frame is reported, because a slow line needs seconds
 for a frame."""
 _STATUS_WAITING = 16
-"""Largest number of queued reports at which a status of the link is added."""
+"""Largest number of waiting reports at which a status report of the link is still queued."""
 _HIGHEST_REPORTED = 2**63 - 1
 """Largest frame counter and mission time (ns) that fit into a report. Received counters have 96 bits."""
 
@@ -505,10 +506,10 @@ class StationSettings:
 
 
 class Transmitter:
-    """Sender of the due frames on all lines; frames that no line takes are sent again before other frames.
+    """Sender of the due frames on all lines; frames that no line accepts are sent again before others.
 
     While nobody listens, live telemetry is discarded, and files and playback wait. The attribute `untaken`
-    counts the frames that a line did not take, at each attempt.
+    counts the frames that were not accepted, once for each attempt and line.
     """
 
     def __init__(self, lines: Sequence[Line], downlink: Downlink) -> None:

@@ -116,8 +116,8 @@ class _Fit:
 
     def __init__(self, dates: FloatArray, states: FloatArray) -> None:
         """Store the times and the `states`: positions (n, 3), or positions and velocities (n, 6)."""
-        # Lines have an epoch of eight decimals. Just before the end of a year, another epoch would be rounded
-        # to a day of the year that does not exist.
+        # In two-line elements, the epoch has eight decimals. An unrounded epoch just before the end of a year
+        # would become a day of the year that does not exist.
         self.epoch = round(float(dates[0]), 8)
         self.minutes = (dates - self.epoch) * 1440.0
         to_icrs = np.array([mean_equator_to_celestial(float(date)) for date in dates])

@@ -272,7 +272,7 @@ def check_amounts(settings: Any, *positive: str) -> None:
     """Raise ArgumentError unless the numbers in the fields of a dataclass are finite and not negative.
 
     The fields named in `positive` must be above zero, and fields annotated as int must be whole numbers.
-    Fields with a pair of numbers, and fields with one number or three numbers (3,), are also checked.
+    The fields that are checked contain one number, a pair of numbers, or either one or three numbers (3,).
     """
     for field in dataclasses.fields(settings):
         value, shapes = getattr(settings, field.name), _SHAPES.get(str(field.type))

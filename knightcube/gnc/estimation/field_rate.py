@@ -54,14 +54,14 @@ known. The noise represents products of errors, which the linearised filter negl
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _SPINS = ((0.0, 0.5), (-1.5, 0.25), (1.5, 0.25))
-"""Squares of the initial spins about the field, with their signs and as a multiple of the variance of the
-spin, and the probabilities of these spins. With `_SPIN_VARIANCE`, they have the mean and variance of the
-normal distribution that they represent."""
+"""Initial spins about the field, and their probabilities. Each spin is given by its square, with the sign of
+the spin, in units of the variance of the spin. With `_SPIN_VARIANCE`, the spins have the mean and variance
+of the normal distribution that they represent."""
 _SPIN_VARIANCE = 0.25
 """Variance of the spin of each initial estimate, as a fraction of the variance of the spin."""
 _TEMPER = 4.0
-"""Divisor of the log-likelihoods for the probabilities of the estimates. A filter that is linearised about a
-wrong estimate has correlated innovations, so the likelihoods exaggerate."""
+"""Divisor of the log-likelihoods from which the probabilities of the estimates are computed. A filter that is
+linearised about a wrong estimate has correlated innovations, so its likelihoods overstate the evidence."""
 _EQUAL = 0.1
 """Normalised square of the difference of two rates below which the less probable estimate is discarded."""
 _CURVATURE = 1.0
@@ -136,14 +136,14 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 class FieldRate:
     """The filter of the body rate.
 
-    The filter is linearised about an estimate, and the spin about the field is unknown at first. From one
-    estimate, the filter may therefore converge to a wrong rate that predicts the field almost as well. The
-    filter begins with three estimates of different spins, and discards those that predict the field less
-    well, or that have converged to the rate of another estimate. The properties return the most probable
-    estimate, and its covariance includes the differences to the other estimates. In 200 simulated tumbles of
-    a 3U satellite at 0.05 and 0.2 rad/s, the rate was always within 5 standard deviations. In 5 of 100
-    tumbles of a rod whose moments of inertia have the ratio 50, a wrong rate was left. A gyro rate
-    (`measure_rate`) excludes a wrong rate.
+    The filter is linearised about an estimate, and the spin about the field is unknown at first. If it
+    started with only one estimate, the filter could therefore converge to a wrong rate that predicts the
+    field almost as well as the true rate. The filter begins with three estimates of different spins, and
+    discards those that predict the field less well, or that have converged to the rate of another estimate.
+    The properties return the most probable estimate, and its covariance includes the differences to the
+    other estimates. In 200 simulated tumbles of a 3U satellite at 0.05 and 0.2 rad/s, the rate was always
+    within 5 standard deviations. In 5 of 100 tumbles of a rod whose moments of inertia have the ratio 50, the
+    filter kept a wrong rate. A gyro rate (`measure_rate`) excludes a wrong rate.
 
     Attributes:
         restarts: number of restarts after failed predictions.
@@ -281,8 +281,9 @@ class FieldRate:
     ) -> bool:
         """Apply a measurement of the states `measured`, and return whether an estimate agrees with it.
 
-        The measurement (3,) has the standard deviation `sigma` per axis; `value_for` returns it for an
-        estimate. Unless `corrects` is true, the measurement is only compared with the estimates.
+        The measurement (3,), which `value_for` returns in the present axes of an estimate, has the standard
+        deviation `sigma` per axis. Unless `corrects` is true, the measurement is only compared with the
+        estimates.
         """
         noise = sigma**2 * np.eye(3)
         innovations, weights = [], []

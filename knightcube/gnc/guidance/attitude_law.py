@@ -9,8 +9,8 @@ The law of a pointing target aligns the pointing axis with the direction of the 
 the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
 If the roll is free, the body keeps its roll angle at the time at which the attitude law begins. The free roll
 angle is measured from the celestial pole for the Sun, and from the orbit normal for all other targets. The
-body then rotates little about the pointing axis. No line through the satellite along the orbit normal hits
-the Earth, so a ground target is never near the orbit normal, where the roll would change fast.
+body then rotates little about the pointing axis. The line through the satellite along the orbit normal never
+hits the Earth, so a ground target is never near the orbit normal, where the roll would change fast.
 """
 
 from __future__ import annotations

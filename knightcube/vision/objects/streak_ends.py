@@ -707,7 +707,8 @@ def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
 _ASIDE_PX = 1.0
 """Largest distance (px) of the ends of flashes from their common line."""
 _LIT = 0.2
-"""Minimum length of all flashes of an object, as a fraction of the length of the line from first to last."""
+"""Minimum total length of the flashes of an object, as a fraction of the distance from the start of the first
+flash to the end of the last."""
 
 
 def flashes_of_objects(ends: FloatArray) -> list[list[int]]:
@@ -728,7 +729,10 @@ def flashes_of_objects(ends: FloatArray) -> list[list[int]]:
 
 
 def _along_one_line(ends: FloatArray, group: list[int]) -> list[int] | None:
-    """Return the indices `group` of streaks (n, 2, 2), px, in their order along a line, or None."""
+    """Return the indices `group` of streaks (n, 2, 2), px, in order of their positions along a common line.
+
+    Returns None if the streaks are not flashes of one object on one line.
+    """
     points = ends[group].reshape(-1, 2) - ends[group].reshape(-1, 2).mean(axis=0)
     along, aside = np.linalg.svd(points, full_matrices=False)[2]
     places = np.sort((points @ along).reshape(-1, 2), axis=1)

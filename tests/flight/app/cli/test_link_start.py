@@ -211,7 +211,7 @@ def test_a_lost_folder_of_keys_is_rebuilt_a_minute_after_it_was_found_missing(
 def test_a_folder_of_keys_that_is_mounted_late_is_read_by_a_new_start(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The stored schedule and the transfers of a folder that is mounted after the rebuilding continue."""
+    """If the folder is mounted after the keys were rebuilt, its stored schedule and transfers continue."""
     config = write_linked_config(place, udp="127.0.0.1:0")
     keys, away = place / "keys" / "satellite", place / "away"
     opened = list[tuple[bool, int, list[str]]]()

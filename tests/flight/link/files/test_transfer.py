@@ -522,7 +522,7 @@ def test_received_data_is_removed_before_its_record(tmp_path: Path, monkeypatch:
 
 
 class FailingDisk:
-    """A disk on which each kind of access to a file of a transfer fails a number of times."""
+    """A disk on which each kind of access to a transfer's file fails a number of times, then succeeds."""
 
     def __init__(self, failures: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.left = dict.fromkeys(("read", "write", "move", "sync"), failures)
@@ -607,7 +607,7 @@ def test_failed_syncs_are_counted_until_new_data_are_kept(
 
 
 class _WithoutSegments(io.BufferedReader):
-    """A file that can be read only in long portions."""
+    """A file whose segments cannot be read, although longer reads succeed, as for the checksum."""
 
     def read(self, size: int | None = -1) -> bytes:
         if size is not None and size < 1000:

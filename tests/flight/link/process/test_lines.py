@@ -1,4 +1,4 @@
-"""Tests that link lines read floods in portions, accept only peers, and report frames that were not sent."""
+"""Tests of the link's lines with floods, strangers, slow connections, and frames that were not sent."""
 
 from __future__ import annotations
 

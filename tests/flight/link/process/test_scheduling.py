@@ -383,7 +383,7 @@ def test_words_are_read_by_the_table() -> None:
     "words", ["point nadir 90deg", "point sun 5deg roll 3deg", "point ground 1deg 2deg 3deg"]
 )
 def test_a_number_that_the_goal_does_not_take_is_refused_and_not_ignored(words: str) -> None:
-    """In `point nadir 90deg` the angle is a roll without its word `roll`."""
+    """For example, `point nadir 90deg` gives a roll angle without the word `roll`."""
     with pytest.raises(CommandError, match="takes at most"):
         command_of_words(words)
 

@@ -252,7 +252,7 @@ def test_a_log_that_states_any_time_does_not_end_the_link(link: BothEnds) -> Non
 def test_packets_of_another_release_are_sent_down_and_do_not_end_the_link(
     link: BothEnds, kind: Packet, change: str
 ) -> None:
-    """During a renewal, and after its end, flight and link can be of different releases."""
+    """During a renewal, and after its end, flight and link may run different releases."""
     fields = kind.fields[:-1] if change == "shorter" else (*kind.fields, Field("more", "u1", "-", "more"))
     other = replace(kind, fields=fields, version=kind.version + 1)
     packer, values = Packer(compile_layouts([other])), plain_contents(other)

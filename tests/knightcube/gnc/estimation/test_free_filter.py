@@ -319,7 +319,7 @@ def test_errors_of_a_body_that_are_negative_are_refused() -> None:
 
 
 def test_measurements_of_another_shape_or_length_are_refused_and_change_nothing() -> None:
-    """Added to a matrix, a number or a row would act as a correlated covariance."""
+    """With numpy, a number or a row would be added to each row, as if the errors were correlated."""
     found, _, _ = fly(3, 1)
     before, still, down = found.covariance.copy(), np.zeros(3), np.array([0.0, 0.0, 1.0])
     for wrong in (np.array(1e-8), 1e-8 * np.ones(3)):

@@ -96,7 +96,8 @@ def test_a_pass_over_a_ground_target_with_a_free_roll_needs_only_the_rate_of_the
 ) -> None:
     """The body rotates about its pointing axis only as slowly as the Earth's rotation and the pass require.
 
-    A roll kept relative to a direction that the ground target passes would need many times the rate.
+    If the direction of the ground target passed near the direction from which the roll is measured, a
+    constant roll would need a rate many times higher.
     """
     times, rng = np.arange(20.0, 600.0, 1.0), np.random.default_rng(6)
     beneath = celestial_to_terrestrial(JULIAN_DATE) @ ORBIT.position_at(np.array([300.0]))[0]

@@ -156,7 +156,7 @@ def test_the_fits_covariance_is_that_of_its_errors() -> None:
 
 
 def test_the_covariance_includes_a_limb_height_that_varies_along_the_limb() -> None:
-    """The NEES is right if the limb is higher towards one side, as towards a low Sun.
+    """The NEES also has its expected value if the limb is higher on one side, as towards a low Sun.
 
     The height of the limb varies with the cosine of the azimuth, with an amplitude of 2.8 km (2 km rms). The
     fit of a quarter of the limb absorbs the variation. Without `uneven`, the errors exceed their claims.
