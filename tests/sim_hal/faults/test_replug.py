@@ -91,10 +91,11 @@ def test_a_port_that_vanishes_is_not_closed_while_data_are_sent(
     port = PySerialPort(str(link), 115200, SystemClock())
     open_meanwhile = []
 
-    def vanish(data: bytes) -> None:
+    def vanish(data: bytes) -> int:
         pull_out(ends)
         time.sleep(0.1)  # time in which the receiving thread detects that the port is lost
         open_meanwhile.append(port._serial.is_open)
+        return len(data)
 
     monkeypatch.setattr(port, "_write", vanish)
     port.send(b"data")
