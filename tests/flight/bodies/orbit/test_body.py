@@ -161,11 +161,12 @@ def test_the_coil_monitor_knows_full_currents_and_the_disturbance() -> None:
     assert response.settle_ns == 100_000_000
     np.testing.assert_allclose(np.diag(response.dipole_per_ampere), 0.648)
     _, dipole = config().largest_torques()
+    moments = np.array([1.1e-3, 1.05e-3, 0.99e-3])
     cast(Any, found.environment).state = lambda _: None
-    assert response.disturbance(0) == pytest.approx(dipole / 0.99e-3), "without an orbit, no air"
+    assert response.disturbance(0) == pytest.approx(dipole / moments), "without an orbit, no air"
     low = SimpleNamespace(position=np.array([0.0, 0.0, 6.878e6]))
     cast(Any, found.environment).state = lambda _: low
-    assert response.disturbance(0) > dipole / 0.99e-3
+    assert (response.disturbance(0) > dipole / moments).all()
     never = configuration.replace(config(), pointing=configuration.replace(config().pointing, coil_test=0.0))
     assert estimation(never).coil_monitor._settings.self_test is None
 
