@@ -284,7 +284,6 @@ class CoilResponse:
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = 0.0
-        self._walks = [0.0] * len(self._free)
         # The newest fit determines the weights of the inertia error modes.
         self._weights: FloatArray = np.zeros(len(self._gyroscopic) // 3 - 1)
         # Bins of the last `_MEMORY_NS`: time (ns), equations (3, p + 1), and last field (3,), T.
@@ -421,7 +420,6 @@ class CoilResponse:
         Bins from before a fault would hide the fault from a fit over all bins.
         """
         rows = np.concatenate(self._rows).reshape(len(self._rows), len(self._free), -1)
-        self._walks = self._disturbance_walks()
         counts = [len(rows)]
         while counts[-1] // 2 >= self._settings.least_bins:
             counts.append(counts[-1] // 2)
@@ -512,7 +510,7 @@ class CoilResponse:
         variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
         white = [
             whitenings(counts, settings.model_error**2, variance, walk * span) @ rows[:, axis]
-            for axis, walk in enumerate(self._walks)
+            for axis, walk in enumerate(self._disturbance_walks())
         ]
         return np.concatenate(white, axis=1)
 

@@ -726,15 +726,21 @@ def _fail_once(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, *wante
     monkeypatch.setattr(owner, name, fail)
 
 
-@pytest.mark.parametrize("damage", ["missing", "bad sector"])
-def test_without_contact_the_board_leaves_a_configuration_that_cannot_be_read(
-    board: RenewedBoard, damage: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ground = board.flown()
+def _confirmed_with_contact(board: RenewedBoard) -> str:
+    """Confirm a new configuration with a limit of contact of 1,000 s; return the configuration before it."""
+    before = board.flown()
     activated(board)
     board.request("confirm")
     board.contact(7, limit_s=1000.0)
     board.step()
+    return before
+
+
+@pytest.mark.parametrize("damage", ["missing", "bad sector"])
+def test_without_contact_the_board_leaves_a_configuration_that_cannot_be_read(
+    board: RenewedBoard, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ground = _confirmed_with_contact(board)
     read, damaged = Path.read_bytes, board.config.stat().st_ino
 
     def fail(path: Path) -> bytes:
@@ -754,11 +760,7 @@ def test_without_contact_the_board_leaves_a_configuration_that_cannot_be_read(
 def test_without_contact_the_board_returns_although_the_present_configuration_cannot_be_stored(
     board: RenewedBoard,
 ) -> None:
-    ground = board.flown()
-    activated(board)
-    board.request("confirm")
-    board.contact(7, limit_s=1000.0)
-    board.step()
+    ground = _confirmed_with_contact(board)
     with patch.object(renewal.Board, "keep", side_effect=OSError(5, "Input/output error")):
         for _ in range(3):
             board.step(1100.0)

@@ -478,6 +478,7 @@ class StepReplay:
 FIELD_STRENGTH = 5e-5
 """Largest magnetic field (T) in a low orbit."""
 _GYRO_BIAS = np.arange(states.GYRO.start, states.GYRO.stop)
+"""Indices of the gyro bias in the error state."""
 REFUSALS_TO_RESTART = 3
 """Number of consecutive contradicting attitudes after which an accurate estimate is restarted."""
 

@@ -98,9 +98,9 @@ def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> floa
     """Return the best setting `share` for a free body in a field that rotates at `field_rate` rad/s.
 
     The rate along the field can be removed only while the field rotates. With a gain above k = 2 Omega J,
-    where Omega is the rotation rate of the field, the spin aligns with the field and is no longer reduced
-    (Avanzini and Giulietti 2012). Along an orbit the field rotates about twice per revolution of the
-    satellite.
+    where Omega is the rotation rate of the field, the spin aligns with the field, about which the coils cause
+    no torque (Avanzini and Giulietti 2012). Along an orbit the field rotates about twice per revolution of
+    the satellite.
     """
     return min(2.0 * field_rate * schedule.period_ns * _SECOND, MAXIMUM_SHARE)
 

@@ -155,7 +155,7 @@ BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
 law demands at most the fraction `SHARE` of the torque that the coils can produce."""
 BRAKING = 4.4e-3
 """Gain (1/s) of the torque that only damps the rotation, twice the rotation rate of the field in a polar
-orbit. With a higher gain, the momentum aligns with the field and is no longer reduced
+orbit. With a higher gain, the momentum aligns with the field, about which the coils cause no torque
 (`share_in_rotating_field`)."""
 RESIDUAL = 0.05
 """Largest estimated residual dipole moment, as a fraction of the coils' limit."""

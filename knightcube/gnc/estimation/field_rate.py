@@ -141,9 +141,8 @@ class FieldRate:
     field almost as well as the true rate. The filter begins with three estimates of different spins, and
     discards those that predict the field less well, or that have converged to the rate of another estimate.
     The properties return the most probable estimate, and its covariance includes the differences to the
-    other estimates. In 200 simulated tumbles of a 3U satellite at 0.05 and 0.2 rad/s, the rate was always
-    within 5 standard deviations. In 5 of 100 tumbles of a rod whose moments of inertia have the ratio 50, the
-    filter kept a wrong rate. A gyro rate (`measure_rate`) excludes a wrong rate.
+    other estimates. For a body as slender as a rod whose moments of inertia have the ratio 50, the filter may
+    still keep a wrong rate. A gyro rate (`measure_rate`) excludes a wrong rate.
 
     Attributes:
         restarts: number of restarts after failed predictions.
