@@ -452,7 +452,7 @@ class Renewal:
             sys.stderr.write(f"renewal: cannot write the status: {error}\n")
 
     def _store(self, **changes: Any) -> None:
-        """Change and store the state. Raises OSError without a change if no copy can be written."""
+        """Change and store the state. Raises OSError if no copy can be written; then nothing is changed."""
         before = {name: getattr(self._state, name) for name in changes}
         vars(self._state).update(changes)
         try:

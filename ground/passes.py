@@ -33,7 +33,7 @@ _SEARCH_S = 3600.0
 _STEP_S = 10.0  # interval (s) between computed positions; begin and end of an eclipse are interpolated
 _SPEED = 7.6e3  # typical speed (m/s) in a low orbit, which converts an along-track error to a timing error
 NEWER = "give newer elements (`knightcube elements` with --fixes or --read)"
-"""Remedy for elements whose predicted times are uncertain."""
+"""Remedy named in messages if the times predicted from the orbital elements are uncertain."""
 _KNOWN_SHARE = 0.25
 """Standard deviation of the predicted times, as a fraction of the orbital period, above which the revolution
 in which the satellite passes over a station is unknown."""

@@ -299,7 +299,7 @@ def write(
 
 
 def password_in(folder: Path) -> str:
-    """Return the password in the configuration in a folder."""
+    """Return the password of the Yamcs configuration in `folder`."""
     found = re.search(r'password: "(\w+)"', (folder / USERS).read_text(encoding="utf-8"))
     assert found is not None
     return found[1]

@@ -389,7 +389,7 @@ class CoilMonitor:
 
     @property
     def doubts_currents(self) -> bool:
-        """Whether the current of a coil in use may differ from its command."""
+        """Whether the current of a coil in use possibly differs from its command."""
         return bool(self._unknown)
 
     @property

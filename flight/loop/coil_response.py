@@ -721,7 +721,7 @@ class CoilCorrection:
 
     @property
     def unreviewed(self) -> frozenset[int]:
-        """The axes whose sign was changed in a tumble, and must be confirmed when the body is slow."""
+        """The axes whose sign was changed in a tumble. Each new sign is confirmed when the body is slow."""
         return frozenset(self._unreviewed)
 
     def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:

@@ -721,9 +721,9 @@ class Driver:
 
 
 def _ours(kind: str, section: type[Any], name: str, *more: str, **values: Any) -> Driver:
-    """Return the registration of a built-in driver, with functions in `flight.app.devices`.
+    """Return the registry entry of a built-in driver, whose functions are in `flight.app.devices`.
 
-    The words `more` name optional functions of the registration, and `values` are its other attributes.
+    The words `more` name optional functions of the entry, and `values` are its other attributes.
     """
     words = ("open", "probe", "files", *more)
     functions: dict[str, Any] = {word: later(f"flight.app.devices:{word}_{name}") for word in words}

@@ -418,7 +418,7 @@ class _Pages:
         name, given = await _command_of(request)
         try:
             return web.json_response({"words": self._console.forms.text(name, given)})
-        except UsageError as error:  # usual for a form that is not filled in completely
+        except UsageError as error:  # normal while the form is still being filled in
             return web.json_response({"error": str(error)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:

@@ -145,7 +145,7 @@ def check_timeout(seconds: float) -> None:
 
 
 def ground_files_folder(keys: Path) -> Path:
-    """Return the ground's folder for transferred files, such as keys/ground-files for the keys keys/ground.
+    """Return the ground's folder for transferred files: keys/ground-files if `keys` is keys/ground.
 
     The folder differs from the satellite's (`files_folder` of `flight.link.files.store`), so that both ends
     can run on one machine.

@@ -162,7 +162,7 @@ class Terminal:
         return self.send_by(sealer, packet)
 
     def sealer(self, spi: int, block: int) -> security.Sealer:
-        """Return the sender of authenticated frames for `send_by`; it reserves `block` counters at once."""
+        """Return a new `sealer` for `send_by`, which reserves `block` counter values at a time."""
         return security.Sealer(self._vault, spi, frames.TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: security.Sealer, packet: bytes) -> int:

@@ -206,7 +206,7 @@ class _FaultyRunner:
         fault = self._faults.active(worker)
         kind = "" if fault is None else fault.kind.kind
         spec, now_ns, realtime = self._specs[worker], self._faults.now_ns(), self._faults.realtime
-        # In lock-step the flight process runs the jobs itself, so a hung or killed worker is modelled.
+        # In lock-step the flight process runs the jobs itself, so a hung or killed worker is only imitated.
         if kind == "endless" and not realtime:
             text = f"no result within {spec.timeout_ns * 1e-9:g} s"
             self._modelled[worker] = _ModelledOutcome(now_ns + spec.timeout_ns, "timed-out", text, now_ns)

@@ -39,7 +39,7 @@ from flight.link.telemetry.packets import LONGEST_PACKET, row_of, to_text, walk
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError
 
-_ARRIVED = "arrived"  # trigger in the mode packet at the end of a slew (flight.loop.modes)
+_ARRIVED = "arrived"  # field `trigger` of the mode packet at the end of a slew (flight.loop.modes)
 
 
 class Stage(IntEnum):

@@ -390,7 +390,7 @@ class FlightLog:
         self._retry_ns = 0
         self._busy_since_ns: int | None = None
         self._closed = False
-        self._draining = threading.Lock()  # lock held while the queue is written to disk, not by write()
+        self._draining = threading.Lock()  # held while the queue is written to disk; write() does not need it
         self._store: SegmentStore | None = None
 
         def begin() -> SegmentStore:

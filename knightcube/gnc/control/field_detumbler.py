@@ -244,7 +244,7 @@ class _FieldPreview:
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return A(y) (3, 3), from which the next costate follows, for the first `count` instants."""
+        """Return the matrix A(y) (3, 3) of the first `count` instants: it maps a costate to the next one."""
         weight = self.reach / self.across(y, count)
         return np.asarray((weight @ self.effect[:count]).reshape(3, 3) + self.rest * _IDENTITY)
 
@@ -287,8 +287,8 @@ FEW, SOON = 4.0, 5.0
 detumbling. A momentum below 4 times (FEW) the residual momentum of a plan is removed within 5 s (SOON) if the
 momentum along the field is small."""
 KNOWN, KNOWN_SHARE = 2e-3, 0.1
-"""Standard deviation of the least certain rate component below which the upper bounds of rate and energy are
-set: in rad/s (first value) or as a fraction of the rate (second value)."""
+"""The upper bounds of rate and energy are set when the standard deviation of the least certain rate component
+is below this, in rad/s (first value) or as a fraction of the rate (second value)."""
 _SECOND = 1e-9
 _ROUNDING = 1e-9
 """Rounding error of a scalar product that should be zero, divided by the lengths of both vectors."""

@@ -187,8 +187,9 @@ def _riccati_numpy(
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Return feedback matrices, the cost-to-go at the start, and whether the costs are singular.
 
-    The error model is `ahead` (n, 6, 6 + columns), and the weights of the errors are `weights`, of the same
-    shape. The feedback matrices have the shape (n, controls, 6 + columns). See `sweep`.
+    `ahead` (n, 6, 6 + columns) contains the transition matrix and the affine part of the error model of each
+    step, and `weights`, of the same shape, the costs of the errors and their slopes. The feedback matrices
+    have the shape (n, controls, 6 + columns). See `sweep`.
     """
     from scipy.linalg.lapack import dgesv  # noqa: PLC0415 - only the worker that plans needs scipy
 

@@ -246,8 +246,8 @@ NODES = 24
 1.1 times the shortest duration, and an extended duration is at most 1.5 % too long. With 16 nodes, planning
 takes half the time and an extended duration is at most 2.5 % too long."""
 FINE_NODES = 40
-"""Number of nodes for paths that reach the current limit near the requested duration. The cost of a path
-along the current limit is up to 0.3 % above the optimum with 24 nodes, and up to 0.07 % with 40 nodes."""
+"""Number of nodes for paths that reach the current limit near the requested duration. With 24 nodes,
+a path at the limit costs up to 0.3 % more than the optimal path, and with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
 """Largest extension factor of a duration after which a path of the requested duration is searched with more
 nodes."""

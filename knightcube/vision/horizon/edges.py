@@ -324,9 +324,9 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
     """Return the matrix that computes the smoothed slope at p positions from the brightness of w pixels.
 
-    The three returned values are the offsets of the pixels from the centre (w,), px, the slope matrix (w, p),
-    and the largest offset of a slope position, px. The smoothing Gaussian has the standard deviation `size`,
-    px. The slope matrix is scaled so that a sharp unit step has the slope 1 for every `size`.
+    The three returned values are the offsets (w,) of the pixels from the centre, px, the matrix (w, p), and
+    the largest offset of the p positions, px. The smoothing Gaussian has the standard deviation `size`, px.
+    The matrix is scaled so that a sharp unit step has the slope 1 for every `size`.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)

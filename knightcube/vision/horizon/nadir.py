@@ -271,7 +271,7 @@ class _ScannedImage:
         self._observed: dict[int, tuple[Observation, ScanLines, list[_FreeCone]]] = {}
 
     def observed(self, settings: EdgeSettings) -> tuple[Observation, ScanLines, list[_FreeCone]]:
-        """Return edges and scan lines of the whole image, and the best cones that are already known."""
+        """Return edges and scan lines of the whole image, and the best cones fitted so far."""
         if settings.lines not in self._observed:
             edges, lines = find_edges(self.image, settings, hidden=self.hidden)
             self._observed[settings.lines] = observe(edges, lines, self.camera), lines, []

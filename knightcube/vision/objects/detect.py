@@ -307,7 +307,7 @@ class SpaceObject:
 class ObjectReport:
     """Result of the search of an image: the examined streaks, and the objects found, the brightest first.
 
-    The attributes `indicators` and `verdicts` contain first the streaks with two ends, then the short
+    `indicators` and `verdicts` have one entry for each streak with two ends, followed by those for the short
     regions. The attribute `crowded` contains one verdict for each region with more than two corners.
     `rotation` (3,), rad, is the rotation vector of the camera, in camera axes, that the search assumed.
     """
@@ -489,9 +489,9 @@ class Judge:
 
         Stars are fitted to each region. If the fitted stars do not explain all light, they are subtracted,
         and the brightest remaining light of the region is tested. In regions at the border of the image, an
-        object must decrease chi-square more, and its ends must be inside the image. Regions whose label is in
-        `settled` are not examined. Regions whose label is in `strange` are examined first, followed by the
-        largest of the other regions.
+        object must decrease chi-square more than elsewhere, and its ends must be inside the image. Regions
+        whose label is in `settled` are not examined. Regions whose label is in `strange` are examined first,
+        followed by the largest of the other regions.
         """
         regions = self.segmented.regions
         bright = regions.is_significant(self.objects.point_significance, self.segmented.background)

@@ -304,9 +304,10 @@ def _brightest_path(
 def _fit_together(
     patch: Patch, middles: FloatArray, rotation: FloatArray, pinhole: Pinhole
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return midpoints (n, 2) and paths (n, m, 2), px, of stars fitted together, and the counts without them.
+    """Return midpoints (n, 2) and paths (n, m, 2), px, of stars fitted together, and the remaining counts.
 
-    The argument `middles` (n, 2), px, is the initial guess of the midpoints.
+    The remaining counts are those after subtraction of these stars. The argument `middles` (n, 2), px, is the
+    initial guess of the midpoints.
     """
     rows, columns = patch.signal.shape
     paths = _paths_through(middles, rotation, pinhole)

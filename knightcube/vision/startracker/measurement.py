@@ -214,9 +214,9 @@ def _crowded(middle: IntArray) -> BoolArray:
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return at most four `chosen` stars in each sixteenth of the area of all stars, and their weights.
+    """Return at most four `chosen` stars in each of 16 parts of the frame, and their weights.
 
-    Each sixteenth of the area has the same total weight. Stars are in all parts of the frame, but foreground
+    Each part has the same total weight. Stars are in all parts of the frame, but foreground
     sources, such as the leaves of a tree, are in one part.
     """
     return _spread_evenly(np.ascontiguousarray(middle), chosen)

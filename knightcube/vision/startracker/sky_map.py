@@ -69,9 +69,9 @@ def usual_bend(camera: CameraModel) -> FloatArray:
 def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
     """Return the reciprocal prior variances (6,) of lens errors for a known accuracy and square pixels.
 
-    For an exact lens, an empty array (0,) is returned. An error of the optical axis's position in the image
-    has the effect of a tilt of the lens. The rotation of all stars by the same angle, which an error of the
-    optical axis also causes, is attributed to the camera's mounting instead of the lens.
+    For a lens that is known exactly, an empty array (0,) is returned. An error of the optical axis's position
+    in the image has the effect of a tilt of the lens. The rotation of all stars by the same angle, which an
+    error of the optical axis also causes, is attributed to the camera's mounting instead of the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)

@@ -504,7 +504,7 @@ class Areas:
 
     Attributes:
         row, column: row and column of each pixel (m,).
-        owner: index of the area of each pixel (m,).
+        owner: index of the area to which each pixel belongs (m,).
         smooth: counts of the smoothed frame above the background at each pixel (m,).
         peak: mask of the pixels that are local maxima of the smoothed frame (m,).
         saturated: mask of the saturated pixels (m,).
@@ -713,7 +713,7 @@ class Survey:
 
     Attributes:
         pixels: frame in counts (rows, columns); hot pixels are replaced if there are many.
-        unit: size of one count in the original unit of the frame.
+        unit: brightness of one count in `pixels`, in the unit of the original frame.
         settings: detection settings, converted to counts.
         sky: sky background and noise.
         areas: connected areas above the noise.

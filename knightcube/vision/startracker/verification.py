@@ -183,7 +183,8 @@ class _Matching:
 # Fraction of bright expected stars with a match below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
 # Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
-# The second value is the radius of the search for nearby stars, relative to the image corner's tangent.
+# The second value is the radius of the search for nearby stars, as a fraction of the distance from the image
+# centre to a corner.
 # A larger fraction indicates a wrong fit of the lens: a foreground hides stars but does not displace them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
 # Excess of log10 chance matches over the limit above which a candidate is rejected without refinement.

@@ -243,9 +243,9 @@ def _rolling_result(
 ) -> MotionResult | None:
     """Return the result for a camera with a rolling shutter, or None if no motion fits.
 
-    The function `fit_along` fits a motion with a rotation in the sense of a given vector (3,). The rotation
-    `axis` (3,) is an initial guess with arbitrary sign. The prior rate determines the sign if its
-    significance exceeds `sigmas` standard deviations.
+    The function `fit_along` fits a motion whose rotation vector has a positive component along a given vector
+    (3,). The rotation `axis` (3,) is an initial guess with arbitrary sign. The prior rate determines the sign
+    if its significance exceeds `sigmas` standard deviations.
     """
     if prior_rate is not None:
         sign = direction_of_time(axis, prior_rate, prior_sigma, sigmas)

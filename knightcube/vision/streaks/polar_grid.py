@@ -405,7 +405,7 @@ def _pixel_indices(index: Int32Array, turning: Float32Array, rising: Float32Arra
 
 
 def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the cumulative sums (r, c + 1) of all samples on a circle before each sample."""
+    """Return, for each of r circles, the sums (r, c + 1) of its first 0, 1, ..., c samples."""
     out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
     turning, rising = _direction_terms(grid)
     for begin, end, left, right in _groups(pinhole, grid, 0):

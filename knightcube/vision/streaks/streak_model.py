@@ -316,8 +316,8 @@ def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Sh
     """Remove the counts before and after the exposure from the image of an infinite streak, `out[:, 0]`.
 
     The images of the streak ends, `out[:, 3:5]`, and the effect of the ends on the derivative `out[:, 5]`
-    with respect to the width are computed as well. The array `along` (b, LINES, k) is the distance (px) of
-    each pixel along the path from the centre of its block of pixels.
+    with respect to the width are computed as well. `along` (b, LINES, k), px, is the distance of
+    each pixel from the centre of its block of pixels, measured along the path.
     """
     out[:, 3:6] = out[:, IMAGES:] = 0.0
     crossing, centre, speed, gained = lines.time, lines.centre, lines.speed, lines.gained

@@ -481,7 +481,7 @@ class _RotationSums:
         return np.asarray(whole.reshape(3 * n, 3, m).transpose(0, 2, 1).reshape(3 * n, 3 * m))
 
     def information_of_pairs(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Return the information (n, 3, 3) of each function of `first` (n, b, 4) and that of `second`."""
+        """Return the information (n, 3, 3) between the functions of `first` (n, b, 4) and of `second`."""
         products = (first[..., None] * second[..., None, :]).reshape(len(first), -1)
         return (products @ self.information.transpose(0, 1, 3, 2, 4).reshape(-1, 9)).reshape(-1, 3, 3)
 
