@@ -117,7 +117,7 @@ def _public(name: str) -> Any:
 
 
 if not TYPE_CHECKING:
-    # Hidden from type checkers: because of `__getattr__`, they would accept any name, and they cannot
+    # Type checkers do not see these lines: with `__getattr__` they would accept any name, and they cannot
     # evaluate this `__all__`.
     __all__ = list(_MODULE_OF)
     __getattr__ = _public

@@ -71,7 +71,7 @@ class HotFunction(Generic[Parameters, Result]):
         chosen = self._chosen or self._choose()
         try:
             return chosen(*args, **kwargs)
-        except self._refusals:  # raised before the compiled form runs
+        except self._refusals:  # these exceptions are raised before the compiled form runs
             return self.numpy_form(*args, **kwargs)
 
     def _choose(self) -> Callable[Parameters, Result]:
@@ -83,7 +83,7 @@ class HotFunction(Generic[Parameters, Result]):
         return self._chosen
 
     def load(self) -> None:
-        """Load the machine code that earlier processes stored, which the first call would load otherwise."""
+        """Load the machine code that earlier processes stored; otherwise the first call would load it."""
         form: Any = self._chosen or self._choose()
         with contextlib.suppress(AttributeError, *self._refusals):  # the first call then loads or compiles
             cache, codegen = form._cache, form.targetctx.codegen()
@@ -98,8 +98,9 @@ class HotFunction(Generic[Parameters, Result]):
         """
         numba = importlib.import_module("numba")
         _announce_compilation()
-        # Without inlining, the process that compiles a helper and the processes that load it from the cache
-        # file would use different compiled forms of the helper, with sums in different orders.
+        # Helpers are inlined, because otherwise the process that compiles a helper and the processes that
+        # load the helper from the cache file would use different machine code, which computes sums in
+        # different orders.
         options = {**_UNWRAPPED, "no_cpython_wrapper": True, "fastmath": _ANY_ORDER, "forceinline": True}
         while _helpers:
             numba.extending.register_jitable(**options)(_helpers.pop())
@@ -135,7 +136,7 @@ def compiled_floats(function: Callable[Parameters, Result]) -> HotFunction[Param
 
 @compiled_floats
 def _nothing(_: Any) -> None:
-    """Do nothing; the first call loads numba, and the modules that numba needs for arrays."""
+    """Do nothing. The first call of this function loads numba and the modules that numba needs for arrays."""
 
 
 def load(*packages: str) -> None:
@@ -161,7 +162,7 @@ def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, 
 
 
 def in_use() -> bool:
-    """Return whether functions called for the first time in this process use their compiled form."""
+    """Return whether functions that this process has not called yet will use their compiled forms."""
     return os.environ.get(_SWITCH, "1") != "0" and _numba_is_usable()
 
 
@@ -189,7 +190,7 @@ _compilation = _Compilation()
 
 
 def compilation_ns() -> int:
-    """Return the time (ns) that this process has spent on compilation, without loading stored machine code.
+    """Return the time (ns) that this process has spent on compiling, which excludes loading machine code.
 
     The function is for measurements of execution times, which must not contain the compilation.
     """
@@ -203,7 +204,7 @@ def report_compilations(report: Callable[[str], None] | None) -> None:
 
 @functools.cache
 def _announce_compilation() -> None:
-    """Measure and report compilations, but not cache loads, and log a warning before the first one."""
+    """Measure and report compilations but not cache loads, and log a warning before the first compilation."""
     event = importlib.import_module("numba.core.event")
 
     class Compilations(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types

@@ -64,7 +64,7 @@ def _position(position: ArrayLike) -> FloatArray:
 
 
 def _single_position(position: ArrayLike) -> FloatArray:
-    """Return a geocentric position (3,), m. Raises ArgumentError for other shapes and as `_position`."""
+    """Return a geocentric position (3,), m. Raises ArgumentError for another shape or if `_position` does."""
     return _position(finite_array("position", position, (3,)))
 
 
@@ -317,10 +317,10 @@ def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> 
     """Return positions (n, 3), m, and velocities (n, 3), m/s, in ICRS axes from a two-line element set.
 
     The propagator is SGP4. The position error of SGP4 is one to three kilometres near the epoch of the
-    elements. It grows by one to three kilometres per day; the unknown drag adds an error that grows with the
-    square of the time. Elements are therefore useful for some days before and after their epoch. They are
-    accepted up to a standard deviation of 1,000 km, which is reached after about 5 days at a height of 300
-    km, two weeks at 400 km and two months at 800 km.
+    elements. The error grows by one to three kilometres per day; the unknown drag adds an error that grows
+    with the square of the time. Elements are therefore useful for some days before and after their epoch.
+    Elements are accepted if the standard deviation is at most 1,000 km, which is reached after about 5 days
+    at a height of 300 km, two weeks at 400 km and two months at 800 km.
 
     Args:
         elements: the two lines of the element set.

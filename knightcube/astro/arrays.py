@@ -129,8 +129,8 @@ def check_type(name: str, value: object, kind: type[object]) -> None:
 def check_fields(settings: Any, prefix: str = "") -> None:
     """Raise ArgumentError unless the fields of a dataclass that are annotated as int or float are numbers.
 
-    Fields annotated as int must be whole numbers. Dataclasses that are values of fields are also checked. The
-    text `prefix` precedes the names.
+    Fields annotated as int must be whole numbers. If the value of a field is a dataclass, its fields are also
+    checked. The text `prefix` precedes the names.
     """
     for field in fields(settings):
         value = getattr(settings, field.name)
@@ -144,7 +144,7 @@ def check_fields(settings: Any, prefix: str = "") -> None:
 
 
 _UNIT = 1e-12
-"""Largest deviation of the length of a vector from one at which the vector is not normalised again."""
+"""Largest difference between the length of a vector and 1 with which the vector is not normalised again."""
 
 
 def unit_vector(name: str, value: npt.ArrayLike) -> FloatArray:

@@ -57,7 +57,7 @@ def inertia_problem(inertia: FloatArray) -> str:
 
 
 def checked_inertia(name: str, value: npt.ArrayLike) -> FloatArray:
-    """Return the argument `name` as an inertia tensor (3, 3), kg m^2. Raises ArgumentError if impossible."""
+    """Return the valid inertia tensor (3, 3), kg m^2, in the argument `name`, or raise ArgumentError."""
     tensor = finite_array(name, value, (3, 3))
     if problem := inertia_problem(tensor):
         raise ArgumentError(name, f"{brief(tensor.tolist())} {problem}")

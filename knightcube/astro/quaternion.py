@@ -100,7 +100,7 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
 
 def _from_matrices(a: FloatArray) -> FloatArray:
     """Return the quaternions (..., 4) of attitude matrices (..., 3, 3), by Shepperd's method (see above)."""
-    products = np.empty((*a.shape[:-2], 4, 4))  # four times the products of the components
+    products = np.empty((*a.shape[:-2], 4, 4))  # products of the components of q, times 4
     products[..., :3, :3] = a + np.swapaxes(a, -1, -2)
     own, trace = np.diagonal(a, axis1=-2, axis2=-1), np.trace(a, axis1=-2, axis2=-1)
     i, j, k = np.arange(3), np.array([1, 2, 0]), np.array([2, 0, 1])

@@ -28,8 +28,8 @@ a full covariance matrix per direction.
 - Predictive filter: In each step the filter chooses the body rate that minimises the weighted residuals of
   the directions predicted to first order (Michalski, section 3.4.1, without a formula; Crassidis and Markley,
   Journal of Guidance, Control, and Dynamics 20, 1997; Park and Crassidis, Navigation 53, 2006). For
-  measurements at one time, the steps converge to the solution of Wahba's problem without rounding errors of
-  B.
+  measurements at one time, the steps converge to the solution of Wahba's problem, and the rounding errors of
+  B have no effect.
 
 - TRIAD: The attitude follows from the pair of directions whose covariance has the smallest trace, and the
   first direction of the pair is assumed to be exact (Michalski, section 3.4.5; covariance of Shuster and Oh).
@@ -42,8 +42,8 @@ a full covariance matrix per direction.
   Singla, Optimal linear attitude estimator, Journal of Guidance, Control, and Dynamics 30 (2007).
 
 TRIAD and OLAE do not minimise the loss function of Wahba's problem, whose solution is a statistically
-efficient estimate. The covariance of the difference between their attitude and the optimal attitude is
-therefore the difference between the two covariances.
+efficient estimate. The difference between the TRIAD or OLAE attitude and the optimal attitude therefore has a
+covariance equal to the difference between the covariances of the two attitudes.
 """
 
 from __future__ import annotations
@@ -290,7 +290,7 @@ class OlaeSolution:
     Attributes:
         rodrigues: (3,) Gibbs vector g: rotation axis times the tangent of half the angle (Sease, eq. 4.4).
         quaternion: (4,) quaternion whose attitude matrix rotates starts into ends (Sease, eq. 4.5 and 4.6).
-        residuals: (n, 3) residuals [s x] g - d of the pairs of directions (Sease, eq. 4.7).
+        residuals: (n, 3) residuals [s x] g - d of the pairs of directions, with d = b - r (Sease, eq. 4.7).
         sums: (n, 3) sums s = b + r of the pairs of directions (Sease, eq. 4.1).
         normal: (3, 3) normal matrix, the sum of w [s x]^T [s x], which is -2 times M in Sease, eq. 4.3.
     """
@@ -418,7 +418,8 @@ class VectorObservation:
     Attributes:
         observed: (3,) observed unit vector in body axes.
         reference: (3,) reference unit vector in inertial axes.
-        covariance: (3, 3) covariance of the observed vector in body axes, rad^2, across the direction.
+        covariance: (3, 3) covariance of `observed`, body axes, rad^2; only the part across the direction is
+            used.
     """
 
     observed: FloatArray

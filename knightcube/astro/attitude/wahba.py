@@ -268,7 +268,7 @@ def _check_unit_length(both: FloatArray) -> None:
     """Raise AttitudeError unless both halves (3,) of each row of an array (n, 6) are unit vectors."""
     vectors = both.reshape(-1, 2, 3)
     excess = np.einsum("nij,nij->ni", vectors, vectors) - 1.0
-    # The sum is small only if all vectors have unit length and no component is NaN.
+    # The sum of the squared excesses is small only if all vectors have unit length and no component is NaN.
     if np.vdot(excess, excess) <= (2.0 * _UNIT_TOLERANCE) ** 2:
         return
     right = np.abs(excess) <= 2.0 * _UNIT_TOLERANCE
@@ -280,9 +280,9 @@ def _check_unit_length(both: FloatArray) -> None:
 def _cofactors(gram: FloatArray, n: int, name: str) -> tuple[Rows, float]:
     """Return adjugate and determinant of the information matrix 1 - `gram` (3, 3) for normalised weights.
 
-    The eigenvalues of the information matrix add up to 2 and are at most 1. The determinant of the
-    information matrix is therefore within a factor of two of the smallest eigenvalue. Raises AttitudeError if
-    the smallest eigenvalue is below the rounding error.
+    The eigenvalues of the information matrix add up to 2 and are at most 1. The determinant is therefore at
+    most the smallest eigenvalue, and at least 4/9 of this eigenvalue. Raises AttitudeError if the smallest
+    eigenvalue is below the rounding error.
     """
     rows = (_EYE - gram).tolist()
     cofactors = adjugate(rows)

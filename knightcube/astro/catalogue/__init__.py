@@ -48,8 +48,8 @@ _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""Exceptions that can be raised while a damaged table is read. RuntimeError indicates unknown compression or
-encryption."""
+"""Exceptions that can be raised while a damaged table is read. The module zipfile raises RuntimeError for
+encrypted members and unknown compression methods."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

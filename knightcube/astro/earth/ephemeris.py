@@ -51,7 +51,7 @@ class Ephemeris:
     sunlit: FloatArray
 
     def position_at(self, times: FloatArray) -> FloatArray:
-        """Return the positions (m, 3), m, at times (m,), s. Raises OrbitError outside the prediction."""
+        """Return the positions (m, 3), m, at times (m,), s. Raises OrbitError for unpredicted times."""
         low, high, s, span = self._interval(times)
         start, end = self.position[low], self.position[high]
         out, into = span * self.velocity[low], span * self.velocity[high]
@@ -82,14 +82,15 @@ class Ephemeris:
         return self.interpolated(self.sunlit[:, None], times)[:, 0]
 
     def interpolated(self, values: FloatArray, times: FloatArray) -> FloatArray:
-        """Return values (m, k) at times (m,), s, interpolated linearly between values (n, k) at `times`."""
+        """Return `values` (n, k) of the n predicted times, interpolated linearly to `times` (m,), s."""
         low, high, s, _ = self._interval(times)
         return np.asarray((1.0 - s) * values[low] + s * values[high])
 
     def _interval(self, times: FloatArray) -> tuple[_Index, _Index, FloatArray, float]:
         """Return the nodes before and after each time (m,), the fractions (m, 1) between them, and the step.
 
-        The nodes are index arrays (m,) or, for a single time, slices, which numpy applies four times as fast.
+        The nodes are index arrays (m,) or, for a single time, slices, because numpy is four times as fast
+        with slices.
         """
         times = np.atleast_1d(times)
         first, last = float(self.times[0]), len(self.times) - 2
@@ -154,7 +155,7 @@ def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) 
     """Return the field (n, 3) in ICRS axes, T, predicted by a dipole model for `times` (n,) after now, s.
 
     The satellite is assumed to move along a circle with its current position, direction and angular rate. The
-    dipole field is rotated and scaled to agree with the current field (3,); this correction decays.
+    dipole field is rotated and scaled to agree with the current field (3,); the correction decays with time.
     """
     all_times = np.concatenate([[0.0], times])
     distance = float(np.linalg.norm(state.position))
@@ -169,7 +170,7 @@ def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) 
     along = np.einsum("ni,ni->n", dipole, direction)[:, None]
     found = np.asarray((_REFERENCE_RADIUS / distance) ** 3 * (3.0 * along * direction - dipole))
     first = found[0]
-    across = np.cross(field, first)  # rotation axis from `first` to `field`
+    across = np.cross(field, first)  # along the axis of the rotation from `first` to `field`
     length = float(np.linalg.norm(across))
     weight = np.exp(-times / _CORRECTION_TIME)[:, None]
     angle_off = math.atan2(length, float(first @ field))

@@ -50,7 +50,7 @@ class GeomagneticError(KnightCubeError):
 def check_year(year: float) -> None:
     """Raise GeomagneticError for a decimal year outside the validity of the model."""
     if not FIRST_YEAR <= year <= LAST_YEAR:
-        # With two digits, a day just outside the range would be shown as a year within the range.
+        # With two digits, a date just outside the range would be rounded to a year within the range.
         digits = 4 if FIRST_YEAR <= round(year, 2) <= LAST_YEAR else 2
         raise GeomagneticError(
             f"year {year:.{digits}f}: WMM2025 is valid from {FIRST_YEAR:.0f} to "

@@ -117,7 +117,7 @@ class _Fit:
     def __init__(self, dates: FloatArray, states: FloatArray) -> None:
         """Store the times and the `states`: positions (n, 3), or positions and velocities (n, 6)."""
         # In two-line elements, the epoch has eight decimals. An unrounded epoch just before the end of a year
-        # would become a day of the year that does not exist.
+        # would be written as a day after the last day of that year.
         self.epoch = round(float(dates[0]), 8)
         self.minutes = (dates - self.epoch) * 1440.0
         to_icrs = np.array([mean_equator_to_celestial(float(date)) for date in dates])
@@ -141,7 +141,8 @@ class _Fit:
         return _first_guess(np.array([first, second]))
 
     def solve(self, parameters: FloatArray, used: BoolArray) -> Any:
-        """Return the least-squares solution for the used states; the iteration starts at `parameters`."""
+        """Return the least-squares solution for the states with a set flag `used`, from guessed
+        `parameters`."""
 
         def residuals(values: FloatArray) -> FloatArray:
             made = _satellite(values, self.epoch)
@@ -166,7 +167,7 @@ class _Fit:
 
 
 def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return the distances (n,), m, of positions (n, 3), ICRS, from those by elements at Julian dates (n,).
+    """Return the distances (n,), m, between positions (n, 3), ICRS, m, and the positions by SGP4 at `dates`.
 
     Raises UsageError for elements that are not valid or that SGP4 cannot propagate to the given dates.
     """

@@ -73,7 +73,7 @@ class NamedElements:
 
 
 def read_elements(text: str) -> list[NamedElements]:
-    """Return the elements of all satellites in a text, which is recognised by its first characters.
+    """Return the elements of all satellites in a text, whose format is recognised by its first characters.
 
     Raises UsageError for invalid elements, with line and columns of two-line elements, or the field of an
     OMM.
@@ -225,8 +225,8 @@ def _lines(
 def _epoch(text: str, where: str) -> datetime:
     """Return the time of an epoch that is given as a calendar date or as a year with a day of the year.
 
-    The time is rounded to the resolution of two-line elements. An epoch just before the end of a year
-    otherwise becomes a day of the year that does not exist.
+    The time is rounded to the resolution of two-line elements. Otherwise, an epoch just before the end of a
+    year would be written as a day after the last day of that year.
     """
     plain = text.strip().removesuffix("Z")
     day_of_year = re.fullmatch(r"(\d{4})-(\d{3})(T.*)", plain)

@@ -35,8 +35,8 @@ _SGP4_EPOCH, _MINUTES_PER_DAY = 2_433_281.5, 1440.0
 _DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
 """Standard deviation of B* for small satellites as a fraction of B*, and its minimum (1/Earth radius)."""
 _DRAG_TIME, _DECAYING = 0.25, 1e7
-"""Time (days) over which the along-track shift by B* is computed, and shift (m/day^2) for a decaying
-orbit."""
+"""Time (days) over which the along-track shift due to B* is computed, and shift (m/day^2) that is assumed if
+the orbit decays within this time."""
 LARGEST_SIGMA = 1e6
 """Largest standard deviation (m) of a position per axis that the library returns from two-line elements."""
 
@@ -372,7 +372,8 @@ def check_lines(first: str, second: str) -> None:
         )
     days = 366.0 if int(first[18:20]) % 4 == 0 else 365.0
     if not 1.0 <= float(first[20:32]) < days + 1.0:
-        # For resonant orbits, SGP4 takes steps of half a day, which are too many for an absurd epoch.
+        # For resonant orbits SGP4 takes steps of half a day, and would take too many steps from an impossible
+        # epoch.
         raise UsageError(
             f"{first!r}: line 1, columns 21 to 32: the day of the year of the epoch, {first[20:32].strip()}, "
             f"must be from 1 to {days:g}"

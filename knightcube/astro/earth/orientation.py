@@ -2,8 +2,9 @@
 
 The precession-nutation model is IAU 2006/2000B, computed by ERFA, with an error of one milliarcsecond. UT1 is
 assumed to equal UTC unless the difference is given. The difference between UT1 and UTC is at most 0.9 s, or
-13" of Earth rotation. Polar motion (0.3") is neglected. Julian dates are UTC, and TT is 69.184 s ahead of UTC
-since 2017. A Julian date as a double-precision number has a resolution of 40 us, or 0.3 m along a low orbit.
+13" of Earth rotation. Polar motion (0.3") is neglected. Julian dates are UTC, and TT has been 69.184 s ahead
+of UTC since 2017. A Julian date as a double-precision number has a resolution of 40 us, or 0.3 m along a low
+orbit.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def julian_epoch(julian_date: npt.ArrayLike) -> FloatArray:
 def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
     """Return the matrices (..., 3, 3) that rotate vectors from ICRS to ITRS at Julian dates UTC (...)."""
     date = np.asarray(julian_date, dtype=float)
-    # ERFA recommends to split a Julian date into whole days and fraction.
+    # ERFA recommends splitting a Julian date into whole days and a fraction.
     whole = np.floor(date)
     day = date - whole
     return np.asarray(
