@@ -106,8 +106,8 @@ _STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
 """Steps of the six unknowns in central differences: direction (rad), velocity divided by distance (1/s), and
 logarithm of the distance."""
 _LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
-"""Longest Gauss-Newton steps of the five unknowns other than the distance, which keep poor hypotheses from
-diverging."""
+"""Limits of the Gauss-Newton steps of the five unknowns other than the distance. The limits keep poor
+hypotheses from diverging."""
 _ROUNDS, _FINAL_ROUNDS = 6, 20
 _MISFIT = 1e-6
 """Smallest accepted probability of the chi-square of a fit. A smaller probability indicates that the object

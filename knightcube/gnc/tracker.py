@@ -17,10 +17,9 @@ orbit radius.
 
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
-not straight lines. For example, the ratio (range rate) / range changes by the squared angular rate per second
-for an object that moves along a great circle at a constant angular rate. The spectral density of the process
-noise along the line of sight is therefore increased by (`bend` rate^2)^2 / rate, where rate is the angular
-rate of the object.
+not straight lines. For example, an object that circles the observer at the angular rate v accelerates towards
+the observer by v^2 times the range. The spectral density of the process noise along the line of sight is
+therefore increased by (`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
 
 Each sighting is assigned to at most one track, first to confirmed and then to tentative tracks, in order of
 increasing cost: the chi-square of direction and brightness plus the logarithm of the determinant of the
@@ -80,8 +79,8 @@ class MotionModel:
             and rate agree with the covariance in passes with angular rates of 0.05 to 0.6 deg/s and ranges of
             up to 5,000 km.
         residual_wander: noise density that replaces `wander` if the gravity gradient is known, 1/s^3.
-        bend: standard deviation of the unmodelled rate of change of the ratio (range rate) / range on curved
-            paths, as a multiple of the squared angular rate of the object.
+        bend: standard deviation of the unmodelled acceleration along the line of sight on curved paths,
+            divided by the range and by the squared angular rate of the object.
     """
 
     rate: float = 0.01
@@ -146,7 +145,7 @@ def begin(
 
 
 def tides(observer: FloatArray) -> FloatArray:
-    """Return the gravity gradient (3, 3) 1/s^2 at a position (3,) m from the Earth's centre, ICRS.
+    """Return the gravity gradient (3, 3), 1/s^2, at a geocentric position (3,), m, in ICRS axes.
 
     To first order, the relative acceleration in free fall is the gradient times the relative position.
     """
@@ -330,14 +329,15 @@ class ObjectTracker:
         return None
 
     def clear(self) -> None:
-        """Delete all tracks; the next frame may have any time."""
+        """Delete all tracks. The next frame may be earlier than the previous frame."""
         self._tracks, self._newest_ns = [], None
 
     def ingest(self, frame: FrameSightings) -> tuple[list[Track], list[Track]]:
         """Process a frame, and return the newly confirmed tracks and the confirmed tracks that ended.
 
         Raises ValueError, without any change of the tracks, for a frame that is not later than the previous
-        frame. Two frames of the same time may be the same exposure, whose errors would count as independent.
+        frame. Two frames of the same time may show the same exposure, so their errors would not be
+        independent.
         """
         if self._newest_ns is not None and frame.time_ns <= self._newest_ns:
             raise ValueError(f"time_ns is {frame.time_ns}: it must be after {self._newest_ns}")

@@ -131,7 +131,7 @@ def estimate_rate(
 def _rate(
     streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
 ) -> StreakResult:
-    """Return the result `seen`, completed by the rate, whose sign is unknown, or by the failure status."""
+    """Return the result `seen` with the rate, whose sign is unknown, or with the status of a failure."""
     seen = replace(
         seen,
         endpoints=streaks.endpoints,
@@ -243,7 +243,8 @@ def fit_rotation(
     raw = np.where(swapped[:, None, None], raw[:, ::-1], raw)
     outward = chord_outward(raw)
     errors = np.sqrt(2.0) * sigma / pinhole.focal_length
-    # The second pass corrects the bias of the ends along the arcs that the first pass predicts for the stars.
+    # The bias of the ends is corrected along the chords in the first pass, and in the second pass along the
+    # stars' arcs, which follow from the rotation of the first pass.
     for _ in range(2):
         if np.count_nonzero(used) < needed:
             return None

@@ -183,7 +183,7 @@ class GraphicMethodError(KnightCubeError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelCamera:
-    """Camera whose boresight is perpendicular to the body z axis, and whose y axis is parallel to it.
+    """Camera whose boresight is perpendicular and whose y axis is parallel to the body z axis.
 
     The unit vector `right` (2,) contains the components of the camera's x axis along body x and y. The
     optical axis is at the pixel `axis` (x, y).

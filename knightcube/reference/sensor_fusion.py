@@ -207,7 +207,8 @@ class SeparateDetermination:
         seconds = (time_ns - since_ns) * _NANOSECOND
         matrix, drift = attitude_matrix(turn), self._filter.bias_sigma
         for number, one in enumerate(self._fields):
-            # The gyro bias error is the same for all intervals, so that standard deviations are added.
+            # The gyro bias error is the same in all intervals, so the angle errors of the intervals add up
+            # linearly.
             drifted = (len(self._fields) - number) * FIELD_EVERY * drift
             cross = cross_matrices(one.observed[None])[0]
             added = cross @ cross.T * 2.0 * drifted * drift * seconds

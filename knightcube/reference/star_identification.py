@@ -32,8 +32,8 @@ attitude of identified stars by image matching.
 
 - Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
   one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
-  Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because otherwise guide stars
-  in dense regions of the sky would get the most votes if the noise exceeds 0.3 px. In a second vote, two
+  Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because guide stars in dense
+  regions of the sky would otherwise get the most votes at noise above 0.3 px. In a second vote, two
   assignments with many votes vote for each other if the angle between their guide stars agrees with the angle
   between their observed stars. The largest group of consistent assignments is the candidate.
 
@@ -101,8 +101,8 @@ class ClassicalSettings:
         verified: maximum number of candidates of a pattern that are verified with all observed stars.
         scale_step: relative half width of the interval of image scales that one search covers.
         scales: maximum number of image scales to search; a field that needs more scales is rejected.
-        cosine_limits: whether the limits of an angle are those of its cosine, whose variance is given by
-            Michalski, eq. 31, instead of the limits of the angle itself.
+        cosine_limits: whether the limits of an angle are computed from its cosine and the variance of the
+            cosine (Michalski, eq. 31) instead of the angle itself.
         verification: conditions for the acceptance of a candidate.
     """
 
@@ -138,7 +138,7 @@ class ScaledField:
         scale: factor by which the tangents of the field angles are multiplied.
         direction: (n, 3) unit vectors to the observed stars at this scale.
         sigma: (n,) standard deviations of the directions, rad.
-        slack: relative error of angles that the uncertainty of the scale causes.
+        slack: relative error of angles due to the uncertainty of the scale.
         stars: number of brightest observed stars from which patterns are formed.
         cosine_limits: whether the limits of angles are computed from their cosines.
     """
@@ -294,7 +294,8 @@ def _support(
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # The position error from a two-star attitude is proportional to the distance from their midpoint.
+    # If two stars define the attitude, the position error of another star grows with its distance from their
+    # midpoint.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -335,7 +336,8 @@ def matching_triangles(
 
 
 def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the indices (k,) into `right` and (k,) into `left` of all pairs of equal values."""
+    """Return, for all pairs of equal values, their indices (k,) in `right` and their indices (k,) in
+    `left`."""
     order = np.argsort(right, kind="stable")
     ranked = right[order]
     place, of = members(np.searchsorted(ranked, left), np.searchsorted(ranked, left, side="right"))
@@ -625,8 +627,9 @@ def identify_by_rate(
 def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
     """Return the body rate with which most observed points agree, by least squares over these points.
 
-    A rate is computed from each pair of the first ten points `direction` (n, 3), and the rate with which most
-    points agree is the initial guess. Raises ValueError if the numbers of directions and velocities differ.
+    A rate is computed from each pair among the first ten of the n points, which are given by `direction` (n,
+    3). The rate with which most points agree is the initial guess. Raises ValueError if the numbers of
+    directions and velocities differ.
     """
     if len(motion.velocity) != len(direction):
         raise ValueError(f"{len(direction)} directions and {len(motion.velocity)} velocities: give one each")
@@ -732,10 +735,11 @@ def match_images(
     independently. The rotation in the image is a rotation about the boresight, and the translation is a tilt
     of the boresight.
 
-    A tilt of the camera moves stars far from the boresight by more than stars at the boresight. The error of
-    the closed form is therefore proportional to the error of the prior attitude and to the squared field
-    angle. Each further step projects the stars with the newest attitude, which removes most of the remaining
-    error. Four steps reduce a prior error of 1 deg in a 20 deg field to less than 0.01".
+    If the camera is tilted, stars far from the boresight move farther in the image than stars at the
+    boresight. The error of the closed form is therefore proportional to the error of the prior attitude and
+    to the squared field angle. Each further step projects the stars with the newest attitude, which removes
+    most of the remaining error. Four steps reduce a prior error of 1 deg in a 20 deg field to less than
+    0.01".
 
     Raises AttitudeError if the attitude is undetermined, or if a star is behind the camera according to the
     prior attitude.

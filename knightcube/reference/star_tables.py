@@ -203,7 +203,7 @@ def angles(one: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def cosine_sigma(cosine: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the standard deviations (k,) of the measured cosines of angles (Michalski, eq. 26 to 31).
+    """Return the standard deviations (k,) of the cosines of measured angles (Michalski, eq. 26 to 31).
 
     With the covariance R = sigma^2 (I - b b^T) of a direction b (eq. 25b), the variance of eq. 31 becomes
     (sigma_1^2 + sigma_2^2) sin^2 + sigma_1^2 sigma_2^2 (1 + cos^2). The second term is the trace of R1 R2,
@@ -506,7 +506,7 @@ class KnownSky:
     """
 
     def __init__(self, index: SkyIndex, half_width: tuple[float, float]) -> None:
-        """Use the guide stars of an index for a field with the half-angle tangents `half_width` (2,)."""
+        """Select the guide stars for a field of view with the half-angle tangents `half_width` (2,)."""
         self.index = index
         self.half_width = half_width
         x, y = half_width

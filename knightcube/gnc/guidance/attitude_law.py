@@ -223,7 +223,7 @@ def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direct
 def following(
     axis: FloatArray, direction: FloatArray, velocity: FloatArray, since: float, quaternion: FloatArray
 ) -> AttitudeLaw:
-    """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
+    """Return the law that points `axis` (3,) to a `passing` object, without a rotation about `axis`.
 
     The law starts with the given attitude (4,) after the smallest rotation that aligns `axis`.
     """
@@ -239,7 +239,7 @@ def following(
 def approach(
     attitudes: Attitudes, quaternion: FloatArray, rate: FloatArray, begin: float, end: float
 ) -> Attitudes:
-    """Return the commanded transition from an attitude (4,) and a body rate (3,), rad/s, to an attitude law.
+    """Return the transition from an attitude (4,) with a body rate (3,), rad/s, to the motion `attitudes`.
 
     The transition lasts from `begin` to `end` s. The rotation vector relative to the attitude law is a
     quintic polynomial of time, which starts with the body's rate relative to the law and ends with zero rate.
@@ -278,7 +278,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
 
 
 def _any_across(axis: FloatArray) -> FloatArray:
-    """Return a unit vector (3,) normal to `axis`, close to the coordinate axis farthest from `axis`."""
+    """Return the unit vector (3,) normal to `axis` that is closest to a coordinate axis."""
     unit = np.eye(3)[int(np.argmin(np.abs(axis)))]
     return _unit(unit - axis * float(axis @ unit))
 

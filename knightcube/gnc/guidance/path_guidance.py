@@ -134,7 +134,7 @@ class PathGuidance:
         estimate_rate: float,
         disturbance: float = 0.0,
     ) -> PlanVerdict:
-        """Follow the path of `plan` from `origin_ns` on if the plan satisfies the acceptance rules.
+        """If `plan` satisfies the acceptance rules, follow its path from `origin_ns` on.
 
         The arguments `estimate_angle` (rad) and `estimate_rate` (rad/s) are the state at the start of the
         path. The current limit is checked for the estimated `disturbance` (rad/s^2).

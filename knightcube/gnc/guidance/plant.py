@@ -42,8 +42,8 @@ from knightcube.errors import UsageError
 def supply_power(current: FloatArray, voltage: float) -> FloatArray:
     """Return the power V |I|, W, that coils take from the supply for mean currents over a PWM period, A.
 
-    If `voltage` is that across a driven coil (`coils.supply_voltage`), the power at the coils is returned. If
-    it is the voltage of the bus before the H-bridge, the power taken from the bus is returned.
+    With the voltage across a driven coil (`coils.supply_voltage`) as `voltage`, the result is the power at
+    the coils. With the voltage of the bus before the H-bridge, the result is the power taken from the bus.
     """
     return np.asarray(voltage * np.abs(current))
 

@@ -90,7 +90,7 @@ class PointingTarget:
                 f"the goal of a pointing target is {brief(self.goal)}: give one of "
                 + ", ".join(f"Goal.{goal.name}" for goal in Goal)
             )
-        try:  # a list or an array could be changed later
+        try:  # a tuple, because a list or an array could be changed later
             object.__setattr__(self, "numbers", tuple(map(float, self.numbers)))
         except (TypeError, ValueError, OverflowError):
             text = f"{self.goal.label}: {brief(self.numbers)}: give a sequence of numbers"

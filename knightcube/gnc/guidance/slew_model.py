@@ -121,7 +121,8 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the second derivatives (n, 4, 4) with respect to q of the scalar products of `pull` and A(q) v.
 
-    The vectors are `pull` (n, 3) and v = `vector` (n, 3). The result is twice Davenport's matrices.
+    The vectors are `pull` (n, 3) and v = `vector` (n, 3). Each second derivative is twice Davenport's matrix
+    of the two vectors.
     """
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
@@ -226,7 +227,7 @@ _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
 def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
-    """Return second derivatives (n, 3, 4, 4), with respect to attitude, of air and sunlight accelerations."""
+    """Return the second derivatives (n, 3, 4, 4), with respect to q, of accelerations by air and sunlight."""
     count = len(around.field)
     result = np.zeros((count, 3, 4, 4))
     if around.pressures is not None:
@@ -307,7 +308,8 @@ class SlewPath:
     """The path of a slew, given at times (n,), s, from zero on and interpolated by the collocation cubics.
 
     The attitudes (n, 4) rotate ICRS into body axes. Rates (n, 3), rad/s, angular accelerations (n, 3),
-    rad/s^2, and dipole moments (n, 3), A m^2, linear between the times, are in body axes.
+    rad/s^2, and dipole moments (n, 3), A m^2, are in body axes. The dipole moments are linear between the
+    times.
     """
 
     times: FloatArray
@@ -335,7 +337,7 @@ class SlewPath:
     def references(self, times: FloatArray) -> AttitudeReferences:
         """Return the commanded motion at times (m,) s.
 
-        Before the start and after the end of the path, the body rests at the first or last attitude.
+        The body rests at the first attitude before the path, and at the last attitude after the path.
         """
         inside = np.clip(times, 0.0, self.horizon)
         turning = HermiteCubic(self.times, self.rate, self.acceleration)
@@ -426,7 +428,7 @@ class AttitudeEnd:
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return True, because only the target attitude has a zero error."""
+        """Return True, because an attitude with zero error is the target attitude."""
         return True
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
@@ -451,7 +453,7 @@ class BoresightEnd:
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return whether the boresight at an attitude (4,) of zero error points along the direction.
+        """Return whether the boresight points along the direction if the attitude `q` (4,) has zero error.
 
         The sines of the pointing error are also zero if the boresight is opposite to the direction.
         """
@@ -555,9 +557,9 @@ intervals, and the shortest duration by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL, _CHECKED_ENDS = math.radians(5.0), 1e-4, 65
-"""Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected if the end is
-that deep for all of `_CHECKED_ENDS` durations, and rate (rad/s) below which an end attitude counts as
-inertially fixed."""
+"""Depth (rad) inside an exclusion cone above which an end attitude is rejected, end rate (rad/s) below which
+the end attitude counts as fixed and is checked, and number of checked durations. A task is rejected if its
+end attitude is too deep for all of these durations."""
 MINIMUM_TIME = math.inf
 """Value of `time_cost` that requests a minimum-time slew, for which only the duration is minimised."""
 
@@ -661,8 +663,8 @@ def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
         shown = end.quaternion[None]
         return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
     for cone in task.cones:
-        # If one of two directions rotates about an axis, the largest angle between the directions is the sum
-        # of their angles from the axis.
+        # If one of two directions rotates about an axis, the largest angle between the two directions is the
+        # sum of the angles between each direction and the axis.
         pairs = ((end.axis, cone.axis), (end.direction, cone.direction(time)[0]))
         apart = sum(math.acos(min(max(float(one @ other), -1.0), 1.0)) for one, other in pairs)
         if min(apart, 2.0 * math.pi - apart) < float(cone.half_angles(time)[0]):
