@@ -336,8 +336,7 @@ def matching_triangles(
 
 
 def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
-    """Return, for all pairs of equal values, their indices (k,) in `right` and their indices (k,) in
-    `left`."""
+    """Return the indices (k,) in `right` and (k,) in `left` of the values of all pairs of equal values."""
     order = np.argsort(right, kind="stable")
     ranked = right[order]
     place, of = members(np.searchsorted(ranked, left), np.searchsorted(ranked, left, side="right"))
