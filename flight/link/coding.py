@@ -75,7 +75,7 @@ DATA_SYMBOLS = _CODEWORD - _PARITY
 _FIELD_POLYNOMIAL = 0x187
 _ROOT = 173  # alpha^11, whose powers 112 to 143 are the roots of the generator polynomial
 _FIRST_ROOT = 112
-_DUAL_BASE_ROOT = 117  # exponent of beta = alpha^117; the basis of the symbols is dual to the powers of beta
+_DUAL_BASE_ROOT = 117  # exponent k of beta = alpha^k; symbols use the basis dual to the powers of beta
 
 
 class ReedSolomon:
@@ -175,7 +175,8 @@ class Code(Protocol):
 
 _WRONG_MARKER_BITS = 3
 """Maximum number of wrong bits in a sync marker that is accepted directly after a valid codeblock. At a bit
-error rate of 0.8 %, at which the Reed-Solomon code fails, one of 8,000 markers has more wrong bits."""
+error rate of 0.8 %, at which the Reed-Solomon code fails, one marker of 8,000 has more than three wrong
+bits."""
 _RECENT_BLOCKS = 256
 """Number of codeblocks that are kept for reuse, because all lines send the same frames, and because a frame
 that no line accepted is sent again."""
@@ -338,10 +339,10 @@ class CltuStream:
 
 
 class CommandCode:
-    """Code of telecommands: CLTUs, randomised or not, or no code; `corrected` counts corrected bits."""
+    """Telecommand code: CLTUs, randomised or not, or uncoded frames; `corrected` counts corrected bits."""
 
     def __init__(self, cltu_kind: str | None) -> None:
-        """Encode frames in CLTUs of the kind "plain" or "randomised", or not at all for None."""
+        """Encode frames in CLTUs of the kind "plain" or "randomised"; with None, frames are not coded."""
         self._coded = cltu_kind is not None
         self._kind = "command" if cltu_kind == "randomised" else None
         self.corrected = 0
@@ -442,11 +443,11 @@ class LinkCodes:
         self._call_signs = call_signs
 
     def on_board(self, kiss: bool = False) -> Framing:
-        """Return the framing of the byte stream on the satellite, for a TNC if `kiss`."""
+        """Return the framing of the satellite's byte stream, with KISS frames for a TNC if `kiss` is true."""
         return _framing(self.telemetry, self.commands, self._call_signs, kiss)
 
     def on_ground(self, kiss: bool = False) -> Framing:
-        """Return the framing of the byte stream on the ground, for a TNC if `kiss`."""
+        """Return the framing of the ground's byte stream, with KISS frames for a TNC if `kiss` is true."""
         reverse = None if self._call_signs is None else (self._call_signs[1], self._call_signs[0])
         return _framing(self.commands, self.telemetry, reverse, kiss)
 

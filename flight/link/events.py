@@ -725,7 +725,7 @@ TESTBED = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
 """Modes that exist only on a testbed."""
 
 FOREIGN_MODES = {"testbed": ORBITAL, "orbit": TESTBED}
-"""Modes that each kind of body does not have."""
+"""Modes that a kind of body does not have, by kind."""
 
 STEERING = POINTING | TESTBED
 """Modes in which the planner and the controller steer the attitude."""

@@ -83,7 +83,7 @@ IDLE_CHANNEL = 7
 """Virtual channel of frames that contain only idle data."""
 _ONLY_IDLE_DATA = 0x7FE  # first header pointer of a frame with only idle data
 
-_COUNTS = 256  # number of values of a frame count
+_COUNTS = 256  # modulus of a frame count
 
 _STATUS = 0b11 << 11  # frame status field: segment length identifier 11, all flags zero
 _LEAST_IDLE = HEADER_BYTES + 1
@@ -160,7 +160,7 @@ class IdleFramer:
     """Framer of idle frames, which keep the carrier of a radio modulated and need no protection."""
 
     def __init__(self, spacecraft: int, frame_bytes: int, master: MasterCount, fill: bytes) -> None:
-        """Make frames of `frame_bytes` bytes with the first bytes of `fill`."""
+        """Make frames of `frame_bytes` bytes, whose data are the first bytes of `fill`."""
         self._first = spacecraft << 4 | IDLE_CHANNEL << 1
         self._fill = fill[: frame_bytes - TELEMETRY_HEADER.size - CRC_BYTES]
         self._master = master
@@ -193,9 +193,9 @@ class PacketAssembler:
     """Decoder that extracts the packets of one virtual channel from telemetry frames.
 
     The frame count in a frame header has only 8 bits, and neither it nor the first header pointer is
-    authenticated. A packet is therefore continued from one frame to the next only if three conditions hold:
-    the frame counts are consecutive, the authenticated counters leave no room for 256 lost frames, and the
-    first header pointer is where the next packet has to begin.
+    authenticated. A packet is therefore continued in the next frame only if three conditions hold: the frame
+    counts are consecutive, the authenticated counters exclude a loss of 256 frames, and the first header
+    pointer agrees with the length of the packet.
     """
 
     def __init__(self) -> None:

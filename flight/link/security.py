@@ -165,9 +165,10 @@ class Vault:
     def __init__(self, folder: Path, witness: Path | None = None, rebuild: bool = False) -> None:
         """Open a folder. Raises UsageError for a missing folder, or if other users may read its files.
 
-        On a satellite, `witness` is the path of the reference folder, which is created if possible. Other
-        users' access to the files is then removed. If `rebuild` is true, a lost folder is made again from the
-        reference folder, without the primary command SPI. Raises OSError if the lost folder cannot be made.
+        On a satellite, `witness` is the path of the reference folder, which is created if it does not exist.
+        With a reference folder, other users' access to the keys is removed. If `rebuild` is true, a lost
+        folder is made again from the reference folder, without the primary command SPI. Raises OSError if
+        this is not possible.
         """
         self._folder = folder
         self._witness = None if witness is None else _Witness(witness)
@@ -207,7 +208,7 @@ class Vault:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against writes by other processes. Raises KnightCubeError if that is impossible."""
+        """Lock the folder against writes by other processes. Raises KnightCubeError if locking fails."""
         with ExitStack() as stack:
             try:
                 file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -237,7 +238,7 @@ class Vault:
         return None if newest.spi == COMMAND_SPIS[0] else self._witness.known[newest.spi]
 
     def has_used(self, spi: int, key: bytes) -> bool:
-        """Return whether an SPI has this key, or has or had it according to the reference folder."""
+        """Return whether an SPI uses this key, or has used it according to the reference folder."""
         present = self.read(spi)
         recorded = self._witness is not None and self._witness.has_recorded(spi, key)
         return recorded or (present is not None and present.key == key)
@@ -279,7 +280,8 @@ class Vault:
         found = []
         for copy in COPIES:
             data = None
-            # A copy that one failed access to the disk hides would be replaced by an older association.
+            # Reading is retried, because a copy that could not be read would be replaced by an older
+            # association.
             for _ in range(_READ_TRIES):
                 with suppress(OSError):
                     data = read_regular(self._path(name, copy), _RECORD.size + _CRC_BYTES)
@@ -514,7 +516,7 @@ class Gate:
             data = unprotect(newer.cipher, header, self._mask, protected, self._encrypted)
             if data is None:
                 continue
-            # A next key that could not be stored as the present key is kept for the next start.
+            # If the next key cannot be stored as the present key, its file is kept for the next start.
             if name != spi and self.replace_key(spi, newer.generation, newer.key):
                 self._vault.remove(name)
             self._open[spi], self._stored[spi] = newer, newer.unused
@@ -589,7 +591,7 @@ class Sealer:
 
 
 USED_KEY = "has or had this key"
-"""Words of the satellite's report on a new key that it refuses because of `Vault.has_used`."""
+"""Text with which the satellite refuses a new key that the SPI has already used (`Vault.has_used`)."""
 
 
 def new_key() -> bytes:

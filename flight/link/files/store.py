@@ -376,7 +376,7 @@ class Store:
     def has_file(self, record: Incoming) -> bool:
         """Return whether the file of a complete transfer is on the disk.
 
-        Returns True also if this cannot be checked because accesses to the disk fail.
+        Returns True also if failing accesses to the disk prevent the check.
         """
         for path in (self.part(record), self.received / str(record.name)):
             try:
@@ -406,7 +406,7 @@ class Store:
             raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
 
     def room(self, copy: bool = False) -> int:
-        """Return the disk space (bytes) available for a received file, or for a selected `copy` of one."""
+        """Return the disk space (bytes) available for a received file, or for its selected copy if `copy`."""
         return max(0, shutil.disk_usage(self._folder).free - (_COPY_FREE_BYTES if copy else _FREE_BYTES))
 
     def _records(self, pattern: str, shape: type[T]) -> list[T]:

@@ -169,7 +169,7 @@ class Sender:
     Attributes:
         record: stored state of the transfer.
         condition: condition code with which the transfer ended, or None while it is open.
-        said: text about the end of the transfer.
+        said: description of the end of the transfer.
     """
 
     def __init__(
@@ -322,8 +322,8 @@ def _condition_text(condition: int) -> str:
 
 
 LACK_NS, SILENT_NS = 2_000_000_000, 10_000_000_000
-"""Times (ns) without a PDU after which missing ranges are requested: after the EOF has been received, and
-before."""
+"""Times (ns) without a PDU after which missing ranges are requested: if the EOF has been received, and if it
+has not."""
 FINISHED_NS = 5_000_000_000
 """Period (ns) after which an unacknowledged Finished PDU is repeated."""
 _FINISHED_TRIES = 20
@@ -339,7 +339,7 @@ class Receiver:
     Attributes:
         record: state of the transfer, which `keep` writes to disk.
         closed: whether the sender has acknowledged the end of the transfer or no longer answers.
-        said: text about the end of the transfer.
+        said: description of the end of the transfer.
         unplaced: whether the complete file has not been moved to its final path yet.
     """
 
@@ -364,7 +364,7 @@ class Receiver:
         self._requested_to: int | None = None  # offset up to which gaps are requested in the current round
         self._sum: FileSum | None = None
         self._finish = Timer(FINISHED_NS, now_ns - FINISHED_NS)
-        self._data_disk, self._disk = DiskTimer(now_ns), DiskTimer(now_ns)  # of the data, and of the end
+        self._data_disk, self._disk = DiskTimer(now_ns), DiskTimer(now_ns)  # for data, for the complete file
         self.unplaced = False
         # A transfer that continues after a restart requests its missing ranges at once.
         age_ns = SILENT_NS if record.name is not None else 0
@@ -535,7 +535,7 @@ class Receiver:
     def _continue_check(self, now_ns: int) -> None:
         assert self.record.end is not None
         checksum, size = self.record.end
-        # Data received before the metadata could not be checked against the size of the file.
+        # Data may have arrived before the metadata, which state the size of the file.
         if size != self.record.size or self._ranges.end > size:
             why = f"received bytes up to {self._ranges.end}, but the EOF states {size}"
             self.stop(Condition.SIZE_ERROR, why)
@@ -601,7 +601,7 @@ _SUSPENDED = "suspended"
 
 
 class Origin(NamedTuple):
-    """Frame and packet (first 16 bits, sequence count) of the command for a transfer; zeros without one."""
+    """Frame and packet (first 16 bits, sequence count) of the command that began a transfer, or zeros."""
 
     spi: int = 0
     counter: int = 0
@@ -750,7 +750,7 @@ class Entity:
         """Store received data durably, once a second or `at_once`. Raises FileError if the disk fails."""
         if at_once or now_ns - self._kept_ns >= _KEEP_NS:
             self._kept_ns = now_ns
-            with ExitStack() as stack:  # stores each transfer, also if another transfer cannot be stored
+            with ExitStack() as stack:  # if one transfer cannot be stored, the others still are
                 for receiver in self._in.values():
                     stack.callback(receiver.keep, now_ns)
 
@@ -794,8 +794,8 @@ class Entity:
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
         """Open an incoming transfer; if too many are open, end the least recently active transfer.
 
-        The transfer of a complete file that is not yet stored is ended early only if every open
-        transfer waits to store its file.
+        A transfer whose complete file still waits to be stored is ended only if this applies to all open
+        transfers.
         """
         if len(self._in) >= MOST_OPEN:
             oldest = min(self._in.values(), key=lambda one: (one.unplaced, one.received_ns))

@@ -117,7 +117,7 @@ def final_mode(command: Command) -> Mode | None:
 
 
 _LOG_DELAY_NS = 10 * SECOND_NS
-"""Mission time (ns) after which the log has been read beyond the BOOT packet at the beginning of a flight."""
+"""Mission time (ns) by which the link has read the BOOT packet at the beginning of a flight."""
 
 
 class Verification:
@@ -199,7 +199,7 @@ class ControlLine(Generic[T]):
 
     @property
     def is_full(self) -> bool:
-        """Whether as many commands as possible wait for answers."""
+        """Whether the maximum number of commands (`AT_MOST`) wait for answers."""
         return len(self._waiting) >= AT_MOST
 
     def send(self, command: T, data: bytes, now_ns: int) -> str:

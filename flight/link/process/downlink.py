@@ -207,7 +207,7 @@ def _number(path: Path) -> int:
 
 
 def _is_gone(path: Path, offset: int) -> bool:
-    """Return whether a file is missing or shorter than `offset`; a failed disk access shows neither."""
+    """Return whether a file is missing or shorter than `offset`, or False if the disk fails."""
     try:
         return path.stat().st_size < offset
     except FileNotFoundError:
@@ -355,7 +355,10 @@ class Downlink:
         self._queue.add(packet)
 
     def play(self, source: Iterator[bytes] | None) -> None:
-        """Play back the packets of `source` at the unused data rate; each b"" ends a call of `frames`."""
+        """Play back the packets of `source` at the unused data rate.
+
+        An item b"" of `source` ends the present call of `frames`.
+        """
         self._source = source
 
     def frames(self, now_ns: int, live_only: bool = False) -> list[bytes]:
@@ -386,7 +389,7 @@ class Downlink:
         return due + self._idle_frames(1e-9 * (now_ns - before), len(due))
 
     def _idle_frames(self, seconds: float, sent: int) -> list[bytes]:
-        """Return the frames of idle data that are due after `seconds` s in which `sent` frames were made."""
+        """Return the due frames of idle data; in the last `seconds` s, `sent` other frames were made."""
         most = self._frame_bytes + self._idle_rate * _BURST_S
         credit = self._idle_credit + self._idle_rate * seconds - sent * self._frame_bytes
         credit = min(max(credit, -most), most)

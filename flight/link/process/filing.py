@@ -368,9 +368,9 @@ class Renewal:
         return "the request could not be stored"
 
     def followed(self, packet: bytes, now_ns: int, *, live: bool) -> None:
-        """Note a fault, a refused configuration, or a reaction to SAFE that a telemetry packet reports.
+        """Note the fault, refused configuration or automatic change to SAFE that a telemetry packet reports.
 
-        The time of a used GPS fix is also noted if the packet was just written (`live` is true).
+        If `live` is true, the packet was just written, and the time of a GPS fix in use is also recorded.
         """
         if (row := row_of(MODE, packet)) is not None:
             if row["mode"] == Mode.SAFE and to_text(row["trigger"]) == _REACTION:

@@ -103,14 +103,14 @@ class Line(Protocol):
         """Return the received frames with their senders, oldest first. Never raises."""
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Record that a sender has sent an authentic frame; by default, nothing is recorded."""
+        """Note that a frame from `sender` was authentic. The default does nothing."""
         return
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
         """Send frames to all listeners. Never raises.
 
-        Returns how many frames, counted from the first, at least one listener takes, or None if nobody
-        listens. The caller sends the other frames again.
+        Returns the number of leading frames that at least one listener accepted, or None if nobody listens.
+        The caller sends the remaining frames again.
         """
 
     def close(self) -> None:
@@ -124,7 +124,7 @@ class _Output:
         self._rest = b""
 
     def send(self, frames: Sequence[bytes], write: Callable[[bytes], int]) -> int:
-        """Send frames by `write`, which returns the number of written bytes. Return how many were begun."""
+        """Send frames by `write`, which counts the written bytes. Return the number of begun frames."""
         data, bounds = self._rest + b"".join(frames), [*accumulate(map(len, frames), initial=len(self._rest))]
         written = write(data) if data else 0
         begun = sum(begin < written for begin in bounds[:-1])
@@ -212,7 +212,7 @@ class UdpLine:
         return len(frames)
 
     def _send(self, unit: bytes, listener: Any) -> bool:
-        """Send a datagram. Return whether the network has taken it."""
+        """Send a datagram. Return whether the network has accepted it."""
         with contextlib.suppress(OSError):
             return self._socket.sendto(unit, listener) == len(unit)
         return False
@@ -229,7 +229,7 @@ class _Connection:
     stream: FrameDecoder
     output: _Output = field(default_factory=_Output)
     trusted: bool = False
-    refused_ns: int | None = None  # since when the connection takes no frame
+    refused_ns: int | None = None  # time since which the connection has accepted no frame
 
 
 class TcpLine:
@@ -292,7 +292,7 @@ class TcpLine:
             state.trusted = True
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
-        """Send frames to the authenticated connections, and close those that take none for five minutes."""
+        """Send frames to authenticated connections; close connections that accept none for five minutes."""
         marked, begun = list(map(self._framing.wrap, frames)), list[int]()
         for connection, state in list(self._connections.items()):
             if not state.trusted:
@@ -368,7 +368,7 @@ class TncLine(Line):
         return [(frame, None) for frame in self._stream.add(data)]
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> int:
-        """Send each frame as the data of one KISS frame. Without a connection the TNC takes no frame."""
+        """Send each frame as the data of one KISS frame. Without a connection, no frame is accepted."""
         if self._socket is None and now_ns >= self._next_ns:
             self._next_ns = now_ns + _RECONNECT_NS
             self._stream = self._framing.stream()
@@ -410,7 +410,7 @@ class SerialLine(Line):
         return [(frame, None) for _, data in pieces for frame in self._stream.add(data)]
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> int:
-        """Send frames. A port that is lost takes no frame."""
+        """Send frames. No frame is accepted if the port is lost."""
         try:
             return self._output.send(list(map(self._framing.wrap, frames)), self._write)
         except DeviceError:
@@ -469,7 +469,7 @@ _UTC_WAIT_NS = 120 * SECOND_NS
 _RESERVED_BLOCK = 4096
 _REFUSALS_A_SECOND = 4
 _STALL_NS = 10 * SECOND_NS
-"""Shortest time (ns) after which a line that takes no frame is reported, because a slow line needs seconds
+"""Shortest time (ns) after which a line that accepts no frame is reported, because a slow line needs seconds
 for a frame."""
 _STATUS_WAITING = 16
 """Largest number of waiting reports at which a status report of the link is still queued."""
@@ -509,13 +509,13 @@ class Transmitter:
     """Sender of the due frames on all lines; frames that no line accepts are sent again before others.
 
     While nobody listens, live telemetry is discarded, and files and playback wait. The attribute `untaken`
-    counts the frames that were not accepted, once for each attempt and line.
+    counts how often a line did not accept a frame.
     """
 
     def __init__(self, lines: Sequence[Line], downlink: Downlink) -> None:
         self._lines, self._downlink = lines, downlink
         self._stall_ns = max(_STALL_NS, round(2 * downlink.frame_s * SECOND_NS))
-        self._refused_ns: dict[str, int] = {}  # since when each line that takes no frame refuses all frames
+        self._refused_ns: dict[str, int] = {}  # time since which a line has accepted no frame, by line
         self._unsent: list[bytes] = []
         self._listened = False  # whether anybody listened to the last frames
         self.untaken = 0
@@ -623,9 +623,9 @@ class Station:
         In the second case the folder of keys was mounted late, and a new station must read the keys, the
         schedule and the file transfers of this folder.
 
-        The function `complain` is called once for each problem with sending, and at most once a second while
-        reports are lost. The function `alive` is called once a second while the loop makes progress, also
-        during an iteration that processes many frames.
+        The function `complain` is called for each new problem with sending, and at most once a second for
+        lost reports. The function `alive` is called once a second while the loop makes progress, also during
+        an iteration that processes many frames.
         """
         self._alive = alive
         due_ns, complained, lost, lost_ns = self._clock.now_ns(), "", 0, 0

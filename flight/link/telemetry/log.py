@@ -8,10 +8,10 @@ separate performance log. The flight log of a lock-step simulation is reproducib
 
 Each boot creates a new run folder such as `run-000042`, into which no later boot writes. Runs are ordered by
 number, because the wall clock of the flight computer may be wrong. The oldest runs are deleted if the archive
-exceeds its budget. They are also deleted, and then the oldest segments of the present run, if the disk has
-less than `LEAST_FREE_BYTES` free bytes, because the link needs free space for requests and files from the
-ground. Little free space alone does not delete the newest earlier run. If the disk cannot be written, the
-flight continues without a log.
+exceeds its budget. If the disk has less than `LEAST_FREE_BYTES` free bytes, old runs and then the oldest
+segments of the present run are deleted, because the link needs space for requests and files from the ground.
+The newest earlier run is never deleted only to gain free space. If the disk cannot be written, the flight
+continues without a log.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class SegmentStore:
         return not os.path.lexists(earlier[0])
 
     def _keep_whole(self, chunk: list[bytes], written: int) -> None:
-        """Count the complete packets of `chunk` within `written` bytes, and truncate the file after them."""
+        """Count the packets of `chunk` that end within `written` bytes; truncate the file after them."""
         whole = 0
         for packet in chunk:
             if whole + len(packet) > written:
@@ -243,8 +243,8 @@ LEAST_FREE_BYTES = 256 << 20
 """Free disk space (bytes) that the runs of an archive leave, enough for the largest update in orbit."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EUCLEAN, errno.EBADMSG})
-"""Error numbers (errno) of a full, failing or damaged disk. A different error number indicates a wrong path
-of the log."""
+"""Error numbers (errno) of a full, failing or damaged disk. Any other error number means that the path of the
+log is wrong."""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
@@ -370,10 +370,10 @@ class FlightLog:
         """Begin a new log.
 
         If `sync_period_ns` is None, fsync is called only at the end of each segment file, for example in a
-        lock-step simulation, which runs faster than real time. If `patient` is true, a failing disk raises no
-        error, writing is retried, and the folder is that of a run in an archive, which leaves
-        `LEAST_FREE_BYTES` free. Raises UsageError if the folder contains a log of the same name and
-        `overwrite` is false, if the sizes are invalid, or if the folder cannot be written.
+        lock-step simulation, which runs faster than real time. If `patient` is true, the folder is that of a
+        run in an archive: if the disk fails, writing is retried and no error is raised, and
+        `LEAST_FREE_BYTES` of the disk are kept free. Raises UsageError if the folder contains a log of the
+        same name and `overwrite` is false, if the sizes are invalid, or if the folder cannot be written.
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
             raise UsageError(

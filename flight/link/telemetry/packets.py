@@ -165,7 +165,7 @@ LAYOUTS: dict[str, Layout] = compile_layouts(PACKETS)
 
 
 def row_of(kind: Packet, packet: bytes) -> Any:
-    """Return the values of a valid packet, or None if it is not a packet `kind` of the defined version."""
+    """Return the values of a valid packet, or None if its type or version is not that of `kind`."""
     layout = LAYOUTS[kind.name]
     known = len(packet) == layout.length and packet[HEADER_BYTES] == kind.version
     return layout.array(packet)[0] if known and packet[:2] == layout.identifier.to_bytes(2, "big") else None
