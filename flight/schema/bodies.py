@@ -107,8 +107,8 @@ class Control(Section, frozen=True, kw_only=True):
 class Identification(Section, frozen=True, kw_only=True):
     """Motion of the body during `knightcube identify`.
 
-    The coils use at most the fraction `current_share` of their current limit. The body stays within
-    `largest_q2`, and each free oscillation lasts `swing` s.
+    The coils use at most the fraction `current_share` of their current limit. The quaternion component q2
+    stays within `largest_q2`, and each free oscillation lasts `swing` s.
     """
 
     current_share: Annotated[float, Meta(gt=0.0, le=0.9)] = 0.6
@@ -154,7 +154,7 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
         return 0.2 * self.plant.field, 3.0 * self.plant.field
 
     def replan_period(self) -> float:
-        """Return the time (s) from one periodic plan, which starts from the newest estimate, to the next."""
+        """Return the planning period (s); each plan starts from the newest estimate."""
         return self.guidance.replan_period
 
     def hardware(self) -> tuple[Section, ...]:
@@ -187,8 +187,8 @@ pressure is a tenth of the largest pressure (solar maximum, perpendicular incide
 _LARGEST_PRESSURE = 10.0
 """Ratio of the largest to the expected pressure."""
 _DIPOLE, _MOMENT = 3.0e-4, 1.047e-3
-"""Dipole (A m^2) that costs as much as an attitude error of 1 deg, and mean moment of inertia (kg m^2) of the
-1U CubeSat for which this dipole was tuned."""
+"""Dipole (A m^2) that costs as much as an attitude error of 1 deg on a 1U CubeSat, and the mean moment of
+inertia (kg m^2) of this CubeSat."""
 
 _DIPOLE_PER_MASS = 3.5e-3
 """Residual dipole (A m^2) per kg of a satellite of class II that does not spin (NASA SP-8018)."""
@@ -361,9 +361,9 @@ class Requirements(Section, frozen=True, kw_only=True):
 
     Detumbling must end within `slow_within` s of the start, and the attitude must be fine within
     `fine_within` s after that. The value `knowledge_deg` limits the rms error of the attitude with star
-    fixes, over all axes. The value `pointing_deg` limits the rms error of the pointing axis from ten minutes
-    after the start of pointing on. The value `camera_missed_percent` limits the percentage of the instants at
-    which the unobstructed star camera gave neither an attitude nor a rate.
+    fixes, over all axes. The value `pointing_deg` limits the rms error of the pointing axis, beginning ten
+    minutes after the start of pointing. The value `camera_missed_percent` limits the percentage of the
+    instants at which the unobstructed star camera gave neither an attitude nor a rate.
     """
 
     slow_within: Positive | None = None
@@ -404,8 +404,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def torque_noise(self) -> float:
         """Return the noise of unmodelled torques in detumbling, rad/s per sqrt(s).
 
-        The default is a tenth of the root mean square of the angular accelerations that the mean dipole limit
-        causes about the three principal axes in a typical field.
+        The default is a tenth of the rms angular acceleration about the principal axes that the mean dipole
+        limit causes in a typical field.
         """
         if self.detumble.torque_noise is not None:
             return self.detumble.torque_noise
@@ -461,8 +461,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def slew_duration(self) -> float:
         """Return the requested duration of a slew to a distant target, s.
 
-        The default is sixteen times the square root of the largest moment of inertia divided by the torque of
-        the mean dipole limit in a typical field, limited to the range from 60 s to 1500 s.
+        The default is 16 sqrt(J / T) s, rounded to 10 s and limited to 60 s to 1500 s, where J is the largest
+        moment of inertia and T the torque of the mean dipole limit in a typical field.
         """
         if self.pointing.slew is not None:
             return self.pointing.slew

@@ -124,8 +124,8 @@ class Sensor(Section, frozen=True, kw_only=True):
     `spi`. The mapping `measures` names the quantities that are read from the sensor, and for each quantity
     the sensor's axis along the axes x, y and z of the unit, such as `gyro: [y, -x, z]`. The mapping `set`
     names attributes of the CircuitPython driver, for example a data rate, and the values that these
-    attributes receive after each start. The value `emulator` names the emulator of another sensor, as
-    `module:function`.
+    attributes receive after each start. If the simulator has no emulator of the sensor, the value `emulator`
+    names one as `module:function`.
     """
 
     part: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -141,9 +141,9 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
     """An inertial unit of separate gyro, magnetometer and accelerometer (driver `sensors`).
 
     The attitude follows from acceleration and magnetic field. Without an accelerometer the unit measures no
-    attitude, so that a unit with only a gyro and a magnetometer is suitable for a satellite in orbit only. A
-    magnetometer alone is a unit without a gyro: the state estimate is then based on star attitudes, streak
-    rates, the magnetic field and the dynamic model.
+    attitude: a gyro with a magnetometer suffices only for a satellite in orbit. A magnetometer alone is a
+    unit without a gyro: the state estimate is then based on star attitudes, streak rates, the magnetic field
+    and the dynamic model.
     """
 
     sensors: Annotated[tuple[Sensor, ...], Meta(min_length=1, max_length=4)]
@@ -347,9 +347,9 @@ class LowBattery(Section, frozen=True, kw_only=True):
     """The states of charge below which the flight application sheds loads, in the order of the keys.
 
     Below `low`, the coils carry at most the fraction `coil_share` of their current limits. Below `very_low`,
-    the star camera takes a frame every `camera_period` s at most. Below `critical`, the mode changes to safe.
-    A load is switched on again when the state of charge exceeds its limit by `hysteresis`. When the state of
-    charge exceeds `critical` by `hysteresis`, the satellite leaves the mode SAFE without a command.
+    the star camera takes at most one frame every `camera_period` s. Below `critical`, the mode changes to
+    safe. A load is switched on again when the state of charge exceeds its limit by `hysteresis`. When the
+    state of charge exceeds `critical` by `hysteresis`, the satellite leaves the mode SAFE without a command.
     """
 
     low: Share = 0.4
@@ -478,7 +478,8 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="driver", tag="
 
 
 FAST = 0.02
-"""Body rate (rad/s) at which scale and alignment of the gyro add 0.01 deg to the attitude in 10 s."""
+"""Body rate (rad/s) at which the scale and alignment errors of the gyro add 0.01 deg to the attitude error in
+10 s."""
 
 
 class Camera(Section, frozen=True, kw_only=True):
@@ -629,8 +630,8 @@ def lens_model(lens: CameraLens, columns: int, rows: int) -> Lens:
 def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
     """Return the mask (rows, columns) of the pixels that show the spacecraft.
 
-    The image file is ignored if `of_file` is false. Raises UsageError for a wrong file, and if more than half
-    of the image is hidden.
+    The image file is ignored if `of_file` is false. Raises UsageError if the file is not an image of the
+    camera's size, or if more than half of the image is hidden.
     """
     mask = polygon_mask(camera.rows, camera.columns, camera.structure)
     if of_file and camera.structure_file is not None:
@@ -651,7 +652,7 @@ def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
 
 
 def stated_accuracy(camera: Camera) -> CameraKnowledge:
-    """Return the standard deviations of the camera parameters that the configuration states."""
+    """Return the standard deviations of the camera parameters, as stated in the configuration."""
     accuracy = camera.accuracy
     return CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time)
 
@@ -695,13 +696,14 @@ class Driver:
         section: type of the section, which adds the driver's own keys to those of the kind's base section.
         open: function that takes the rig and the section, and returns the driver (`hal.interfaces.devices`).
             A driver of coils must be passive until its method `start` is called.
-        probe: function that takes a rig and the section, queries the device without changing its state, and
-            returns its answer as text, or raises DeviceError if the device does not answer. Only the driver
-            `sensors` starts its sensors, for which `knightcube check` locks the bus of the coils.
+        probe: function that takes a rig and the section, and returns the device's answer to a query as text.
+            The query does not change the state of the device. Raises DeviceError if the device does not
+            answer. Only the driver `sensors` starts its sensors; `knightcube check` locks the bus of the
+            coils for this.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
             device to the emulated wires, and returns the device. A camera driver needs no function `emulate`,
-            because the simulator emulates the cameras of all drivers. A device of another package without an
-            emulator can only be used on hardware.
+            because the simulator emulates the cameras of all drivers. Any other device without this function
+            can only be used on hardware.
         files: function that returns the device files that the section names.
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils
@@ -723,7 +725,8 @@ class Driver:
 def _ours(kind: str, section: type[Any], name: str, *more: str, **values: Any) -> Driver:
     """Return the registry entry of a built-in driver, whose functions are in `flight.app.devices`.
 
-    The words `more` name optional functions of the entry, and `values` are its other attributes.
+    The words `more` name the functions besides `open`, `probe` and `files`; `values` are other attributes of
+    the entry.
     """
     words = ("open", "probe", "files", *more)
     functions: dict[str, Any] = {word: later(f"flight.app.devices:{word}_{name}") for word in words}
@@ -795,7 +798,7 @@ def _named(kind: str, named: str, key: str) -> Driver:
 
 
 def _explained(driver: Driver, named: str, key: str) -> Driver:
-    """Return a driver of another package, whose functions explain mistakes in their code (`call_named`)."""
+    """Return a driver of another package, with functions that report mistakes in its code (`call_named`)."""
 
     def explained(word: str) -> Any:
         function, device = getattr(driver, word), word in {"open", "probe", "off"}
@@ -859,7 +862,7 @@ def _cameras(values: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
 
 @lru_cache(maxsize=32)
 def _camera_fields(others: tuple[tuple[str, type[Any]], ...]) -> list[tuple[str, Any]]:
-    """Return the fields of the cameras, whose `device` may also be of the tagged types `others`."""
+    """Return the fields of the cameras, whose `device` may also have one of the types `others`, by tag."""
     device: Any = V4l2Device | AravisDevice | None
     for named, section in others:
         name, bases = section.__name__, (section,)

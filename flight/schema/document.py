@@ -99,7 +99,7 @@ _MISTAKES = (
     OSError,
     RuntimeError,
 )
-"""Exceptions that mistakes in a module usually raise during its import and in its functions."""
+"""Exceptions that programming errors usually raise, during the import of a module or in its functions."""
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
@@ -142,11 +142,11 @@ def _import_problem(module: str, name: str, error: Exception, on_board: bool) ->
 def call_named(
     key: str, named: str, function: Callable[..., Any], *arguments: Any, device: bool = False
 ) -> Any:
-    """Return the result of a function of the object `named` (`module:object`), which the key `key` gives.
+    """Return the result of `function`, which belongs to the object `named` that the key `key` gives.
 
     Raises ConfigError, with the file and line, if the function fails because of a mistake in its code. If the
-    function uses a `device`, NotResponding is raised instead, because a fault of the device may also be the
-    cause, and a service does not start again after a ConfigError.
+    function uses a `device`, NotResponding is raised instead, because the device may also have caused the
+    failure, and a service does not restart after a ConfigError.
     """
     try:
         return function(*arguments)
@@ -163,7 +163,7 @@ def call_named(
 
 
 def _mistake(error: Exception, file: str | None, cure: str) -> str:
-    """Return an error with file and line, if possible of the given file, and the remedy for this line."""
+    """Return the text of an error with its location, if possible in `file`, and the remedy `cure`."""
     frames = [one for one in traceback.extract_tb(error.__traceback__) if not one.filename.startswith("<")]
     own = [one for one in frames if one.filename == file] or frames
     where = f"{own[-1].filename}:{own[-1].lineno}: " if own and own[-1].filename != __file__ else ""
@@ -171,7 +171,7 @@ def _mistake(error: Exception, file: str | None, cure: str) -> str:
 
 
 _TRANSIENT = frozenset({errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE})
-"""Error numbers of a failing disk, and of used up memory or descriptors: a later attempt may succeed."""
+"""Error numbers of a failing disk and of exhausted memory or descriptors: a later attempt may succeed."""
 
 
 def _permitted_objects(path: Path) -> list[str]:
@@ -291,7 +291,7 @@ def read_text(path: Path, packaged: bool = True) -> str:
 
 
 def not_utf_8(path: Path, error: UnicodeDecodeError) -> ConfigError:
-    """Return the error for a file that is not UTF-8, with the wrong byte."""
+    """Return the error for a file that is not UTF-8; the error states the first invalid byte."""
     byte = error.object[error.start]
     return ConfigError(str(path), f"is not UTF-8, byte 0x{byte:02x}: save the file as text in UTF-8")
 
@@ -302,7 +302,7 @@ def names() -> list[str]:
 
 
 def no_such_file(path: Path) -> str:
-    """Return the message about a missing file, with the most similar packaged configuration, or all."""
+    """Return the message about a missing file; it names a similar packaged configuration, or else all."""
     known = names()
     similar = difflib.get_close_matches(path.name.removesuffix(".yaml"), known, n=1, cutoff=0.75)
     if similar:
@@ -555,7 +555,7 @@ _YAML_CURES = {
     "another document": ": remove the line `---`",
     "expected <block end>": ": check brackets, commas and the indentation",
 }
-"""What to do about texts that are not YAML, by a part of the message of the parser."""
+"""Remedies for texts that are not YAML, by a part of the parser's message."""
 
 
 def _unit_hint(dotted: str, value: Any, message: str, below: bool) -> str:
@@ -572,7 +572,7 @@ def _unit_hint(dotted: str, value: Any, message: str, below: bool) -> str:
 
 
 def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
-    """Suggest a known key for the unknown `key` of the struct at `path`, if possible one that extends it."""
+    """Suggest a known key for an unknown `key` of the struct at `path`; prefer keys that begin with `key`."""
     for step in re.findall(r"\.([^.\[]+)", path):
         fields = {f.encode_name: f.type for f in msgspec.structs.fields(shape)}
         tree = tree.get(step) if isinstance(tree, dict) else None
@@ -586,7 +586,7 @@ def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
 
 
 def _struct_of(annotation: Any, tree: Any) -> Any:
-    """Return the struct class in an annotation, such as `Camera | None`, by the tag in `tree`."""
+    """Return the struct class in an annotation such as `Camera | None`, selected by the tag in `tree`."""
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         config = annotation.__struct_config__
         tag = tree.get(config.tag_field) if isinstance(tree, dict) and config.tag_field else config.tag
@@ -612,7 +612,7 @@ def _permitted(message: str, shape: Any, path: str) -> str:
 
 
 def _limits(kinds: list[inspect.Type]) -> str:
-    """Return the range of a number, such as `64 to 8192`, or an empty text if the types differ in it."""
+    """Return the range of a number, such as `64 to 8192`, or an empty text if the types differ in range."""
     found = {
         (kind.gt, kind.ge, kind.lt, kind.le)
         for kind in kinds

@@ -197,17 +197,18 @@ def _check_craft(craft: Craft, refuse: Refuse) -> None:
 
 # Limits of the density of a satellite, kg/m^3: an inflated balloon, and platinum.
 _DENSITIES = (5.0, 20_000.0)
-# Largest ratio of moments of inertia to those of the same mass at the corners of the body, for long booms.
+# Largest ratio of the sum of the moments of inertia to that of the same mass at the corners of the body. The
+# ratio exceeds 1 for a satellite with long booms.
 _MOST_SPREAD = 10.0
-# Smallest ratio of moments of inertia to those of a homogeneous body.
+# Smallest ratio of the sum of the moments of inertia to that of a homogeneous body.
 _LEAST_INERTIA = 0.05
-# Largest dipole moment of a coil per kg of the satellite, A m^2/kg: a tenth of the mass is saturated iron.
+# Largest dipole moment of a coil per kg of the satellite, A m^2/kg, if a tenth of the mass is saturated iron.
 _MOST_DIPOLE = 20.0
 # Largest residual dipole of a satellite with magnetic control, per kg of its mass, A m^2/kg.
 _MOST_RESIDUAL = 0.5
 # Largest field of the Earth in orbit, T: at the poles, at the lowest altitude.
 _EARTH_FIELD = 6.5e-5
-# Largest ratio of the current that the supply can drive to the limit of the current.
+# Largest ratio of the current that the supply can drive through a coil to the current limit of the coil.
 _MOST_SURPLUS = 100.0
 
 
@@ -576,7 +577,7 @@ def parse(text: str, name: str = "configuration") -> Config:
 
 
 def _check_body(document: Document) -> None:
-    """Raise ConfigError for a section that belongs to the other kind of body, with the remedy.
+    """Raise ConfigError, with a remedy, for a section that belongs to the other kind of body.
 
     A body defined outside this repository uses the sections of the testbed.
     """
@@ -611,7 +612,7 @@ def _replace_unit(document: Document) -> None:
 
 
 def load_testbed(path: Path) -> TestbedConfig:
-    """Read and validate a configuration of the testbed. Raises ConfigError, also for another body."""
+    """Read and validate a configuration of the testbed. Raises ConfigError for any other body."""
     try:
         return as_testbed(load(path))
     except ConfigError as error:
@@ -619,7 +620,7 @@ def load_testbed(path: Path) -> TestbedConfig:
 
 
 def load_orbit(path: Path) -> OrbitConfig:
-    """Read and validate a satellite's configuration. Raises ConfigError, also for another body."""
+    """Read and validate a satellite's configuration. Raises ConfigError for any other body."""
     try:
         return as_orbit(load(path))
     except ConfigError as error:

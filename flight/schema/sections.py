@@ -198,9 +198,10 @@ class Link(Section, frozen=True, kw_only=True):
     bytes. Each communication line carries at most `rate` bytes/s of telemetry frames. Idle frames raise the
     rate to `idle_rate` bytes/s. Telemetry is always authenticated, and readable without a key if
     `encrypt_telemetry` is false. The section `coding` describes the channel coding. A flight computer returns
-    to its previous release if it has power and receives no authentic frame for `command_loss` s. When
-    `command_loss` s have passed a second time, the computer returns to its previous configuration, and a
-    third time, to the configuration accepted on the ground. A `command_loss` of 0 disables these returns.
+    to its previous release if it has power and receives no authentic frame for `command_loss` s. If another
+    `command_loss` s pass without a frame, the computer returns to its previous configuration, and after a
+    third such period to the configuration accepted on the ground. A `command_loss` of 0 disables these
+    returns.
     """
 
     keys: Annotated[
@@ -289,7 +290,7 @@ class Config(Section, frozen=True, kw_only=True):
         return 0.0, self.inertial_unit.field_range
 
     def replan_period(self) -> float | None:
-        """Return the time (s) from one periodic plan to the next, or None for a body without plans."""
+        """Return the planning period (s), or None for a body without periodic plans."""
         return None
 
     def hardware(self) -> tuple[Section, ...]:
