@@ -217,14 +217,14 @@ def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
 def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> Any:
     device = driver_of(kind, section, f"{key}.driver").open(rig, section)
     stack.callback(device.close)
-    # The drivers of this package check their readings themselves, at less cost.
+    # The built-in drivers check their readings themselves, at less cost than `CheckedUnit`.
     if kind in {"inertial_unit", "magnetometer"} and ":" in section.driver:
         return CheckedUnit(device, section.field_range)
     return device
 
 
 def _dated(rig: Rig, config: Config) -> Rig:
-    """Return the rig with the earliest plausible date, from the epoch of the two-line elements."""
+    """Return the rig with its earliest plausible UTC, computed from the epoch of the two-line elements."""
     if isinstance(config, OrbitConfig) and config.elements is not None:
         with suppress(UsageError):  # invalid elements are reported when the body is built
             days = TwoLineElements(*config.elements).epoch - UNIX_EPOCH
@@ -430,7 +430,7 @@ check_pca9685 = coil_settings
 
 
 def check_drv8830(coils: Coils) -> CoilSettings:
-    """Return the settings of coils on DRV8830 bridges. Raises OutOfRange beyond their highest voltage."""
+    """Return the settings of coils on DRV8830 bridges. Raises OutOfRange for an excessive supply voltage."""
     volts, most = coils.supply_voltage, round(LAST_STEP * STEP_V, 2)
     if volts > most:
         raise OutOfRange("coils", "supply voltage of DRV8830 bridges", volts, 0.1, most, "V")
@@ -592,7 +592,7 @@ files_aravis = files_v4l2
 
 
 def _read_chips(rig: Rig, bus: int | str | None, register: int, *addresses: int) -> str:
-    """Read a register of each chip on an I2C bus. Raises NotResponding with advice."""
+    """Read a register of each chip on an I2C bus. Raises NotResponding if a chip does not answer."""
     opened = rig.wires.i2c(bus)
     for address in addresses:
         try:

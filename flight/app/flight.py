@@ -166,7 +166,7 @@ _YOUNG_OBJECTS = 20_000
 
 
 def _collect_rarely(stack: ExitStack) -> None:
-    """Keep the garbage collector from examining all present objects, and new objects every few seconds.
+    """Exempt all present objects from garbage collection, and collect garbage among new objects rarely.
 
     Reference counting frees nearly all objects of a flight. The stack restores the collector at the end.
     """
@@ -208,7 +208,7 @@ def next_whole_second(clock: Clock) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A valid configuration, read from `chosen`; `merged` includes the text of the files that it extends."""
+    """A valid configuration, read from `chosen`; `merged` is `text` with the files that it extends."""
 
     request: RunRequest
     chosen: Chosen
@@ -664,9 +664,9 @@ _NEWEST = 4
 def _begin_folder(
     request: RunRequest, text: str, config: Config, stack: ExitStack, new: bool
 ) -> tuple[RunRequest, list[Path]]:
-    """Create the folder of the run, which is the next folder of the archive if there is an archive.
+    """Create the folder of the run: `request.out`, or the next run folder of the archive if one is given.
 
-    Return the request with the path of the new folder, and the folders of the newest earlier runs.
+    Return the request with this folder as `out`, and the folders of the newest earlier runs.
 
     Raises UsageError for a folder that already contains a run or that another flight uses, and for a folder
     that cannot be written, which is removed if it is `new`. A flight computer with an archive flies despite

@@ -330,7 +330,7 @@ class FlownRelease:
 def _proven(path: Path) -> list[str]:
     """Return the proven releases, or an empty list if the file is missing or damaged.
 
-    Raises OSError for a file that cannot be read, whose releases must not be dropped by the next write.
+    Raises OSError if the file cannot be read, because the next write would otherwise drop its releases.
     """
     data = LinuxFiles().read(path) or b""
     with suppress(ValueError, TypeError, LookupError, RecursionError):
@@ -409,7 +409,7 @@ class Supervision:
         coils: Ticker,
         settle: Callable[[], None] | None = None,
     ) -> None:
-        """Connect the supervisors with `coils`, the coil driver's job; `settle` runs once before READY."""
+        """Connect the supervisors; the ticker `coils` runs the coil driver; `settle` runs before READY."""
         self._guardian, self._overseer, self._clock = guardian, overseer, clock
         # A separate event log is used, because the loop does not exist yet, and no event needs a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
@@ -466,7 +466,7 @@ def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
 def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: ExitStack) -> Supervision:
     """Connect the supervisors, and raise the priority of the control loop and the coil driver.
 
-    Raises ConfigError if the coil driver runs no periodic job, whose runs the heartbeats depend on.
+    Raises ConfigError if the coil driver runs no ticker (periodic task), on which the heartbeats depend.
     """
     coils = next((ticker for ticker in clock.tickers if ticker.name == COILS), None)
     if coils is None:
@@ -691,7 +691,7 @@ def _text(path: Path, data: bytes) -> str:
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
     """Return the configuration as text (`text`, or the file's text) and as values.
 
-    Changes that the request makes to a configuration affect only the values. Raises ConfigError for an
+    Changes that the request makes are contained in the values but not in the text. Raises ConfigError for an
     invalid configuration, and UsageError if the configuration cannot be changed as requested.
     """
     text = read_text(request.config_path) if text is None else text

@@ -84,7 +84,7 @@ ENTRY_POINTS = "knightcube.commands"
 """Name of the entry point group; each entry point is a table of commands that a package adds."""
 
 PROGRAM = "knightcube"
-"""Name of the program in help, errors and examples, also if started by `python -m flight`."""
+"""Name of the program in help, examples and error messages, even if it was started by `python -m flight`."""
 
 _EXAMPLES = f"""\
 examples:
@@ -139,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _obey(words)
     except (KnightCubeError, DeviceError) as error:
-        # That a planner finds no path is a failure of the command and not a usage error.
+        # A planner that finds no path is a failure of the command, not a usage error.
         misused = isinstance(error, UsageError) and not isinstance(error, PlanningError)
         return complain(str(error), 2 if misused else 1)
     except KeyboardInterrupt:

@@ -67,7 +67,8 @@ from knightcube.errors import KnightCubeError, UsageError
 
 _NICE = 10
 _KEYS_WAIT_NS = 60 * SECOND_NS
-"""Time (ns) for which the start waits for the folder of keys, before it is rebuilt from the second record."""
+"""Time (ns) for which the start waits for the folder of keys before it rebuilds the folder from the reference
+folder."""
 _WRITE_TIMEOUT_S = 0.0  # a radio that is slower than the configured rate takes the rest of a frame later
 
 
@@ -90,7 +91,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def link(options: argparse.Namespace) -> int:
-    """Run the link until a signal arrives. Raises ConfigError, and KnightCubeError for other errors."""
+    """Run the link until a signal arrives.
+
+    Raises ConfigError for a wrong option or configuration, and KnightCubeError for any other error.
+    """
     if os.path.exists(options.log) and not os.path.isdir(options.log):  # false if the disk fails
         raise ConfigError(f"--log {options.log}", "is not the folder of a run or of an archive")
     ended = threading.Event()
@@ -213,7 +217,7 @@ def _open(
 
 
 def _witness(keys: Path) -> Path:
-    """Return the path of the reference folder: a service's second state folder, or one beside the keys."""
+    """Return the reference folder: the second state folder of a service, or else a folder beside the keys."""
     folders = os.environ.get("STATE_DIRECTORY", "").split(":")
     return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"
 

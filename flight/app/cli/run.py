@@ -167,8 +167,8 @@ def _faults_help() -> str:
 REFUSED = 78
 """Exit status of a service whose configuration is wrong (EX_CONFIG of sysexits.h).
 
-The service manager restarts the service after any other failure. The status 2 of other usage errors is not
-used, because a shell that temporarily cannot start the service also ends with status 2.
+The service manager restarts the service after any other failure. The exit status of other usage errors, 2, is
+not used, because a shell that temporarily cannot start the service also ends with status 2.
 """
 
 
@@ -236,7 +236,7 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
         if now - last < period:
             return
         last = now
-        # A full disk, or a stream that was closed before a later compilation, must not affect the flight.
+        # A full disk, or a stream that is closed when numba compiles later, must not affect the flight.
         with suppress(OSError, ValueError):
             stream.write(f"{before}{text()}{after}")
             stream.flush()
@@ -291,7 +291,7 @@ def _probed(config: Config, cameras: ExitStack, name: str, kind: str, section: A
 
     All cameras stay open until `cameras` closes them, because cameras that can be opened separately may
     together exceed the bandwidth of a USB bus. Separate sensors are started for the check, which would
-    disturb a flight that reads them, so the bus of the coils is first locked like by a flight.
+    disturb a flight that reads them. The bus of the coils is therefore locked first, as in a flight.
     """
     camera = isinstance(section, Camera | WideCamera)
     driver = driver_of(kind, section.device if camera else section)
@@ -304,7 +304,7 @@ def _probed(config: Config, cameras: ExitStack, name: str, kind: str, section: A
             if camera:
                 open_camera(section, rig, stack)
             if isinstance(section, SensorsSection):
-                with suppress(NotResponding):  # a missing bus of the coils does not concern the sensors
+                with suppress(NotResponding):  # sensors on other buses do not need the bus of the coils
                     real_rig(config, own, exclusive=True).wires.i2c()
             return Probed(name, place, True, driver.probe(rig, section))
         except DeviceError as error:
