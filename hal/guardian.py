@@ -79,7 +79,7 @@ class Watch:
         self.due_ns = now_ns + SILENCE_NS
 
     def orphan(self, now_ns: int) -> None:
-        """Record that the flight process ended without a goodbye, and schedule a write of zero for now."""
+        """Record that the flight process ended without a goodbye message; a write of zero is due now."""
         self.orphaned = True
         self._zeroed = 0
         self.due_ns = now_ns

@@ -307,7 +307,7 @@ class LinuxI2cBus:
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """In one transaction, write `data` unless it is empty and read `count` bytes unless that is 0."""
+        """Write `data` (if not empty) and read `count` bytes (if not 0) in one transaction."""
         messages = [i2c_msg.write(address, data)] if data or not count else []
         if count:
             messages.append(i2c_msg.read(address, count))

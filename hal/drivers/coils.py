@@ -14,7 +14,7 @@ zero.
 
 Zero current is commanded by low levels at both inputs of all bridges, because the chip executes a write to
 its register ALL_LED_OFF_H even if it is not configured. If a leg of a bridge is stuck high, low inputs would
-drive current through the coil, so this bridge is braked (both inputs high) immediately afterwards.
+drive current through the coil, so the job brakes this bridge (both inputs high) directly after the write.
 
 Instead of a PWM chip with H-bridges, DRV8830 bridges (TI SLVSAB2) with an I2C interface and a regulated
 output voltage can drive the coils, one bridge for each coil. The output voltage has 58 steps of 0.08 V, and

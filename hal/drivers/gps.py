@@ -15,11 +15,11 @@ version in MON-VER. If the receiver refuses CFG-VALSET (ACK-NAK), the driver use
 versa. A CFG-VALSET with a key that the receiver does not have is refused as a whole, so only the keys of the
 port in use are sent: UART 1, UART 2 or USB. The receiver reports its port in CFG-PRT; a receiver that does
 not answer, such as an M10, has only UART 1. With the default dynamic model ("portable"), a receiver rejects
-fixes above 12 km or 310 m/s, so the driver selects the model for the highest altitudes and speeds.
-No call blocks. If bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud
-rates. When it finds the receiver, it commands the configured baud rate. A receiver that refuses this rate is
-reported, and is used at its own rate as long as it sends fixes. Consumer receivers stop working above 18 km
-or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
+fixes above 12 km or 310 m/s, so the driver selects the model for the highest altitudes and speeds. No call
+blocks. If bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud rates.
+When it finds the receiver, it commands the configured baud rate. If the receiver refuses this rate, the
+driver reports the refusal and keeps the receiver's present rate as long as fixes arrive. Consumer receivers
+stop working above 18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
 
 A receiver with the driver `nmea` sends sentences by itself, about once a second. The sentence RMC contains
 date, time, ground speed and course, and the sentence GGA contains the position with altitude, quality and
@@ -311,7 +311,7 @@ class UbloxReceiver:
         self._rate_ns = now_ns  # time of the last change of the baud rate
         self._return_ns: int | None = None  # time at which the port returns to the configured baud rate
         self._found_rate = 0
-        self._rate_refusals: set[Kind] = set()  # refused commands of the baud rate
+        self._rate_refusals: set[Kind] = set()  # refused commands for the baud rate
         self._refused = self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0
 
     def poll(self) -> list[GpsReading]:
@@ -446,7 +446,8 @@ class UbloxReceiver:
     def _use_valset(self, wanted: bool) -> None:
         """Select CFG-VALSET or the older commands, and configure at once after a change to CFG-VALSET.
 
-        During a change of the baud rate nothing is repeated, because both kinds of commands were sent for it.
+        While a baud rate change is pending nothing is sent again, because the rate was sent by both kinds of
+        commands.
         """
         self._is_due = self._is_due or (wanted > self._uses_valset and self._return_ns is None)
         self._uses_valset = wanted
@@ -626,7 +627,7 @@ RANGE_ERROR = 3.0
 KNOT = 1852.0 / 3600.0
 _LONGEST = 4096
 _FIELDS = {"RMC": 10, "GGA": 12}
-"""Minimum numbers of fields of the sentences from which a reading is made."""
+"""Minimum number of fields of a usable sentence, by sentence name."""
 _VERTICAL_SPEED_S = 10.0
 """Longest time (s) between two fixes from which a vertical velocity is computed."""
 _VERTICAL_SPEED_SIGMA = 50.0

@@ -130,9 +130,10 @@ class UnitSettings:
     field_range: float
 
     def body_maps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the matrices (3, 3) from measured to true rate and field, body axes, and an offset (3,), T.
+        """Return the maps (3, 3) of measured to true rate and field, and an offset (3,) of the field, T.
 
-        The offset is caused by the magnetometer's bias, and is subtracted from the field in body axes.
+        The true rate and field are in body axes. The offset is caused by the magnetometer's bias, and is
+        subtracted from the mapped field.
         """
         gyro, magnetometer = (
             np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in (self.gyro_matrix, self.field_matrix)
@@ -299,7 +300,7 @@ class CheckedUnit:
         self._unit.close()
 
     def _checked(self, reading: ImuReading) -> ImuReading | None:
-        """Return the reading without an implausible rate, or None if another value is implausible."""
+        """Return the reading, with NaN for an implausible rate, or None if another value is implausible."""
         values: dict[str, Any] = {name: np.asarray(getattr(reading, name), dtype=float) for name in _SHAPES}
         for name, value in values.items():
             if name != "rate" and not np.isfinite(value).all():
@@ -328,7 +329,7 @@ class CheckedUnit:
 
 
 def level_attitude(field: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Return the quaternion (4,) from testbed frame to body axes, given field and specific force at rest.
+    """Return a resting body's quaternion (4,), testbed frame to body axes, from its field and specific force.
 
     The testbed's y axis points down, and the horizontal field points along its -z axis. In free fall the
     quaternion is the identity.

@@ -419,7 +419,7 @@ class ExposureTiming:
     """Computation of exposure start times, and detection of exposures that are shorter than reported."""
 
     def __init__(self, settings: V4l2Settings, clock: Clock, counts: CameraCounts) -> None:
-        """Use the camera's settings and clock, and count frames that contradict the settings in `counts`."""
+        """Use the camera's settings and clock; `counts` counts the frames that contradict the settings."""
         self._name = settings.path
         self._settings, self._clock, self._counts = settings, clock, counts
         self._arrival_stamps = False
@@ -659,7 +659,7 @@ class V4l2Camera:
             device.close()
 
     def _dequeue(self, device: VideoDevice) -> Filled | None:
-        """Return the oldest filled buffer, or None if none is filled or if a read error may be temporary."""
+        """Return the oldest filled buffer, or None if none is filled or a possibly temporary error occurs."""
         try:
             filled = device.dequeue()
         except OSError as error:

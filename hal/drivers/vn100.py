@@ -211,7 +211,7 @@ class Recovery:
         completed: number of completed recoveries.
         refusal: last refusal of the unit, or an empty text after a completed recovery.
         upsets: number of times that a unit which had sent readings was reset or had wrong settings.
-        upset: text about the last such event, or an empty text.
+        upset: cause of the newest of these upsets as text, or an empty text.
     """
 
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
@@ -239,13 +239,14 @@ class Recovery:
         if self._has_read and not (self._was_reset or self._is_fresh):
             self.upsets += 1
             self.upset = cause
-        # The first time stamp after a recovery steps back because of the restart that was already handled.
+        # The first time stamp after a recovery steps back, because the unit was restarted before the
+        # recovery.
         self._was_reset = not self._is_fresh
 
     def advance(
         self, now_ns: int, readings: int, sentences: Sequence[Sentence], packets: int, received: int
     ) -> None:
-        """Advance the recovery by one poll, in which `sentences` and a number of `readings` were received.
+        """Advance the recovery by one poll, which received `sentences` and the given number of `readings`.
 
         `received` and `packets` are the numbers of bytes and of valid packets, including those with unknown
         fields, since the start of the driver. Raises NotResponding if the port is lost.

@@ -27,7 +27,8 @@ class ImuReading(NamedTuple):
     """One sample of the inertial unit, in the body frame and the mission's reference frame.
 
     Attributes:
-        time_ns: host time of the sample, ns: the packet's time of arrival minus its transmission's duration.
+        time_ns: host time of the sample, ns, which is the packet's arrival minus the duration of its
+            transmission.
         arrival_ns: host time at which the last byte of the packet was received, ns.
         device_time_ns: time of the unit's own clock since the unit was started, ns.
         quaternion: (4,) rotation of the reference frame into the body frame, scalar last.
@@ -68,7 +69,7 @@ class ImuLink(NamedTuple):
         rejection: quantity and value of the last sample with an invalid value, or an empty text.
         upsets: number of times that the unit restarted or had wrong settings, after which it is configured
             again.
-        upset: text about the last of these events, or an empty text.
+        upset: cause of the newest of these upsets as text, or an empty text.
     """
 
     bytes_received: int

@@ -16,7 +16,7 @@ class DeviceError(Exception):
         self.message = message
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return the parts for pickling, because `args` contains the text instead of the arguments."""
+        """Return pickling data without a call of `__init__`, because `args` lacks its arguments."""
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
@@ -25,7 +25,7 @@ class NotResponding(DeviceError):
 
 
 class OutputFull(NotResponding):
-    """Raised if the output queue of a port remains full; `written` is the number of bytes that it took."""
+    """Raised if the output queue of a port remains full; `written` is the number of bytes already queued."""
 
     def __init__(self, device: str, written: int) -> None:
         super().__init__(device, "writing failed (the output queue is full): is the device still there?")

@@ -17,7 +17,7 @@ from hal.interfaces.guardian import CoilReach
 
 SECOND_NS = 1_000_000_000
 LATE_NS = 25_000_000
-"""Lateness (ns) from which a late emulated device affects a flight: the period of a control cycle."""
+"""Smallest lateness (ns) of an emulated device that affects a flight: the period of a control cycle."""
 
 
 class Ticker(Protocol):
@@ -120,7 +120,7 @@ class RawI2cBus(I2cBus, Protocol):
     """I2C bus that also executes transactions without a register address."""
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """In one transaction, write `data` unless it is empty and read `count` bytes unless that is 0."""
+        """Write `data` (if not empty) and read `count` bytes (if not 0) in one transaction."""
 
 
 class SpiDevice(Protocol):
