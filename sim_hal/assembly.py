@@ -120,9 +120,9 @@ def assemble(
 ) -> Hardware:
     """Build the hardware of `config` in the world of its simulation `section`, and connect it to `wires`.
 
-    The function `now_ns` returns the simulation time. The functions `expose` and `expose_wide` replace the
-    camera renderers; in real time they run in another process. Raises ConfigError if the configuration of the
-    simulated world is invalid.
+    The function `now_ns` returns the simulation time. The functions `expose` and `expose_wide`, if given,
+    replace the camera renderers; in real time, both functions render in another process. Raises ConfigError
+    if the configuration of the simulated world is invalid.
     """
     # In real time, the clock advances during assembly, so all devices get the same start time.
     start_ns = now_ns()
@@ -228,7 +228,8 @@ def assemble_coils(
 ) -> tuple[Any, Any]:
     """Build the coil circuit and the current monitor, which is None if not configured.
 
-    For a coil driver of another package, the circuit has at least the methods `currents` and `mean_supply`.
+    The emulator of a coil driver of another package returns a circuit with at least the methods `currents`
+    and `mean_supply`.
     """
     truth = section.truth
     if truth.resistance is not None and len(truth.resistance) != len(config.coils.slots):
@@ -319,8 +320,8 @@ def emulated_camera(
 def _between_axes(camera: Camera, true: CameraLens) -> FloatArray:
     """Return the rotation (4,) from the camera axes of the configuration to the axes of the true lens.
 
-    A mounting is measured with the true lens. The configured boresight is therefore the direction from which
-    the true lens images a star onto the configured image centre.
+    The configured mounting is assumed to be measured with the true lens. The configured boresight is
+    therefore the direction from which the true lens images a star onto the configured image centre.
     """
     lens = lens_model(true, camera.columns, camera.rows)
     x, y, z = lens.unit_vectors(np.array([lens_of(camera).centre]))[0]
@@ -369,7 +370,7 @@ class StarRenderer:
     def render(
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack] = ()
     ) -> Image:
-        """Return the frame number `sequence`, exposed at the `attitudes` (k, 4) at `times` (k,), s."""
+        """Return frame `sequence`, exposed while the camera has the `attitudes` (k, 4) at `times` (k,), s."""
         from sim_hal.star_camera import render  # noqa: PLC0415 - see above
 
         generator = np.random.default_rng([self._seed, sequence])

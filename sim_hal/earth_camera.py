@@ -172,7 +172,7 @@ def visible_share(scene: EarthScene) -> float:
 
 
 def darkening(share: FloatArray) -> FloatArray:
-    """Return the brightness (...) of the Sun's disc at squared radii from 0 to 1 (limb), with the mean 1."""
+    """Return the brightness (...) of the Sun's disc at squared radii (limb: 1), relative to its mean."""
     rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
     return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
 
@@ -237,8 +237,8 @@ class EarthCameraModel:
         scatter: fraction of the light that the optics scatter over wide angles.
         scatter_angle: angle at which the scattered light has half its central radiance, rad.
 
-    Raises OutOfRange for values out of range, and ValueError for a lens with different numbers of rows and
-    columns.
+    Raises OutOfRange for values out of range, and ValueError for a lens whose rows or columns differ from
+    those of the model.
     """
 
     lens: CameraModel
@@ -449,7 +449,7 @@ def blurred(model: EarthCameraModel, image: Float32Array) -> Float32Array:
 
 @lru_cache(maxsize=4)
 def _blur_weights(sigma: float) -> Float32Array:
-    """Return the weights (2 k + 1,) of a Gaussian blur with standard deviation `sigma`, px, to 4 `sigma`."""
+    """Return the weights (2 k + 1,) of a Gaussian of standard deviation `sigma`, px, cut off at 4 `sigma`."""
     reach = int(4.0 * sigma + 0.5)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-9)) ** 2)
     return np.asarray(weights / weights.sum()).astype(np.float32)
@@ -475,7 +475,7 @@ def _spread(image: Float32Array, weights: Float32Array, share: float, bins: Floa
     Args:
         image: radiance (rows, columns), which continues with its edge pixels beyond the edges.
         weights: weights (2 k + 1,) of the blur along each axis.
-        share: factor of the blurred image.
+        share: factor by which the blurred image is multiplied.
         bins: scattered light at the centres of bins of `_BIN` x `_BIN` px, for linear interpolation.
     """
     (rows, columns), (down, across) = image.shape, bins.shape
@@ -673,8 +673,8 @@ def _with_neighbours(pixels: BoolArray) -> IntArray:
 def _rays_within(rays: Float32Array, pixels: IntArray, columns: int) -> Float32Array:
     """Return the rays (3, 4 n) through 2 x 2 points within each of the n pixels with the indices `pixels`.
 
-    The rays are interpolated linearly from the rays (3, rows x columns) of the pixel centres. The error is
-    below 0.3/f^2 + 2e-7 rad, where f is the focal length in px.
+    The rays are interpolated linearly from the rays (3, rows x columns) of the pixel centres. The error of a
+    ray is below 0.3/f^2 + 2e-7 rad, where f is the focal length in px.
     """
     centre = rays.take(pixels, axis=1)
     slopes = []

@@ -15,9 +15,9 @@ spectrum, sampled on a sphere within a periodic volume. The noise has two scales
 systems, and coasts and single clouds. The map does not show the real Earth, but has bright edges inside the
 limb, which disturb a horizon detector.
 
-The radiance along many lines of sight has a numpy form and a compiled form (`knightcube.compiled`). Both
-forms read the air's functions from tables with linear interpolation. For scale heights from 8 km, the
-relative error is below 2e-4.
+The function `light` computes the radiance along many lines of sight in a numpy form or a compiled form
+(`knightcube.compiled`). Both forms read the air's functions from tables with linear interpolation. For scale
+heights from 8 km, the relative error is below 2e-4.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ _DEEPEST = -9.0
 
 @dataclass(frozen=True, slots=True)
 class Atmosphere:
-    """Exponential air.
+    """Air whose density decreases exponentially with height.
 
     Attributes:
-        scale_height: m.
+        scale_height: scale height of the density, m.
         optical_depth: vertical optical depth, by default of Rayleigh scattering at 550 nm (Bucholtz 1995,
             Appl. Opt. 34).
         multiple: ratio of all scattered light to singly scattered light.
@@ -119,11 +119,11 @@ _CELLS = 96
 _SLOPE = -2.3
 """Exponent of the noise amplitude as a power of the wave number, as for the spectrum of clouds."""
 _MODULO = np.arange(16 * _CELLS) % _CELLS
-"""Whole coordinates modulo the period, as a table that includes the largest magnified coordinates."""
+"""Remainders modulo `_CELLS` of the whole numbers up to the largest magnified grid coordinate."""
 _RADIUS = 0.42 * _CELLS
 """Radius (grid cells) of the Earth's sphere in the noise volume."""
 _MAGNIFICATION, _FINE = 11.0, 0.5
-"""Magnification of the fine noise's coordinates, and its amplitude relative to the coarse noise."""
+"""Magnification of the coordinates for the fine noise, and ratio of fine to coarse noise amplitude."""
 _RESOLUTION = 2.0**-12
 """Resolution of the stored noise, in standard deviations."""
 _SOFT = 0.1
@@ -131,7 +131,7 @@ _SOFT = 0.1
 
 
 def albedo(directions: Float32Array, noise: npt.NDArray[np.int64]) -> Float32Array:
-    """Return the ground's albedo (n,) in Earth-fixed unit directions (3, n), from the noise `map_noise`."""
+    """Return the ground's albedo (n,) in Earth-fixed directions (3, n), from the noise of `map_noise`."""
     places = directions * np.float32(_RADIUS)
     places += np.float32(0.5 * _CELLS)
     heights = _read(noise, places * np.float32(_MAGNIFICATION))
@@ -181,11 +181,11 @@ def _blended(
 
 @lru_cache(maxsize=4)
 def map_noise(seed: int) -> npt.NDArray[np.int64]:
-    """Return two periodic cubic grids of independent noise of unit variance, as one flat array.
+    """Return the land and cloud noise, of unit variance, on a periodic cubic grid, as one flat array.
 
-    Each number consists of four 16-bit integers in the unit `_RESOLUTION`, from the lowest bits to the
-    highest: land noise and cloud noise of a grid point, and of the next grid point along the third axis. The
-    compiled form of `light` reads both grid points at once.
+    Each 64-bit number of the array contains four 16-bit integers in the unit `_RESOLUTION`, beginning with
+    the lowest bits: the land noise and the cloud noise of a grid point, and then both noises of the next grid
+    point along the third axis. The compiled form of `light` therefore reads two grid points at once.
     """
     across = np.fft.fftfreq(_CELLS, 1.0 / _CELLS).astype(np.float32)
     wave = np.sqrt(across[:, None, None] ** 2 + across[None, :, None] ** 2 + across**2)
@@ -206,8 +206,8 @@ TOP = 120e3
 FAINTEST = 2e-4
 """Smallest radiance of visible air above the limb, relative to sunlit white ground.
 
-For fainter air, the mean radiance within a pixel of 10 km at the limb differs from the radiance at the centre
-of the pixel by less than 5e-5.
+In air that is fainter than this, the mean radiance within a limb pixel of 10 km differs from the radiance at
+the pixel's centre by less than 5e-5.
 """
 _DARKEST = -0.2
 """Cosine of the Sun's zenith angle below which only air above `TOP` is lit (11.5 deg below the horizon)."""
@@ -231,16 +231,16 @@ def intersect(rays: Floats, origin: FloatArray, into_earth: FloatArray) -> Earth
     """Return the intersections of rays (3, n) of any length, in camera axes, with the Earth.
 
     `origin` (3,) is the camera's position in the scaled axes, and `into_earth` (3, 3) is the matrix from
-    camera axes to the scaled axes. The precision is that of `rays`. For 32-bit rays from altitudes up to
-    2,000 km, the errors of all heights are below 2 m, and the errors of 99.9 % of the places are below 20 m.
-    Places near the limb have larger errors along the line of sight.
+    camera axes to the scaled axes. The floating-point type of `rays` limits the precision. For 32-bit rays
+    from altitudes up to 2,000 km, all heights have errors below 2 m, and 99.9 % of the points have position
+    errors below 20 m. Points near the limb have larger errors along the line of sight.
     """
     start = origin.astype(rays.dtype)
     axes: Floats = semi_axes().astype(rays.dtype)
     # Computing with contiguous rows of coordinates is several times faster than with rows of vectors.
     scaled = into_earth.astype(rays.dtype) @ rays
     squares, along = np.sum(scaled * scaled, axis=0), start @ scaled
-    # The distance of the nearest point from the centre is more accurate than a quadratic's discriminant.
+    # The distance of the ray's nearest point is a more accurate test than a quadratic's discriminant.
     nearest = start[:, None] - (along / squares) * scaled
     nearest_squares = nearest * nearest
     distance = np.sum(nearest_squares, axis=0)
@@ -272,13 +272,13 @@ def near_earth(rays: Float32Array, origin: FloatArray, into_earth: FloatArray) -
 _STEPS, _SUN_STEPS = 4096, 6144
 """Numbers of intervals in the tables of `AirTables`."""
 _HORIZON = 1024
-"""Column of `AirTables.sun` for a Sun on the horizon, if the first column is for `_DARKEST`."""
+"""Column of `AirTables.sun` for a Sun on the horizon; column 0 is for the cosine `_DARKEST`."""
 _CHUNK = 65_536
 """Number of lines of sight that the numpy form computes at a time, because small arrays are faster."""
 _BLOCK = 256
 """Number of lines of sight that `light` traces at a time."""
 
-# Numba computes with 64 bits if a number is a Python float, so the loop form's numbers have 32 bits.
+# A Python float would make numba compute with 64 bits, so the compiled form uses 32-bit constants.
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _FLOAT_TOP, _FLOAT_DARKEST, _FLOAT_STEPS = np.float32(TOP), np.float32(_DARKEST), np.float32(_STEPS)
 _FLOAT_FAINTEST = np.float32(FAINTEST)
@@ -305,8 +305,8 @@ class AirTables(NamedTuple):
             `TOP`.
         sun: table (2, `_SUN_STEPS` + 2) at cosines of the Sun's zenith angle from `_DARKEST` to 1. The rows
             are the optical depth towards the Sun, and the sunlight that reaches horizontal ground.
-        share: table (1, `_STEPS` + 2) of the mean transmission of scattered sunlight, at 1/(1 + x) from 0 to
-            1, where x is the mean optical depth that the sunlight has passed (`Atmosphere.scattered`).
+        share: table (1, `_STEPS` + 2) of the mean transmission of sunlight on its way to the scattering air,
+            at values of 1/(1 + x) from 0 to 1. The optical depth x is that of `Atmosphere.scattered`.
     """
 
     sight: Float32Array
@@ -387,7 +387,7 @@ def light_numpy(
 
 
 def _chosen(vectors: Float32Array, at: IntArray) -> Float32Array:
-    """Return the columns with the ascending indices `at` of vectors (3, n)."""
+    """Return the columns of `vectors` (3, n) with the indices `at`, in ascending order."""
     return vectors if len(at) == vectors.shape[1] else vectors.take(at, axis=1)
 
 
@@ -426,12 +426,12 @@ def light(
         sight_table: first table of `air_tables`.
         sun_table: second table of `air_tables`.
         share_table: third table of `air_tables`.
-        noise: `map_noise` of the ground.
+        noise: noise of land and cloud from `map_noise`.
     """
     count = rays.shape[1]
     radiance = np.zeros(count, np.float32)
     at_limb = np.zeros(count, np.bool_)
-    # One-dimensional arrays with offsets of _BLOCK permit vector instructions, and rows of an array do not.
+    # Flat arrays with offsets of _BLOCK permit vector instructions; rows of two-dimensional arrays do not.
     traced, shaded = np.empty(6 * _BLOCK, np.float32), np.empty(2 * _BLOCK, np.float32)
     points = np.empty(3 * _BLOCK, np.float32)
     heights = np.empty(2 * _BLOCK, np.float32)
@@ -469,7 +469,7 @@ def light(
 def _earthward(
     origin: FloatArray, into_earth: FloatArray, axes: FloatArray
 ) -> tuple[tuple[np.float32, np.float32, np.float32], np.float32]:
-    """Return the unit vector (3,) to the centre of the Earth, in camera axes, and a limit.
+    """Return the unit vector (3,) to the Earth's centre, camera axes, and the limit of a scalar product.
 
     A unit ray stays above the height `TOP` if its scalar product with the vector is below the limit.
     """
@@ -490,7 +490,7 @@ def _earthward(
 def _steepest(
     rays: Float32Array, start: int, size: int, down: tuple[np.float32, np.float32, np.float32]
 ) -> np.float32:
-    """Return the largest scalar product of `down` (3,) with `size` rays (3, n) from the column `start` on.
+    """Return the largest scalar product of `down` (3,) with the `size` rays that begin at column `start`.
 
     Rays that are not numbers are ignored.
     """
@@ -512,7 +512,7 @@ def _trace(
     sun: FloatArray,
     traced: Float32Array,
 ) -> None:
-    """Store the quantities of `size` lines of sight (3, n), from the column `start` on, that `light` needs.
+    """Compute `traced` for the `size` lines of sight that begin at column `start` of `rays` (3, n).
 
     For each line of sight, the array `traced` (6 x `_BLOCK`) contains the column number of `AirTables.sight`,
     the column number of `AirTables.sun` (-1 for a dark line of sight), the cosine of the scattering angle,
@@ -562,9 +562,9 @@ def _shade(
     haze: np.float32,
     shaded: Float32Array,
 ) -> None:
-    """Store the air's radiance, and the sunlight from ground with an albedo of 1, in `shaded` (2 x `_BLOCK`).
+    """Store the radiance of the air, and the radiance of white ground at 1 au, in `shaded` (2 x `_BLOCK`).
 
-    The first `number` entries of `lit` are the indices of the lines of sight in `traced`.
+    The first `number` entries of `lit` are the indices of the sunlit lines of sight in `traced`.
     """
     for j in range(number):
         i = lit[j]
@@ -588,7 +588,7 @@ def _shade(
 
 @loop_helper
 def _between(table: Float32Array, row: int, low: int, step: np.float32) -> np.float32:
-    """Return the value at the fraction `step` between the columns `low` and `low` + 1."""
+    """Return the value of a table's row at the fraction `step` from column `low` to the next column."""
     before: np.float32 = table[row, np.uint32(low)]
     after: np.float32 = table[row, np.uint32(low + 1)]
     return before + step * (after - before)
@@ -598,9 +598,9 @@ def _between(table: Float32Array, row: int, low: int, step: np.float32) -> np.fl
 def _find_albedo(
     points: Float32Array, count: int, noise: npt.NDArray[np.int64], heights: Float32Array
 ) -> None:
-    """Compute the albedo of points (3 x `_BLOCK`) on the ground, m, and overwrite their first coordinates.
+    """Replace the x coordinates of `points` (3 x `_BLOCK`) on the ground, m, by the albedo at the points.
 
-    `heights` (2 x `_BLOCK`) is overwritten with noise.
+    The other coordinates and `heights` (2 x `_BLOCK`) are overwritten with intermediate results.
     """
     for i in range(count):
         x, y, z = points[i], points[_BLOCK + i], points[2 * _BLOCK + i]
@@ -625,7 +625,7 @@ def _add_noise(
     noise: npt.NDArray[np.int64],
     heights: Float32Array,
 ) -> None:
-    """Add the land and cloud noise, interpolated at magnified points (3 x `_BLOCK`), to `heights`."""
+    """Add the land and cloud noise at the magnified points (3 x `_BLOCK`), times `share`, to `heights`."""
     cells, pairs = np.empty(4 * _BLOCK, np.uint32), np.empty(4 * _BLOCK, np.int64)
     for n in range(count):
         i, j = np.floor(points[n] * magnification), np.floor(points[_BLOCK + n] * magnification)

@@ -1,7 +1,7 @@
 """Emulated buses and serial lines by name, and the functions that connect the emulated devices to them.
 
-A driver's registration (`flight.schema.devices`) names the function that connects its emulated device here.
-In lock-step, serial lines exist only in memory; in real time, they are pseudo-terminals.
+A driver's registration (`flight.schema.devices`) names the function that connects the driver's emulated
+device. In lock-step, serial lines exist only in memory; in real time, they are pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _LINE_STREAM = 0x11E
 ORBIT_STREAM = 0x0B17
 """Second number, after the simulation's seed, in the seeds of the devices that need an orbit."""
 _LINE_KEYS = {"inertial_unit": (), "gps": (1,)}
-"""Last numbers of the random seed for line faults, by section; other lines use a checksum of their name."""
+"""Last numbers in the seed of a line's faults, by section; other lines use a checksum of the device name."""
 
 
 class EmulatedWires:

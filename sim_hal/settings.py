@@ -100,9 +100,8 @@ class Disturbances(Section, frozen=True, kw_only=True):
     `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
     of air density and residual dipole. The angle between body axes and principal axes is at least a third of
     `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
-    deviations of the coils' scale errors and axis tilts. Every 20 s the dipole of each coil changes at
-    random, as it does with the supply voltage. `coil_variation` is the relative standard deviation of these
-    changes.
+    deviations of the coils' scale errors and axis tilts. Every 20 s the dipole per ampere of each coil
+    changes at random. `coil_variation` is the relative standard deviation of these changes.
     """
 
     gravity_gradient: Multiple = 1.0
@@ -122,8 +121,8 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
     """The section `free_body`.
 
     If `craft` is a name, the body is one of the two satellites in `sim_hal.worlds.free_body.CRAFTS`.
-    If `craft` is not a name, the body is the satellite of the flight configuration, with the differences in
-    `craft`.
+    Otherwise the body is the satellite of the flight configuration, with the true values that `craft`
+    contains.
 
     `errors` is the largest error of the configured description of body, coils and sensors, as a multiple of
     the configured accuracies (`sim_hal.description_errors`).

@@ -101,7 +101,7 @@ class EmulatedCamera:
         self.advance(self._now_ns())
 
     def poll(self) -> Frame | None:
-        """Return the newest frame once, or None before its read-out has ended."""
+        """Return the newest frame once, when its read-out has ended, otherwise None."""
         exposure, now_ns = self._exposure, self._now_ns()
         if exposure is None or exposure.image is None or not exposure.image.done():
             return None
@@ -189,4 +189,4 @@ SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }
-"""For each fault, function that returns changed pixels from the pixels (rows, columns) and frame number."""
+"""Function of each fault that returns the changed pixels, given pixels (rows, columns) and frame number."""

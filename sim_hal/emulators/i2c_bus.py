@@ -160,7 +160,7 @@ class EmulatedI2cBus:
         self.send(address, bytes((register, *values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
-        """In one transaction, write `data` unless it is empty and read `count` bytes unless that is 0."""
+        """Write `data` (if not empty) and read `count` bytes (if not 0) in one transaction."""
         messages = [Message(address, data)] if data or not count else []
         return b"".join(self.transfer([*messages, Message(address, count=count)] if count else messages))
 

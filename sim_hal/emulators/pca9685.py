@@ -153,7 +153,8 @@ class EmulatedPca9685:
             for value in data[1:]:
                 written |= self._store(self._pointer, value)
                 self._advance()
-        # A write to a channel acts like RESTART, but with the OCH bit it must contain all four registers.
+        # A write to a channel acts like RESTART; if the OCH bit is set, only a write of all four registers
+        # does.
         if written and (count >= 4 or not self._registers[MODE2] & _UPDATE_ON_ACK):
             if self._halted:
                 self._halted &= ~written

@@ -468,7 +468,7 @@ class OutputStreams:
         self._streams = streams
 
     def next_tick(self, passed: int) -> int | None:
-        """Return the first tick after the tick `passed` on which a stream is due, or None for no stream."""
+        """Return the first tick after the tick `passed` on which a stream is due, or None without streams."""
         return min(((passed // s.divisor + 1) * s.divisor for s in self._streams.values()), default=None)
 
     def due(self, tick: int) -> list[Stream]:

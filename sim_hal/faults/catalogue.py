@@ -292,7 +292,7 @@ _PARTS: dict[str, Callable[[Hardware], Sequence[object]]] = {
     "battery-monitor": lambda hardware: (hardware.power and hardware.power.rails[0],),
     "bus-monitor": lambda hardware: (hardware.power and hardware.power.rails[1],),
 }
-"""Emulated parts of the devices with faults that set an attribute; None for a part that is not configured."""
+"""Emulated parts on which a device's faults set an attribute, or None for a part that is not configured."""
 
 
 def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
@@ -424,7 +424,7 @@ class AlteredPart:
         write: Callable[[int, bytes], None] | None = None,
         read: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        """Pass written data to `write` instead of the chip, and alter the data from the chip by `read`."""
+        """Use `write` instead of the method `write` of the chip, and alter the data of the chip by `read`."""
         self._part = part
         self._write = write or part.write
         self._read = read or (lambda data: data)

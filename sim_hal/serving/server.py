@@ -141,7 +141,11 @@ class DeviceServer:
         self._selector.register(descriptor, selectors.EVENT_READ, answer)
 
     def serve(self, patience_ns: int | None = None) -> None:
-        """Advance the devices and answer requests, until `stop` or `patience_ns` after the last client."""
+        """Advance the devices and answer requests until `stop` is called.
+
+        If `patience_ns` is given, serving also ends when no client has been connected for this time after the
+        first client.
+        """
         left_ns: int | None = None
         while not self._stopped:
             now_ns = self._clock.now_ns()

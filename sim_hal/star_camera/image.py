@@ -57,7 +57,10 @@ class PointSpread:
     quadrature: Callable[[float], int]
 
     def shares(self, positions: FloatArray, size: int) -> Float32Array:
-        """Return the charge fractions (..., size) of sources at `positions` (...) on a row or column."""
+        """Return the charge fractions of sources on a row or column of pixels.
+
+        The sources are at `positions` (...), px. The result (..., size) is for the first `size` pixels.
+        """
         table, rise = _table(self, size)
         entry, beyond = _entries(positions)
         shares = table.take(entry, axis=0)
@@ -65,7 +68,7 @@ class PointSpread:
         return np.asarray(shares)
 
     def own_shares(self, positions: FloatArray) -> Float32Array:
-        """Return the charge fraction on each pixel of a row or column, with one source position per pixel."""
+        """Return the charge fraction on each pixel of a row or column, given a source position per pixel."""
         pixel = np.arange(positions.shape[-1])
         table, rise = _table(self, len(pixel))
         entry, beyond = _entries(positions)
@@ -101,14 +104,14 @@ def bilinear_gaussian(sigma: float) -> PointSpread:
         return np.asarray(np.clip(1.0 - distance, 0.0, None) @ taps)
 
     def quadrature(length: float) -> int:
-        # The slope of the profile is discontinuous, so samples must be much closer than a pixel.
+        # The slope of the profile is discontinuous, so the spacing of samples must be far below a pixel.
         return 1 if length < 1e-3 else math.ceil(2.0 + 8.0 * length)
 
     return PointSpread(profile, 2, 8.0, quadrature)
 
 
 def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
-    """Return the table index before each position, and the fraction (0 to 1) to the next table entry."""
+    """Return the index of the table row below each position, and the fraction (0 to 1) to the next row."""
     scaled = positions * STEPS
     entry = scaled.astype(np.intp)
     return entry, (scaled - entry).astype(np.float32)
@@ -135,8 +138,8 @@ Vectors = Callable[[FloatArray], FloatArray]
 class Span:
     """Quadrature samples (m,) of a short interval of the exposure, in segments of smooth motion.
 
-    The arrays `starts` and `ends` contain the start and end (s) of each sample's segment. The positions
-    `nodes` in the segment are from 0 to 1, and the quadrature weights of a segment add up to 1.
+    The arrays `starts` and `ends` contain the start and end (s) of each sample's segment. The samples'
+    positions `nodes` range from 0 to 1 within a segment, and the quadrature weights of a segment add up to 1.
     """
 
     starts: FloatArray
@@ -146,7 +149,7 @@ class Span:
 
     @classmethod
     def of(cls, segments: list[tuple[float, float, FloatArray, FloatArray]]) -> Self:
-        """Return the samples of segments, which are given by start, end, nodes and weights."""
+        """Return the samples of `segments`, each of which is a tuple (start, end, nodes, weights)."""
         starts, ends, nodes, weights = zip(*segments, strict=True)
         counts = [len(part) for part in nodes]
         times = np.repeat(starts, counts), np.repeat(ends, counts)
@@ -351,7 +354,7 @@ def _deposit_rows(
     corner = low[seen] - reach
     size = int(np.max(high[seen] - low[seen])) + 2 * reach + 1
     place = points[:, seen] - corner
-    # `later` (m, k, size): line times by which each row of a patch is exposed after the row of the source.
+    # `later` (m, k, size): delay (line times) of each patch row's exposure after that of the source's row.
     later = np.arange(size) - place[..., 1:]
     across = spread.shares(np.clip(place[..., :1] + later * shift[..., :1], 0.0, size), size)
     down = spread.own_shares(np.clip(place[..., 1:] + later * shift[..., 1:], 0.0, size))
@@ -405,7 +408,7 @@ class StarCameraModel:
             and blurs it with a sampled 3 x 3 kernel (Sease, eqs. 2.5, 2.6, 2.9).
         noise: "poisson" is Poisson noise with Gaussian read noise. "uniform" is the uniform noise of Sease,
             eq. 2.11.
-        hot_pixels: hot pixels, whose dark current is higher.
+        hot_pixels: position and excess dark current of each hot pixel (`HotPixel`).
         line_time: time between the exposures of consecutive rows, s; 0 is a global shutter.
         background_gradient: gradient of the stray light along x and y, counts/px; the stray light is zero in
             the darkest corner of the image.
@@ -586,7 +589,10 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 FAINT_SHARE = 0.25
 """Largest ratio of charge (e-) to background noise variance (e-^2) in pixels with Gaussian noise only."""
 GREATEST_SKEWNESS = 0.05
-"""Largest skewness of noise that is drawn as Gaussian; by the Edgeworth series, the error is 0.004."""
+"""Largest skewness of noise that is drawn as Gaussian.
+
+By the Edgeworth series, the error of a probability is then below 0.004.
+"""
 
 SLICES, OUTER_SLICES = 1 << 16, 64
 """Number of equally probable slices of the normal distribution, and number of tail slices on each side."""
@@ -649,7 +655,7 @@ def standard_normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32
     words = rng.integers(0, 2**64, size=(count + 3) // 4, dtype=np.uint64)
     slices = words.view(np.uint16)[:count]
     normal = _slice_middles().take(slices)
-    # The sum of 16-bit numbers wraps around, so that the slices of both tails become the lowest numbers.
+    # The 16-bit sum wraps around, so that it is below 2 * OUTER_SLICES for the slices of both tails only.
     outer = np.flatnonzero(slices + np.uint16(OUTER_SLICES) < 2 * OUTER_SLICES)
     chance = (slices[outer] + rng.uniform(2.0**-32, 1.0, size=len(outer))) / SLICES
     normal[outer] = ndtri(chance)

@@ -1,8 +1,8 @@
 """Effects of the star camera's orbit: moving objects, aberration, stray light, and the Earth in view.
 
 An object without an orbit, which is configured by a line of sight, moves along a great circle among the
-stars. An object in orbit is lit by the Sun and can be hidden by the Earth. Apart from tumbling, its magnitude
-changes only while the Earth covers part of the Sun as seen from the object.
+stars. An object in orbit is lit by the Sun and can be hidden by the Earth. If the object does not tumble, its
+magnitude changes only while the Earth covers part of the Sun as seen from the object.
 
     camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
     orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
@@ -98,11 +98,11 @@ def source_tracks(
 ) -> list[SourceTrack]:
     """Return the tracks of the visible objects from `start` to `end` s.
 
-    `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks count from
-    `zero` s, as in an attitude history. An object that is in the umbra or behind the Earth during the entire
-    exposure is omitted. An object that is partly sunlit, or sunlit for part of the time, has its mean
-    brightness over the track. For a rolling shutter, `end` is the end of the last row's exposure. Raises
-    OutOfRange for times outside the orbits, and for an object within 1 m of the camera.
+    `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks are relative to
+    the time `zero`, s. An object that is in the umbra or behind the Earth during the entire exposure is
+    omitted. An object that is partly sunlit, or sunlit for part of the time, has its mean brightness over the
+    track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
+    outside the orbits, and for an object within 1 m of the camera.
     """
     if not start < end:
         raise OutOfRange(DEVICE, "end of the exposure", end, start, math.inf, "s")
@@ -259,7 +259,7 @@ def _on_circle(line: LineOfSight, magnitude: float, mission: float, times: Float
 
 
 def _dimming(tumble: Tumble, start: float, end: float) -> float:
-    """Return how much fainter (mag) a tumbling object is on average between two mission times (s)."""
+    """Return the mean change of a tumbling object's magnitude between two mission times (s)."""
     middles = start + (end - start) * (np.arange(64) + 0.5) / 64
     phase = 2.0 * np.pi * middles / tumble.period + math.radians(tumble.phase_deg)
     return float(-2.5 * math.log10(np.mean(10.0 ** (-0.4 * tumble.amplitude * np.sin(phase)))))

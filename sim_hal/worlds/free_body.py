@@ -98,9 +98,10 @@ def _stepped(
     of_rates: Floats,
     of_torques: Floats,
 ) -> State:
-    """Return the state of `Rotation.step`.
+    """Return the rotational state after a step, as `Rotation.step` describes.
 
-    `of_rates` maps products of rates, and `of_torques` (1/(kg m^2)) maps torques, to angular accelerations.
+    The factors `of_rates` give the angular accelerations of products of rates, and the factors `of_torques`
+    (1/(kg m^2)) those of torques.
     """
     middle = (0.5 * (begin[0] + end[0]), 0.5 * (begin[1] + end[1]), 0.5 * (begin[2] + end[2]))
     half = 0.5 * dt
@@ -286,7 +287,7 @@ def coil_frames(dipoles: FloatArray) -> FloatArray:
         if float(start @ end) == 1.0:
             frames.append(np.eye(3))
             continue
-        # `end` is `start` rotated by 180 deg about `start` and then by 180 deg about the bisector `middle`.
+        # Rotations by 180 deg about `start` and then about the bisector `middle` rotate `start` to `end`.
         middle = start + end
         across = np.eye(3)[(index + 1) % 3]
         if float(middle @ middle) < 1e-12:
@@ -780,7 +781,7 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
 
 
 def _true_coils(coils: Coils, windings: Sequence[Winding] | None) -> Coils:
-    """Return the coils, with `windings` unless that is None. Raises ConfigError for impossible windings."""
+    """Return the coils, with `windings` if given. Raises ConfigError for impossible windings."""
     if windings is None:
         return coils
     key = "simulation.free_body.craft.windings"

@@ -301,7 +301,7 @@ _LOWEST_PERIGEE = 150e3
 An orbit with a lower perigee decays within a revolution.
 """
 _NIGHT, _DAY = 0.4, 1.6
-"""Factors of the air density on the side opposite to the diurnal bulge, and at its apex."""
+"""Factors of the air density opposite to the apex of the diurnal bulge, and at the apex."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
 """Mean density factor of the diurnal bulge over all directions."""
 _LAG = math.radians(30.0)
