@@ -575,8 +575,8 @@ class SlewTask:
         end: end conditions as a function of the slew's duration.
         horizon, longest: requested and longest permitted duration, s. The duration is extended if no path of
             the requested duration is found.
-        time_cost: weight of the duration in the cost, W. If the time cost is None, the duration is fixed; if
-            it is MINIMUM_TIME, only the duration is minimised.
+        time_cost: weight of the duration in the cost, W. If the time cost is None, the duration is not
+            optimised; if it is MINIMUM_TIME, only the duration is minimised.
         cones: exclusion cones that are avoided throughout the slew.
         nodes: number of collocation intervals, which is one less than the number of nodes.
     """

@@ -85,7 +85,7 @@ _STEPS, _LONGEST_STEP = 4, 16.0
 Gravity gradient amplifies errors of the integration by a factor of ten in about 20 minutes."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
 """Largest number of corrections of a path, error at the nodes (half angle, rad) below which the corrections
-end, and error at the nodes above which the plan of the path fails."""
+end, and largest error with which the path is accepted after the corrections."""
 
 
 def closed(
@@ -148,8 +148,8 @@ _ROOM = math.radians(0.005)
 the camera axis approaches a cone by less than this angle, and therefore does not enter the cone."""
 
 _RESERVE = 0.3
-"""Part of the deviation described in `_margins` that is added to the margin. A larger part means fewer
-corrections of paths, but a larger distance from the cones and more heat."""
+"""Fraction of the upper bound described in `_margins` that is added to the margin. With a larger fraction,
+fewer paths must be corrected, but paths keep a larger distance from the cones and need more heat."""
 
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
@@ -161,7 +161,7 @@ _ENDS = 9
 
 
 _LONGEST_INTERVAL = 250.0
-"""Length (s) of a collocation interval up to which paths are found in a low orbit."""
+"""Longest collocation interval (s) with which paths are found in a low orbit."""
 _HOPELESS = 10.0
 """Ratio of the required dipole to the dipole limit above which no other start time is tried. Along an orbit,
 the energy varies by a factor of up to ten, and the dipole by a factor of about three."""
@@ -260,12 +260,12 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
 
 
 def _margins(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the angles (cones, 2 nodes), rad, that widen cones at the points of a path similar to `path`.
+    """Return the angles (cones, 2 nodes), rad, by which cones must be widened at the points of similar paths.
 
-    Between two points, the camera axis may be closer to a cone than at both points. The difference depends on
-    where between the points the axis is closest to the cone, and is at most the deviation of the clearance
-    from the straight line through its values at both points. The margin is the difference on the given path
-    plus a part of this deviation.
+    Between two points, the camera axis may be closer to a cone than at both points. The upper bound of this
+    difference is the deviation, half-way between the points, of the clearance from the mean of its values at
+    both points. The result is the required angle plus a margin, which is the difference on `path` plus the
+    fraction `_RESERVE` of the upper bound, but at most the upper bound.
     """
     clear = _clearances(task, path)
     ends, middles = clear[:, ::_DENSE], clear[:, _DENSE // 2 :: _DENSE]
@@ -286,7 +286,7 @@ def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
 def refusal(task: SlewTask, tried: int, least: float = math.inf) -> str:
     """Return the error message, with possible remedies, for a task for which no path was found.
 
-    The argument `least` is the smallest ratio of the peak dipole to the dipole limit that the search found
+    The argument `least` is the smallest ratio of peak dipole to dipole limit among the paths that were found
     without the dipole limit (`SlewSearch.least`).
     """
     text = f"no slew within the dipole limit{' and outside the cones' * bool(task.cones)} was found"
@@ -552,7 +552,7 @@ def _craft(inertia: ArrayLike, dipole_limit: ArrayLike, heat: ArrayLike) -> Slew
 
 
 def _axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
-    """Return the body axes of the pointing targets. Raises ArgumentError if they determine no roll."""
+    """Return the body axes of the pointing targets. Raises ArgumentError if the axes are parallel."""
     axes = BodyAxes(unit_vector("pointing_axis", pointing_axis), unit_vector("across_axis", across_axis))
     if float(np.linalg.norm(np.cross(axes.pointing, axes.across))) < MINIMUM_SINE:
         raise ArgumentError(
@@ -610,8 +610,8 @@ def _ephemeris(elements: tuple[str, str], time: datetime, duration: float) -> Ep
     """Return the ephemeris for slews that begin at `time` and end at most `duration` s later.
 
     The ephemeris begins `LEAD` s before `time`, and ends at least `LEAD` s after the last slew. Raises
-    UsageError for invalid elements, OrbitError for elements of another time, and GeomagneticError outside the
-    years of the magnetic field model.
+    UsageError for invalid elements, OrbitError if the epoch of the elements is too far from these times, and
+    GeomagneticError outside the years of the magnetic field model.
     """
     dates, satellite = julian_date(time) + np.array([0.0, duration / DAY]), elements_of(elements)
     for year in julian_epoch(dates).tolist():
@@ -662,12 +662,14 @@ def plan_slew(
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
             default is three times `duration`, but at most 20,000 s.
-        window: length of the time interval in which the slew begins at the time of minimum energy, s.
+        window: length of the time interval, s, from which the start time of the best slew is chosen.
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
             energy plus `time_cost` times the duration. If the time cost is infinite, the shortest slew is
-            planned; if it is None, the duration is fixed.
-        pointing_axis: body axis (3,) that points to the targets. All three axes may have any length.
-        across_axis: body axis (3,) from which a roll is measured; its part along `pointing_axis` is ignored.
+            planned; if it is None, the duration is not optimised.
+        pointing_axis: body axis (3,) that points to the targets. This vector and the next two vectors may
+            have any length.
+        across_axis: body axis (3,) from which a roll is measured; its component along `pointing_axis` is
+            ignored.
         camera_axis: body axis (3,) that stays outside the cones, or None for `pointing_axis`.
         cones: half angles of the exclusion cones of Sun and Moon, and angle from the Earth's limb, rad.
         nodes: number of collocation intervals, 8 to 96.

@@ -62,7 +62,8 @@ class BandLayout:
         end: indices (ends,) of the multipliers of the end conditions.
         begins: indices (k + 1,) of the first element of each interval and of the last node.
         places: indices, in the flattened band matrix, of the elements to which the intervals contribute.
-        entries: indices of the elements of an interval's flattened matrix block that are copied to `places`.
+        entries: indices, in an interval's flattened matrix block, of the elements that are copied to
+            `places`.
     """
 
     states: IntArray
@@ -286,8 +287,8 @@ class Transcription:
     ) -> FloatArray:
         """Return the Newton matrix (the second derivatives of the Lagrangian) as a band matrix.
 
-        The barrier and convexification terms `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are
-        added to the second derivatives with respect to states and dipoles.
+        The barrier and convexification terms are added: `state_part` (2 k + 1, 7, 7) to the second
+        derivatives with respect to states, and `dipole_part` (k + 1, 3) to those with respect to dipoles.
         """
         at, h = linear.at, self._step
         half, whole = np.split(multipliers[self.layout.equations], 2, axis=1)
@@ -340,7 +341,7 @@ class SlewLimits:
         return np.concatenate(found)
 
     def pull(self, at: Trajectory, weights: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of the sum of all inequality values g multiplied by `weights`."""
+        """Return the derivative (size,) of the weighted sum of the values g of all inequalities."""
         layout = self.equations.layout
         result = np.zeros(layout.size)
         dipoles, cones = self._parts(weights, at)
@@ -366,8 +367,8 @@ class SlewLimits:
         """Return the second derivatives of the barrier with respect to states and with respect to dipoles.
 
         The shapes are (2 k + 1, 7, 7) for the states and (k + 1, 3) for the dipoles. The second derivatives
-        of the barrier are weighted sums over the inequalities g. The products of the first derivatives of g
-        have the weights `stiff`, and the second derivatives of g have the weights `bent`.
+        of the barrier are sums over the inequalities g. The products of the first derivatives of g are added
+        with the weights `stiff`, and the second derivatives of g are subtracted with the weights `bent`.
         """
         dipoles, cones = self._parts(stiff, at)
         _, weights = self._parts(bent, at)
@@ -450,7 +451,7 @@ class SlewProgram:
         self.steps = 0
 
     def factors(self, point: Iterate) -> Factors:
-        """Return the factorised Newton matrix for the smallest change of a path that removes all residuals.
+        """Return the factorised Newton matrix for removing all residuals of a path by the smallest change.
 
         The matrix omits the second derivatives of the equations, because a matrix with these derivatives
         would permit large steps near a flat optimum. Raises PlanningError if the matrix is singular.

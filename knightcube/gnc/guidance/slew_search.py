@@ -231,9 +231,9 @@ _DAMPED = 1.0
 _LONGEST_STEP = 4.0
 """Largest change of the mode amplitudes in an iteration of the momentum fit."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Heat of a mode, divided by the largest heat of a mode, below which the mode is discarded (first value).
-Singular value, divided by the largest singular value, below which a direction of the end momentum is not
-controlled (second value)."""
+"""First value: heat of a mode, relative to the largest heat of a mode, below which the mode is discarded.
+Second value: singular value, relative to the largest singular value, below which the modes do not control a
+component of the end momentum."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
 """End error (rad), and depth inside a cone (as a difference of cosines), above which a guess is tried after
 all other guesses."""
@@ -259,7 +259,7 @@ def guesses(equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -
 
 
 def _curves(equations: Transcription, craft: SlewCraft) -> tuple[FloatArray, FloatArray]:
-    """Return a curve (n, 3) of the angular momentum from start to end, and d additive modes (d, n, 3).
+    """Return a curve (n, 3) of the angular momentum from start to end, and d modes (d, n, 3) to add to it.
 
     The momentum is in kg m^2/s and ICRS axes. The modes preserve both ends, and are orthogonal, so that their
     heats are additive. A mode with the amplitude one rotates the body by about half a revolution.
@@ -385,26 +385,24 @@ ENOUGH = 3
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors by which the requested duration is multiplied, one after the other, until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Factor by which the first step shortens a slew (first value). The shortening ends when the shortest
-duration for which a path was found, divided by the longest duration for which none was found, is below the
-second value. The three pairs are for the coarse grid, for the fine grid, and for slews without a time cost on
-the fine grid."""
+"""First value: factor by which the first step shortens a slew. The shortening ends when the ratio of the
+shortest duration with a path to the longest duration without a path is below the second value. The three
+pairs are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
 _CROSSED = 1.3
-"""Angle by which a cone that a path crosses between two points is widened, divided by the depth of the path
-inside the cone."""
+"""Widening of a cone that a path crosses between two points, divided by the depth of the path inside the
+cone."""
 _BEYOND = math.radians(0.02)
-"""Additional angle (rad) by which a cone that a path crosses between two points is widened."""
+"""Angle (rad) that is added to this widening of a cone."""
 _BETWEEN = 16
 """Number of intervals of an intermediate grid, used if a path from the coarse grid does not converge directly
 on the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
-"""Ratio of the dipole to the dipole limit above which an integrated path is abandoned (first value). The
-second value is an additional factor for the duration of a path whose dipole exceeds the limit by less."""
+"""First value: ratio of the dipole to the dipole limit above which an integrated path is abandoned. If the
+ratio is smaller, the duration is multiplied by the root of the ratio and by the second value."""
 _PEAK = 0.9
 """Ratio of the largest dipole to the dipole limit at the first duration of a continuation."""
 _LEAST_COST = 1.1
-"""Ratio of the duration at which the continuation of a slew with a time cost begins to the estimated best
-duration."""
+"""First duration of the continuation of a slew with a time cost, divided by the estimated best duration."""
 
 
 class HorizonContinuation:
@@ -624,7 +622,7 @@ class SlewSearch:
                 yield from self._tried([found])
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path outside the cones that the path `found` crosses with the given depths, rad.
+        """Return a path outside the cones, starting from a path that crosses cones with the given `depths`.
 
         The array `depths` (cones, 2 nodes) contains the largest depth inside each cone between neighbouring
         points of the path. Returns None if no path is found or the path was corrected too often.

@@ -101,7 +101,8 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 
     If `near`, the path of a similar task with the same duration, is given, it is the first initial guess, and
     a plan found from this guess is returned immediately. Raises PlanningError with the reason if no path is
-    found, and for a task with a time cost, because the planner does not optimise the duration.
+    found. Tasks with a time cost also raise PlanningError, because the planner does not optimise the
+    duration.
     """
     plan = None if near is None else plan_near(task, near)
     if plan is not None:
@@ -158,7 +159,8 @@ def _end_attitude(end: End, near: FloatArray) -> FloatArray:
     if isinstance(end, AttitudeEnd):
         return end.quaternion
     seen = shown(near[None], end.direction[None])[0]
-    # The half-way quaternion from the direction at `near` to the boresight, body axes, has no roll.
+    # Quaternion of the shortest rotation from the attitude `near` to an attitude at which the boresight
+    # points along the direction.
     half = np.append(np.cross(end.axis, seen), 1.0 + float(seen @ end.axis))
     if float(np.linalg.norm(half)) < 1e-6:  # opposite directions
         half = np.append(tangent_basis(end.axis)[0], 0.0)
@@ -282,7 +284,7 @@ class ObservedPaths:
     def _needed(self, x: Numbers, drift: Numbers) -> Numbers:
         """Return the values (m n, 4 + cones) of m paths (3, m n, 3) at the n points.
 
-        The acceleration of a body without currents on these paths is `drift` (m n, 3).
+        The angular accelerations without coil currents are `drift` (m n, 3).
         """
         q, _, acceleration = self.turned(x)
         count = len(self._field)

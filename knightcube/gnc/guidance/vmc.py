@@ -97,7 +97,7 @@ class HorizonSearch:
 
         The current of a rest-to-rest slew of duration T scales with 1/T^2, so solutions without limits give
         an estimate of the shortest feasible duration. The nonlinear program with a free duration starts from
-        this estimate. If it has no solution, the search is repeated from a longer duration.
+        this estimate. If this program has no solution, the search is repeated from a longer duration.
         """
         if self.warm is not None:
             program = self.program_at(asked)
@@ -129,7 +129,7 @@ class HorizonSearch:
     def with_time_cost(
         self, guess: float, shortest: float, longest: float, time_cost: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path that minimises energy plus `time_cost` (W) times duration, from a guess (s).
+        """Return the path that minimises energy plus `time_cost` (W) times duration, found from a `guess`, s.
 
         The derivative of the minimum energy with respect to the duration equals the partial derivative at the
         optimal path (envelope theorem). A tried duration is a lower bound of the optimum if a longer duration
@@ -202,7 +202,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the nonlinear program of the duration `time` (s), and a path within the limits or None.
+        """Return the nonlinear program for the duration `time` (s), and a path within the limits or None.
 
         The search starts from the initial guess plus the difference `apart` (N,) on the nodes, if given.
         """
@@ -249,7 +249,7 @@ FINE_NODES = 40
 """Number of nodes for paths that reach the current limit near the requested duration. With 24 nodes,
 a path at the limit costs up to 0.3 % more than the optimal path, and with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
-"""Largest extension factor of a duration after which a path of the requested duration is searched with more
+"""Largest extension factor of a duration with which a path of the requested duration is sought again, on more
 nodes."""
 
 REFERENCE = 2.0
@@ -365,7 +365,8 @@ def plan(
             horizon, min(SHORTEST_WITH_TIME_COST, longest), longest, time_cost
         )
     if trial is None and cost is PathCost.SUPPLY:
-        # The heat is a smooth function of the current, so its search finds the shortest duration more often.
+        # The heat is a smooth function of the current, so a search for the minimum heat finds the shortest
+        # duration more often.
         coolest = plan(
             plant,
             start_q2,
@@ -406,15 +407,15 @@ def plan(
 
 
 _TRIED = 64
-"""Number of durations for which the error message computes the smallest current."""
+"""Number of durations for which the smallest current is computed for the error message."""
 
 
 def _remedy(plant: SingleAxisPlant, ends: BoundaryStates, horizon: float, longest: float) -> str:
     """Return the current limit, and the remedy if no path of `horizon` to `longest` s is found.
 
-    Without a thread, the current limit must permit the bang-bang path between the states at the angle zero,
-    where the torque is largest. If the acceleration is a in one part of the time T and -a in the other part,
-    it changes the rate by v and moves the body by s more than the mean of both rates does, with
+    Without a thread, the current limit must permit a bang-bang path with the torque at the angle zero, which
+    is the largest torque. If the coil causes the acceleration a in one part of the time T and -a in the other
+    part, it changes the rate by v, and the body moves by s more than T times the mean of both end rates, with
     a T^2 / 4 = |s| + v^2 / (4 a).
     """
     start, end = angle_of(ends.start), angle_of(ends.end)
@@ -435,7 +436,7 @@ def _remedy(plant: SingleAxisPlant, ends: BoundaryStates, horizon: float, longes
             f"{limit}: every path of these durations needs at least about {current:.3g} A: use a larger "
             "current limit, a longer horizon or a smaller step"
         )
-    # A body that moves at an end may also need a shorter horizon, because it would leave the range of angles.
+    # If the body moves at an end, it may also need a shorter horizon to stay within the range of angles.
     return f"{limit}: use {'another' if any(rates) else 'a longer'} horizon or a larger current limit"
 
 
@@ -596,7 +597,7 @@ def _q2_at(name: str, angle: float) -> float:
 
 
 def _cost(minimise: str) -> PathCost:
-    """Return the kind of energy called `minimise`. Raises PlanningError for an unknown name."""
+    """Return the kind of energy with the name `minimise`. Raises PlanningError for an unknown name."""
     names = [cost.value for cost in PathCost]
     if not (isinstance(minimise, str) and minimise in names):
         raise PlanningError(f"minimise is {brief(minimise)}: give {' or '.join(map(repr, names))}")
@@ -616,11 +617,11 @@ def plan_step(
     nodes: int = NODES,
     max_stretch: float = MAX_STRETCH,
 ) -> StepPlan:
-    """Return the minimum-energy path of a body about one axis that one torque coil rotates.
+    """Return the minimum-energy path of a body that one torque coil rotates about one axis.
 
-    The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP,
-    under the current limit of the plant and |angle| <= 1.4955 rad at every time, beyond which the coil has
-    almost no torque. Angles do not wrap. If no path of the requested duration satisfies the limits, the
+    The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP.
+    The path satisfies the current limit and |angle| <= 1.4955 rad at every time; at larger angles the coil
+    has almost no torque. Angles do not wrap. If no path of the requested duration satisfies the limits, the
     duration is extended to the shortest feasible duration ("stretched"). A plan takes about 2 ms.
 
     The method `plan.path.motion(times)` returns angle, rate and acceleration at times (n,), s after the
@@ -633,7 +634,7 @@ def plan_step(
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
-        time_cost: cost of the duration, W, which is added to the energy; None for a fixed duration.
+        time_cost: cost of the duration, W, added to the energy, or None to use `horizon` if possible.
         minimise: "heat" for the integral of R I^2, or "supply" for the supply energy, the integral of V |I|.
         nodes: number of nodes of the path, 8 to 40.
         max_stretch: largest ratio of the duration to `horizon`.

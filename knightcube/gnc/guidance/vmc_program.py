@@ -123,8 +123,8 @@ class PathFamily:
 
     Attributes:
         grid: pseudospectral discretisation of the paths.
-        still: values (N,), on the nodes, of the initial guess (prey path) with zero slopes at both ends,
-            which do not depend on the duration.
+        still: values (N,), on the nodes, of the initial guess (prey path) for zero slopes at both ends; these
+            values do not depend on the duration.
         drift: change (N,) of the initial guess per second of duration, due to the slopes at both ends.
         basis: change (N, N - 4) of the values on the nodes per unit of each parameter.
     """
@@ -174,8 +174,7 @@ class ObservedFamily:
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
         """Return the derivative (3, m) of q2, q2' and q2'' with respect to the duration.
 
-        A longer duration changes the initial guess, and reduces the factors that convert derivatives with
-        respect to the scaled time s to time derivatives.
+        A longer duration changes the initial guess and reduces the factors of `time_scale`.
         """
         slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
         return np.asarray(self.drift + slower * trajectory)
@@ -348,9 +347,9 @@ class PathProgram:
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
-        # If the start is already the optimum, NLopt reports limited progress due to rounding errors.
-        # The report is not a failure if a further Newton step would reduce the energy only a little.
-        # The reduction is estimated as half the squared gradient with respect to the whitened parameters.
+        # If the start is already the optimum, NLopt reports limited progress due to rounding errors. This
+        # report is not a failure if a further Newton step would reduce the energy only a little. The
+        # reduction is estimated as half the squared gradient with respect to the whitened parameters.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
@@ -474,7 +473,7 @@ def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _peaks(ratios: FloatArray) -> BoolArray:
-    """Return a mask (2, m) of the local maxima of |ratios| (2, m) along each row that exceed one."""
+    """Return a mask (2, m) of those local maxima of |ratios| (2, m) along each row which exceed one."""
     size = np.abs(ratios)
     peak = size > 1.0
     peak[:, 1:] &= size[:, 1:] >= size[:, :-1]
