@@ -44,7 +44,7 @@ def dropin(config: Config) -> str:
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
     if config.simulation is None and config.body != "testbed":
-        lines.append("Restart=always")  # a satellite flies again after the duration of a flight
+        lines.append("Restart=always")  # a satellite's flight software starts again after each flight
     if config.commands.udp is not None:  # UDP commands are accepted only from this machine
         lines += _network([LOOPBACK])
     return _text(lines)

@@ -70,7 +70,7 @@ class Build:
         return 0
 
     def _fill(self, release: Path, wanted: str) -> None:
-        """Build and test a release, whose sources have the digest `wanted`."""
+        """Build and test a release from sources with the digest `wanted`."""
         self._test(self._environment(release))
         if not self._options.dry_run:
             (release / SOURCE).write_text(wanted, encoding="ascii")
@@ -115,7 +115,7 @@ class Build:
         if problem := _damaged_package(old):
             sys.stderr.write(f"install: failed: add the folder wheels, because {problem}\n")
             raise SystemExit(1)
-        # Bytecode records the times of the old source files, so Python would not use copies of it.
+        # Bytecode is not copied, because Python rejects bytecode whose source file has another time.
         caches = shutil.ignore_patterns("__pycache__")
         ours = shutil.ignore_patterns(*_OURS, "__pycache__")
         for packages in old.glob("venv/lib/python3*/site-packages"):

@@ -8,13 +8,13 @@ the unpacked bundle instead of downloading files.
 
 The program writes the artefact to FOLDER/artefact, and the sources of a release to FOLDER/source. For a
 configuration, the program also writes FOLDER/set with the configuration and the drop-ins of its units. For
-orbital elements or a star catalogue, the configuration in FOLDER/set is a copy of the configuration PRESENT
-with one value replaced. PRESENT must match its checksum file. KEPT is the folder in which the star catalogue
-is installed later. UTC is the mission time (s since 1970) with which expiry dates are compared. If UTC is
-empty, the mission time is unknown and expiry dates are not checked, because the system clock of a board may
-be wrong. PRESENT, KEPT and UTC may be omitted for a release. The program prints the version, the permission
-to replace a newer version, and the SHA-256 as one JSON object. For a refused bundle, the program prints one
-line and exits with status 1.
+orbital elements or a star catalogue, the configuration in FOLDER/set is that in the file PRESENT with one
+value replaced. PRESENT must match its checksum file. KEPT is the folder in which the star catalogue is
+installed later. UTC is the mission time (s since 1970) with which expiry dates are compared. If UTC is empty,
+the mission time is unknown and expiry dates are not checked, because the system clock of a board may be
+wrong. PRESENT, KEPT and UTC may be omitted for a release. The program prints the version, the permission to
+replace a newer version, and the SHA-256 as one JSON object. For a refused bundle, the program prints one line
+and exits with status 1.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class _Content:
 
 
 class _Member(tarfile.TarInfo):
-    """Header of a file. Other headers are refused before tarfile reads their values, of any length."""
+    """Header of a regular file. Any other header is refused before tarfile reads its values of any length."""
 
     @classmethod
     def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:

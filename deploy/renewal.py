@@ -122,7 +122,7 @@ class State:
         previous: name of the configuration that flew before the present one.
         bad: names of the releases that failed a trial.
         trial: open trial.
-        returning: kind, target, replaced version and report of an unfinished rollback to an earlier version.
+        returning: kind, target, replaced version, request, command and text of an unfinished return.
         reports: newest reports, each a list of number, request, result, name and text.
         note: text that the flight reports as an event at its next start.
         note_s: time (s) for which the flight software has run since the note was made.
@@ -168,13 +168,13 @@ def decoded(data: bytes) -> Any:
 
 
 def state_of(values: dict[str, Any]) -> State:
-    """Return the state from the values of a record. Raises one of `_DAMAGED` for invalid values."""
+    """Return the state from the values of a record. Raises an exception of `_DAMAGED` for invalid values."""
     trial = values["trial"] and Trial(**_known(Trial, values["trial"]))
     return State(**{**_known(State, values), "trial": trial})
 
 
 def _known(shape: type, values: dict[str, Any]) -> dict[str, Any]:
-    """Return `values` without the attributes that only a later version of the class `shape` has."""
+    """Return `values` without attributes that the class `shape` lacks, such as those of a later version."""
     return {name: value for name, value in values.items() if name in shape.__annotations__}
 
 
@@ -499,7 +499,7 @@ class Renewal:
         self._save()
 
     def accept(self, what: str) -> None:
-        """Store the accepted configuration, and end a trial or return that would undo what was installed."""
+        """Store the accepted configuration, and end a trial or a return that would undo the installation."""
         state, trial, ended = self._state, self._state.trial, list[str]()
         if not self._board.keep(GROUND):
             raise OSError(f"{self._board.configuration} cannot be read")
@@ -510,7 +510,7 @@ class Renewal:
             if trial.what == "configuration":
                 state.previous = trial.old
             elif trial.old:
-                # install.sh keeps the current release as the fallback, which must not be an unconfirmed one.
+                # install.sh keeps the release `current` as the fallback, so this must be a confirmed release.
                 self._board.point("current", trial.old)
         if ended:
             self._report(ended[0], "failed", ended[1], "install.sh was run: its version stays")
@@ -535,7 +535,7 @@ class Renewal:
         """Execute a request, in at most `MOST_TRIES` attempts, and report the reason if it is refused."""
         state = self._state
         state.begun = {name: state.begun.get(name, 0) + 1}
-        self._save()  # so that a request during which the board loses power is not repeated forever
+        self._save()  # otherwise a request that stops the board would be repeated forever
         state.handled = [*state.handled, name][-KEPT_REQUESTS:]
         request: dict[str, Any] = {}
         with (
@@ -601,7 +601,7 @@ class Renewal:
         left_s, despite, before = 3600.0 * hours, bool(request["despite_faults"]), board.release("previous")
         session = str(self._contact.get("session", ""))
         if kind == "release":
-            # If the current release is incomplete, the previous release runs, and also follows a trial.
+            # If the current release is incomplete, the previous release runs, also after a failed trial.
             old, new, what = board.release("current") or board.release("previous"), "", "release"
             os.sync()  # the sources are on disk before the trial is stored
         else:
@@ -633,9 +633,9 @@ class Renewal:
     def _opened(
         self, kind: str, folder: Path, releases: Iterable[str], trusted: Path, utc: str = ""
     ) -> dict[str, Any]:
-        """Return the result of `open_bundle.py` at the mission time `utc` (s), an empty text if unknown.
+        """Return the result of `open_bundle.py`.
 
-        The content is written to `folder`. Raises Refused if every attempt with one of `releases` fails.
+        The content is written to `folder`. Raises Refused if the program fails with all `releases`.
         """
         board, problems = self._board, list[str]()
         program = Path(__file__).resolve().with_name("open_bundle.py")
@@ -653,7 +653,7 @@ class Renewal:
         raise Refused([*problems, "no release or no root.json is installed: run deploy/install.sh"][0])
 
     def _confirm(self, name: str, kind: str) -> None:
-        """End the trial and keep the new version. Raises Refused if it cannot be confirmed."""
+        """End the trial and keep the new version. Raises Refused if the trial cannot be confirmed."""
         state, trial, board = self._state, self._state.trial, self._board
         if trial is None or trial.stage != "fly" or trial.kind != kind:
             raise Refused(f"no {kind} is on trial")
@@ -756,7 +756,7 @@ class Renewal:
         again.mkdir()
         try:
             self._opened("release", again, [name], again / "trusted")
-        except Refused as error:  # after two such releases, no bundle could be opened any more
+        except Refused as error:  # with two such releases, no bundle could be opened any more
             raise Refused(f"the release cannot open bundles: {error}") from error
 
     def _begin_revert(self, problem: str) -> None:
@@ -880,7 +880,7 @@ class Renewal:
             text = f"no authentic frame for {state.silent_s:.0f} s: the {what} is used"
             if self._go_back(step, "", "command-loss", text):
                 return
-            # If this step has no version to return to, the timer's next step follows at once.
+            # If there is no version to which this step can return, the next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _age_note(self) -> None:

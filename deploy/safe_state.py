@@ -32,7 +32,7 @@ FLEW_S = 600.0
 """Flight duration (s) after which the next restart has the shortest waiting time (`FIRST_S`) again."""
 
 COILS_S, RETRY_S = 30.0, 1.0
-"""Intervals (s) between attempts to set the coils to zero, after a successful and after a failed attempt.
+"""Time (s) until the coils are set to zero again, after a successful attempt and after a failed attempt.
 
 The script `coils-off` is also killed after `COILS_S`, so that a hanging bus delays answers by no more than
 this time.
@@ -166,7 +166,7 @@ def coils_off() -> bool:
             return script.wait(COILS_S) == 0
         except subprocess.TimeoutExpired:
             say(f"coils-off is killed because it did not end in {COILS_S:.0f} s")
-            os.killpg(script.pid, signal.SIGKILL)  # the script and the programs that it waits for
+            os.killpg(script.pid, signal.SIGKILL)  # ends the script and its child processes
             script.wait()
     return False
 
