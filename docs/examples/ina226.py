@@ -94,7 +94,7 @@ def open_monitor(rig: Rig, section: Ina226Section) -> Ina226:
 
 
 def probe(rig: Rig, section: Ina226Section) -> str:
-    """Check for `knightcube check` that the device responds. Raises DeviceError if not."""
+    """Check for `knightcube check` that the device responds. Raises DeviceError if it does not."""
     monitor = open_monitor(rig, section)
     try:
         return monitor.identify()

@@ -1,6 +1,6 @@
-"""Calibrate a lens from images of the night sky, solve another image with it, and estimate it image by image.
+"""Calibrate a lens from images of the night sky, solve an image with it, and let a star tracker learn it.
 
-The script draws the images as a camera with 2 % of barrel distortion at its corners takes them.
+The script draws the images of a camera whose lens has 2 % of barrel distortion at the corners.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STARS = catalogue.load()
 
 
 def draw(right_ascension: float, declination: float, roll: float) -> Image:
-    """Return an image of the sky at a pointing, in deg, with the distortion of the lens."""
+    """Return an image of the sky through the distorting lens; the three angles of the pointing are in deg."""
     matrix = attitude_matrix(Pointing(*np.radians([right_ascension, declination, roll])).quaternion())
     rays = STARS.directions_at(2026.5) @ matrix.T
     near = (rays[:, 2] > 0.97) & (STARS.magnitude < 7.5)

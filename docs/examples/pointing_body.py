@@ -144,7 +144,7 @@ class Direct:
         return self._reference
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether the time to reach the target has not yet elapsed."""
+        """Return whether the body may still be on its way to the target."""
         return now_ns - self.since_ns < DUE_NS
 
     def is_adrift(self, now_ns: int) -> bool:
@@ -156,7 +156,7 @@ class Direct:
         self._reference = None
 
     def busy_since_ns(self) -> int | None:
-        """Return None, because the worker never has a job."""
+        """Return None, because this body never has a planning job."""
         return None
 
     def aim(self, target: Target, now_ns: int) -> None:

@@ -24,7 +24,7 @@ row, column = np.indices(frame.shape) - MARGIN
 
 
 def draw_path(points: FloatArray, electrons: float) -> None:
-    """Add a path (n, 2), px, of a point of light that is blurred by 1 px."""
+    """Draw the path (n, 2), px, of a point source of light into the frame, blurred by 1 px."""
     for x, y in points:
         if -3.0 < x < 514.0 and -3.0 < y < 514.0:
             left, top = int(x) - 5 + MARGIN, int(y) - 5 + MARGIN
