@@ -320,7 +320,8 @@ def talker(
 
     The kind is `vn100` or `gps`, or "" if none is recognised. The pause is 0 for a device that sends
     regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100. The first rate is
-    tried for at least `period_ns`, because the last flight may have configured this interval of the messages.
+    tried for at least `period_ns`, because the last flight may have set the device to this interval between
+    messages.
     """
     listened_ns = max(_LISTEN_NS, period_ns)
     for rate in dict.fromkeys((*rates, *BAUD_RATES)):
@@ -364,7 +365,7 @@ def find(config: Config, rig: Rig) -> Iterator[Found]:
         place = _place(config, key, section, driver)
         try:
             if camera and rig.cameras is None:
-                with ExitStack() as opened:  # closes the camera, so that a later step can open it
+                with ExitStack() as opened:  # the camera is closed for later steps
                     open_camera(section, rig, opened)
             answer = "opens" if driver is None or camera else driver.probe(rig, section)
             finding = _wrong_part(key, section, rig, serial)

@@ -152,7 +152,7 @@ def step_light(session: Session) -> Outcome:
 
 
 def _size_changes(camera: Camera, pixels: Image) -> dict[str, Any]:
-    """Return the columns and rows of a frame as changes of the configuration, if they differ from it."""
+    """Return changes of the configured columns and rows, or no changes if the frame has these already."""
     if pixels.shape == (camera.rows, camera.columns):
         return {}
     return {"camera": {"columns": pixels.shape[1], "rows": pixels.shape[0]}}

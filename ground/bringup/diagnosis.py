@@ -127,8 +127,8 @@ def missing_share(change: FloatArray, noise: float) -> float:
     """Return the fraction of samples in which the coil produced no field.
 
     The coil changes the measured field by `change` (k, 3), T. The field of the coil is missing in a sample if
-    the change is less than half of the usual change. The fraction is 0 if the usual change does not exceed
-    eight times the `noise` (T) of a sample.
+    the change is less than half of the typical change (80th percentile). The fraction is 0 if the typical
+    change is at most eight times the `noise` (T) of a sample.
     """
     mean = change.mean(axis=0)
     along = change @ mean / (np.linalg.norm(mean) or 1.0)
@@ -230,7 +230,8 @@ class Turns:
 
     Attributes:
         gyro: rotation vectors (3, 3) measured by the gyro, rad.
-        before, after: mean acceleration and mean field (3, 2, 3) before and after each rotation.
+        before, after: mean acceleration and mean field before and after each rotation (3, 2, 3); the second
+            index is 0 for the acceleration and 1 for the field.
     """
 
     gyro: FloatArray
@@ -559,7 +560,7 @@ class CoilsFound:
         live: mask (n,) of the commands that produce a field.
         drawn: supply current (n,) relative to the command, corrected for a wrong shunt; NaN if unknown.
         shunt: ratio of actual to configured shunt resistance, or 1.
-        joined: commands (j, k) whose coils are connected, so that command j also drives coil k.
+        joined: for each command j that drives two connected coils, the second coil k.
         askew: largest angle (rad) between the measured and the expected field of a healthy coil.
         findings: the faults.
     """

@@ -58,7 +58,7 @@ def step_power(session: Session) -> Outcome:
 def _readings(
     session: Session, monitors: Mapping[str, PowerMonitor], command: FloatArray
 ) -> dict[str, PowerReading | None]:
-    """Return the newest readings after the coils have carried the currents `command` (n,), A, for a while.
+    """Drive the coils with the currents `command` (n,), A, and return the newest readings.
 
     The reading of a monitor is None if it is older than these currents.
     """
@@ -113,7 +113,7 @@ def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -
 _FIX_PATIENCE_S = 120.0  # longest time (s) that a receiver under an open sky needs for its first fix
 _SILENCE_S = 6.0
 _FIXES = 12
-_NMEA_PERIOD_S = 1.0  # interval (s) of the fixes of an NMEA receiver, which the driver does not configure
+_NMEA_PERIOD_S = 1.0  # interval (s) between fixes of an NMEA receiver; no driver sets this interval
 _LATE_S = 0.7
 """Largest age (s) of a fix at its arrival: receivers need up to 0.2 s, and slow serial lines add to this."""
 _CLOCK_S = 5.0  # difference (s) between GPS time and computer time that is not explained by a late fix

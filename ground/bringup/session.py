@@ -286,7 +286,7 @@ def _coil_changes(
             windings[k]["sign"] = coil.sign * (-1 if found.strength[j] < 0 else 1)
         resistance = kinds.get((part, "wrong resistance"))
         if resistance is not None and resistance.factor is not None:
-            # The duty cycle of a command follows from the resistance of its own winding, not of coil k.
+            # The driver computes the duty cycle of command j from the resistance of winding j, not of coil k.
             windings[k]["resistance"] = round(coil.resistance * resistance.factor, 3)
         tilted = axes_known and (part, "wrong direction") in kinds
         if tilted:
