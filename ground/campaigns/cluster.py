@@ -1,7 +1,7 @@
 """Campaigns on a Dask cluster whose machines have the dependencies, but not the packages of this project.
 
-A plugin sends the project's packages to every worker, also to workers that join later. A case is sent as the
-name of the function that runs it, with the case's data. This module itself is pickled by value, so that
+A plugin sends the project's packages to every worker, also to workers that join later. A case is sent as
+data, with the name of the function that runs the case. This module itself is pickled by value, so that
 scheduler and workers can read it without the packages. The top level of this module must therefore import
 neither the packages nor Dask.
 """

@@ -242,7 +242,7 @@ def _without_nan(value: Any) -> Any:
 
 
 def _note_complete(out: Path) -> None:
-    """State that no case ran, because all cases already had results, and when the campaign began."""
+    """Print that no case ran because all cases have results, and when the campaign began."""
     begun = datetime.fromtimestamp((out / _LABEL).stat().st_mtime).isoformat(" ", "minutes")
     whole = f"contains all results of the campaign of {begun}; delete the folder to run it again"
     sys.stderr.write(f"no case ran: {out} {whole}\n")
@@ -329,7 +329,7 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
     """Run cases on the cores of this machine, and yield each result when its case ends.
 
     If a worker process dies, another process runs its case. Raises CampaignError if three processes die while
-    they run the same case, and passes on the exception of a case that fails. All worker processes have ended
+    they run the same case. If a case fails, its exception is raised here. All worker processes have ended
     when the function returns or raises an error.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -377,7 +377,7 @@ def _worker(campaign: Campaign, scratch: str) -> _Worker:
     pipe, end = context.Pipe()
     process = context.Process(target=_serve, args=(end, campaign.run, os.getpid(), scratch))
     process.start()
-    end.close()  # so that the pipe is closed when the worker process ends
+    end.close()  # the pipe then closes when the worker process ends
     return _Worker(process, pipe)
 
 
@@ -419,7 +419,7 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
 def _sendable(
     case: Case, answer: tuple[Result | None, Exception | None]
 ) -> tuple[Result | None, Exception | None]:
-    """Return result and exception of a case, or a CampaignError instead of those that cannot be pickled."""
+    """Return result and exception of a case, or a CampaignError if they cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(answer))
     except Exception as problem:  # noqa: BLE001 - any error of the methods of a foreign class

@@ -229,7 +229,7 @@ def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) 
 
 
 def fly_case(case: Case) -> Result:
-    """Fly a case in lock-step, and return its random parameters and its limited performance measures."""
+    """Fly a case in lock-step, and return its random parameters and the performance measures with limits."""
     given = case.parameters
     found: Result = {"key": case.key, "drawn": given["drawn"], "judged": [], "error": ""}
     found |= {name: given[name] for name in ("seed", "duration")}
@@ -270,7 +270,7 @@ def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[fl
                 row["quantity"], (row["limit"], row["unit"], [math.nan] * len(results))
             )
             worst = math.nan if row["worst"] is None else float(row["worst"])
-            values[number] = float(np.fmax(worst, values[number]))  # the other value if one is NaN
+            values[number] = float(np.fmax(worst, values[number]))  # the larger value, ignoring NaN
     return found
 
 

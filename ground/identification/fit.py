@@ -1,4 +1,4 @@
-"""Maximum-likelihood fit of the motion's constants and the noise levels to a record, and absolute constants.
+"""Maximum-likelihood fit of the plant's constants and the noise levels to a record of the motion.
 
 The equation of motion, divided by the inertia, is theta'' = g I cos(theta) - kappa theta - delta theta' + d
 (Sease 2013, eq. 5.4, with the thread). Each change of the current I takes effect after the delay tau. The
@@ -15,7 +15,7 @@ levels by Fisher scoring. The priors are wide and affect only values that the re
 prior of the delay is about 20 ms, and the prior noise levels are uncertain by a factor of 3. Events that
 noise cannot explain, such as the release, a jolt or an outlier, restart the filter.
 
-The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
+If the innovations are white (test of Ljung and Box 1978), the covariance is the inverse of the information.
 The inertial unit's attitude filter or air currents can make the innovations correlated, that is, not white.
 If the innovations are not white, each standard deviation is at least the sandwich estimate (Huber 1967) over
 segments of the record.
@@ -235,7 +235,7 @@ class _Predictor:
         self._pbb = b1 * f21 + b2 * f22 + q * span
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives (6,) of the predicted angle and of the predicted gyro reading."""
+        """Return the derivatives (6,) of predicted angle and gyro reading with respect to the constants."""
         return self._by_angle, self._by_rate + self._bias_row
 
     def update(
@@ -342,7 +342,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
         settled = float(np.max(np.abs(likelier.to_logarithms() - noise.to_logarithms()))) < _NOISE_CONVERGED
         noise = likelier
         if settled and largest < _CONVERGED:
-            # Samples that differed from the motion of earlier constants may agree with the present ones.
+            # Samples that the gate rejected with earlier constants may pass it with the present constants.
             gated = _gated(record, constants, noise, gates.pop(0)) if gates else restarts
             if gated == restarts:
                 return _finished(record, constants, noise, restarts)

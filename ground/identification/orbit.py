@@ -38,7 +38,7 @@ LEARNED = 0.5
 """Maximum ratio of estimated to configured standard deviation (rms) at which a quantity counts as learned."""
 _UNIFORM = math.sqrt(3.0)  # largest error of a uniform distribution with a standard deviation of one
 _FRACTIONS = np.geomspace(1.0, 1e-3, 13).tolist()
-"""Fractions of the configured inertia accuracies that are tried, in decreasing order."""
+"""Factors, in decreasing order, by which the search multiplies the configured inertia accuracies."""
 _ELEMENTS = ("xx", "yy", "zz", "yz", "zx", "xy")
 _AXES = ("x", "y", "z")
 _MATRIX = tuple(a + b for a in _AXES for b in _AXES)
@@ -73,7 +73,7 @@ class LearnedQuantity:
 
     @property
     def change(self) -> FloatArray:
-        """Changes (n,) of the learned values in estimated standard deviations, or NaN if `claim` is zero."""
+        """Changes (n,) of the learned values, divided by `claim`; NaN if `claim` is zero."""
         known = np.where(self.claim > 0.0, self.claim, math.nan)
         return np.asarray((self.value - self.described) / known)
 

@@ -29,7 +29,7 @@ _RESOLUTION = 1.0e-4
 """Difference (A) above which two currents count as different; one PWM count is about 4e-5 A."""
 _SETTLED_FIELD = 0.5  # time (s) from switching off the coils until the field is measured
 _MAX_GAP = 60.0  # longest allowed time (s) between two samples
-_CLIPPED_VARIANCE = 100.0  # factor by which the variance of a current is increased at the coil's limit
+_CLIPPED_VARIANCE = 100.0  # variance of a current at the coil's limit, relative to other currents
 _MAX_VALUES = {
     "imu": {"quaternion": 1.001, "rate": 50.0, "field": 0.1},
     "control": {"current_command": 10.0, "current_written": 10.0},
@@ -200,7 +200,7 @@ _OFFSET_SIGMAS, _OFFSET_SHARE, _MOST_OFFSET = 6.0, 0.01, 0.5
 """Smallest magnetometer offset that is subtracted, in standard deviations and as a fraction of the field, and
 largest offset, as a fraction of the field."""
 _LEAST_ROTATION = 0.1
-"""Smallest rotation (rad, standard deviation) that separates an offset of the magnetometer from the field."""
+"""Smallest standard deviation (rad) of the angle that separates magnetometer offset and field."""
 
 
 def _field(
@@ -259,7 +259,7 @@ class Timeline:
 
     @classmethod
     def of(cls, record: Record, delay: float) -> Timeline:
-        """Return the events from the first to the last sample; the coil currents change `delay` s late.
+        """Return the events from the first to the last sample; currents change `delay` s after `switch_time`.
 
         The current before the first switch time is zero. Intervals longer than `MAX_STEP` are divided.
         """
