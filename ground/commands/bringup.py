@@ -205,7 +205,7 @@ def _keep(options: argparse.Namespace, key: str, known: Mapping[str, Outcome], n
     folder, outcome = options.out, known[name]
     if outcome.arrays:
         np.savez(folder / f"{name}.npz", **outcome.arrays)
-    else:  # arrays of an earlier session do not belong to this outcome
+    else:  # the file of an earlier session does not belong to this outcome
         (folder / f"{name}.npz").unlink(missing_ok=True)
     for title, pixels in outcome.frames.items():
         write_picture(folder / f"{title}.png", pixels)

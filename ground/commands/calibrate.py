@@ -182,7 +182,7 @@ def _omitted(name: str, term: OmittedTerm) -> str:
 
 
 def _field_of_view(lens: DeterminedLens) -> float:
-    """Return the horizontal field of view (deg) of the lens without its distortion."""
+    """Return the horizontal field of view (deg) of the lens, ignoring its distortion."""
     found = lens.calibration.lens
     return 2.0 * math.degrees(math.atan(0.5 * found.columns / found.focal_length))
 

@@ -384,7 +384,7 @@ def run_passes(options: argparse.Namespace) -> int:
         cure = f"{NEWER}, or a longer lead"
         raise UsageError(f"--schedule: {problem}, which exceeds --lead {options.lead:g}: {cure}")
     found = prediction.passes(stations)
-    # If the prediction begins now, there must be time to send its commands.
+    # If the prediction begins now, the first command must be due late enough to be sent in time.
     earliest = prediction.begin + (SENDING if options.begin is None else timedelta(0))
     commands = _commands(found, options.lead, earliest) if options.schedule else [[] for _ in found]
     if options.json:

@@ -179,7 +179,7 @@ def _fly(options: argparse.Namespace) -> Path:
     from flight.app.run import default_folder  # noqa: PLC0415
 
     given = configuration.load_testbed(options.source)
-    if given.simulation is not None:  # so that an error names the user's file and line
+    if given.simulation is not None:  # errors then name the user's file and line
         from sim_hal.rig import SimulationRequest  # noqa: PLC0415 - loads the simulator
 
         SimulationRequest(options.source, read_text(options.source), Path()).section()

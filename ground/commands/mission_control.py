@@ -174,7 +174,7 @@ def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Pope
 
 
 def _failed(process: subprocess.Popen[bytes]) -> bool:
-    """Return whether a process has ended with an error, unlike a flight at the end of its duration."""
+    """Return whether a process has ended with an error; a flight that reaches its duration has none."""
     return process.poll() not in (None, 0)
 
 
@@ -252,7 +252,7 @@ _Forecast = tuple["OrbitPrediction", tuple["Station", ...]]
 
 
 def _forecast(options: argparse.Namespace) -> _Forecast | None:
-    """Return the predicted orbit and the stations, or None without stations. Raises UsageError."""
+    """Return the predicted orbit and the stations, or None if no station is given. Raises UsageError."""
     if not options.station and options.stations is None:
         return None
     source = argparse.Namespace(**{**vars(options), "config": options.elements or options.config})

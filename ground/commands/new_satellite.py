@@ -169,8 +169,8 @@ class Answers:
     def ask(self) -> None:
         """Ask for the values that the user has not given as options.
 
-        Raises KeyboardInterrupt after Ctrl-C, and UsageError at the end of the input. In both cases the
-        command that continues with the answers so far is shown.
+        Raises KeyboardInterrupt after Ctrl-C, and UsageError at the end of the input. In both cases, a
+        command line is shown that continues after the answers so far.
         """
         try:
             for question in self._open():

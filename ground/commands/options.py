@@ -103,11 +103,11 @@ def exposure_of(options: argparse.Namespace, configured: float | None) -> tuple[
 
 
 _MOST_ASIDE, _MOST_RATIO = 60.0, 3.0
-"""Largest angle (deg) and ratio between a measured rate and the rough rate that determines its sign."""
+"""Largest angle (deg) and largest ratio of magnitudes of a rough and a measured rate that agree."""
 
 
 def prior_contradiction(prior: Sequence[float] | None, rate: FloatArray | None) -> str:
-    """Return how a rough rate (3,) contradicts a measured rate (3,), rad/s, or an empty text.
+    """Return a text on how a rough and a measured rate (3,), rad/s, differ, or an empty text if they agree.
 
     A rough rate that contradicts the measured rate is not used to determine the sign of the latter.
     """

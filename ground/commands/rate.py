@@ -167,7 +167,7 @@ def _estimate(
 def _objects(
     pixels: Image, pinhole: Pinhole, found: FrameMotion, likelihood: LikelihoodSettings, unit: float
 ) -> tuple[tuple[SpaceObject, ...], str]:
-    """Return the objects in the picture, and the reason why they could not be searched or an empty text."""
+    """Return the objects in the picture, and the reason why the search failed, or an empty text."""
     if found.rate is None:
         return (), "the rate is not known"
     gain, saturation = likelihood.gain, likelihood.saturation
@@ -223,7 +223,7 @@ def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:
         size = float(np.linalg.norm(found.rate))
         along = found.rate / size
         spread = float(np.sqrt(along @ found.covariance @ along))
-        # Slow rates need more digits: the smallest uncertainty has at least two.
+        # Small uncertainties need more decimals: each uncertainty has at least two significant digits.
         digits = max(4, 1 - math.floor(math.log10(max(1e3 * float(sigma.min()), 1e-12))))
         pairs = zip(found.rate, sigma, strict=True)
         values = "  ".join(f"{1e3 * r:+.{digits}f} +- {1e3 * s:.{digits}f}" for r, s in pairs)

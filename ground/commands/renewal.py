@@ -196,8 +196,8 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
     """Sign the bytes of an artefact, and return the path of their bundle. Raises UsageError.
 
     The bundle is written completely before the metadata, so that a failed write does not use up a version.
-    The bundle gets its final name last. If it could be used before its metadata are stored, the next bundle
-    could have the same versions of the metadata.
+    The bundle gets its final name only after the metadata are stored. Otherwise a failed write could leave a
+    usable bundle, and the next bundle would have the same metadata versions.
     """
     folder, kind = options.folder, options.kind
     signer = _read_key(folder / "signing.pem")

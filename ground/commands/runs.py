@@ -52,7 +52,7 @@ def run_report(options: argparse.Namespace) -> int:
     try:
         paths = reporting.draw(run, options.figures or options.run / "figures")
     except UsageError as error:
-        # The numbers have been printed, so missing pictures are an error only with the option --figures.
+        # The report has been printed, so missing pictures are an error only with the option --figures.
         sys.stderr.write(f"knightcube: {error}\n")
         return 0 if options.figures is None else 2
     if not options.json:

@@ -242,7 +242,7 @@ def _command_by_link(options: argparse.Namespace) -> int:
 
 
 def _hint(options: argparse.Namespace) -> str:
-    """Return how to see that a started command has changed the mode; empty if it does not change the mode."""
+    """Return a hint on where the mode that a command starts is shown; empty if it changes no mode."""
     if options.what not in commands.LAYOUTS:
         return ""
     mode = final_mode(_command_of(options))
@@ -623,7 +623,7 @@ class _FileWork:
         if name and now_ns * 1e-9 - self._shown_s >= _SHOW_S:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():
-                if one.name not in {"", name}:  # an earlier transfer that continues is not shown
+                if one.name not in {"", name}:  # transfers of other files are not shown
                     continue
                 part = f"{one.done} of {one.size} bytes" if one.size else "waiting for data"
                 sys.stderr.write(f"knightcube: {shown(one.name or name)}: {part}\n")

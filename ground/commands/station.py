@@ -154,8 +154,8 @@ def run_watch(options: argparse.Namespace) -> int:
 def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: str) -> int:
     """Show the flight whose packets the source `tail` delivers.
 
-    `wait` is the longest time (s) to wait for a first complete state, and `where` is the end of the message
-    that is shown if no packets arrive.
+    `wait` is the longest time (s) to wait for a first complete state. If no packets arrive, a message that
+    ends with `where` is shown.
     """
     state, by_link = FlightState(), options.link is not None
 
