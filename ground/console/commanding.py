@@ -47,9 +47,9 @@ Send = Callable[[bytes], Object]
 """Function that sends a command packet and returns the answer with `obeyed` and `text`. Raises
 KnightCubeError."""
 _TIMEOUT_S = 3.0  # longest time (s) to wait for an answer from a socket
-_LISTEN_S = 0.02  # longest time (s) for which one read of a link waits
+_LISTEN_S = 0.02  # longest time (s) to wait in one read of a link
 _RESTART_NS = 10 * SECOND_NS
-"""Decrease of the mission time (ns) that shows a restart of the flight; delayed packets are less late."""
+"""Decrease of the mission time (ns) that shows a restart of the flight; delays of packets are shorter."""
 _RUN, *_OF_THE_LINK = (
     LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (RUN, LINK, VERIFICATION, TRANSFER)
 )
@@ -239,7 +239,7 @@ class LinkFeed:
         return time.monotonic() - self._received
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name received since the last call.
+        """Return the packets received since the last call, by name.
 
         If the flight software was restarted since then, only the packets after the restart are returned. A
         failure to send is stored in `problem`, because telemetry may still arrive. Raises FileError if the
@@ -279,8 +279,8 @@ class LinkFeed:
     def _since_restart(self, packets: list[bytes]) -> list[bytes]:
         """Return the packets after the last restart of the flight, or all packets if there was no restart.
 
-        A restart is shown by a different packet `run` that is followed by a decrease of mission time. Either
-        alone shows no restart: a packet `run` may correct the UTC, and a link process that restarts repeats
+        A restart is shown by a different packet `run` that is followed by a decrease of mission time. Neither
+        is sufficient alone: a packet `run` may correct the UTC, and a link process that restarts repeats
         packets of the flight.
         """
         first = 0
@@ -305,7 +305,7 @@ class LinkFeed:
         """
         with self.lock:
             counter = self._terminal.send(packet, _SPI)
-            self._reports.pop(counter, None)  # it would belong to a frame with an earlier key
+            self._reports.pop(counter, None)  # reports on a frame with an earlier key
         until = time.monotonic() + _ANSWER_S
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))

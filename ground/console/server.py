@@ -148,7 +148,7 @@ class Console:
                 f"restarts of the flight: {self.restarts}; the page shows the packets since the last restart"
             )
         self.trouble = "; ".join(doubts)
-        # Packets of one time may arrive in two reads, so the page shows times up to the previous read.
+        # Packets of one time may arrive in two reads, so the page omits the times of the newest read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
@@ -202,7 +202,7 @@ def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
 
 
 def application(console: Console, access: Access) -> web.Application:
-    """Return the web application of a console whose packets have been read at least once."""
+    """Return the web application of a console, which must have read packets at least once."""
 
     @web.middleware
     async def only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -253,7 +253,7 @@ def application(console: Console, access: Access) -> web.Application:
 
 
 def _is_not_a_malformed_request(record: logging.LogRecord) -> bool:
-    """Return False for the traceback of bytes that are not HTTP, which another program has sent."""
+    """Return False for a logged error about received bytes that are not HTTP."""
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
@@ -418,7 +418,7 @@ class _Pages:
         name, given = await _command_of(request)
         try:
             return web.json_response({"words": self._console.forms.text(name, given)})
-        except UsageError as error:  # normal while the form is still being filled in
+        except UsageError as error:  # expected while the operator fills in the form
             return web.json_response({"error": str(error)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:
@@ -457,7 +457,7 @@ class _Pages:
         try:
             shown = state.at(at_ns, LAYOUTS)
         except OSError as error:
-            state.reset()  # the next state that can be read is sent completely
+            state.reset()  # the next readable state is sent as a whole
             trouble = f"the history of the console cannot be read: {reason_of(error)}"
         return {
             "time": at_ns * 1e-9,

@@ -41,8 +41,8 @@ class FlightSurroundings:
         coil_dipole: largest dipole moment along a body axis, A m^2.
         body: kind of body, or None if the configuration cannot be read.
         resistance: resistance of each coil, ohm.
-        currents: coil currents (3, 3), A/(A m^2), per dipole moment along each body axis, or None unless the
-            craft is a satellite with three coils.
+        currents: matrix (3, 3) from a dipole moment in body axes, A m^2, to coil currents, A; None unless the
+            body is a satellite with three coils.
     """
 
     elements: TwoLineElements | None
@@ -99,7 +99,7 @@ class FlightSurroundings:
         }
 
     def track(self, utc_ns: int) -> list[list[float]]:
-        """Return the ground track [[latitude, longitude], ...], deg, of the revolutions before and after."""
+        """Return the ground track [[latitude, longitude], ...], deg, 95 min before and after `utc_ns`."""
         if self.elements is None:
             return []
         dates = _julian_date(utc_ns) + np.arange(-_TRACK_HALF, _TRACK_HALF, _TRACK_STEP) / DAY

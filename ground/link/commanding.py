@@ -97,7 +97,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if isinstance(address, tuple):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, address, data, timeout, to)
-    # A flight that runs as a service has no access to /tmp, but it can answer to a socket beside its own.
+    # A flight that runs as a service has no access to /tmp, but it can answer to a socket in its own folder.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (
@@ -229,7 +229,7 @@ def command(
 ) -> list[Report]:
     """Send a command, `show` its reports and return them. Raises KnightCubeError if no report arrives.
 
-    The call ends with the final report, when `ended` is true for the list of received reports, or after
+    The call ends with the final report, as soon as `ended` returns true for the received reports, or after
     `seconds` s. A ping is sent after each silence, because a link process that restarts, or that receives no
     frame for a minute, forgets the UDP address of the ground. If the frame's counter was used before, or if
     the reserve SPI is used, the counters of the ground are then raised above those of the satellite.
@@ -303,7 +303,7 @@ def change_key(
     reports = command(terminal, packet, spi, seconds, show)
     if obeyed(reports) and changed in COMMAND_SPIS:
         _promote(vault, changed)
-    elif USED_KEY in failed(reports):  # the satellite will never accept it, so the next attempt makes a key
+    elif USED_KEY in failed(reports):  # the satellite never accepts this key: the next attempt makes another
         vault.remove(name)
     return reports  # a new telemetry key is accepted at the first frame that uses it
 
@@ -349,7 +349,7 @@ class FileSession:
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
-        self._failed: list[tuple[Progress, int]] = []  # failed transfers with timeout (ns)
+        self._failed: list[tuple[Progress, int]] = []  # failed transfers, with timeouts (ns) of the reasons
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
         self._unsent = b""  # packet that could not be sent yet
@@ -400,7 +400,7 @@ class FileSession:
     def transmit(self, now_ns: int) -> None:
         """Send the commands and PDUs that are due, within the rate limit.
 
-        Raises KnightCubeError if a packet cannot be sent. The next call sends this packet again.
+        Raises KnightCubeError if a packet cannot be sent. The next call then sends the packet again.
         """
         self.entity.work(now_ns)
         self.entity.keep(now_ns)

@@ -136,7 +136,7 @@ class CommandStream:
             yield packet
 
     def _take_token(self) -> bool:
-        """Return whether the line with the token is complete, and remove it."""
+        """Return whether the line with the token has arrived completely; the line is then removed."""
         size = len(self._line)
         line = bytes(self._arrived[:size])
         if any(byte not in _TOKEN_CHARACTERS for byte in line[: size - 1]):

@@ -253,7 +253,7 @@ class Terminal:
                 return
 
     def reception(self) -> str:
-        """Return the numbers of received and lost frames and of corrected errors as a text."""
+        """Return, as a text, the numbers of received frames, lost frames and corrected errors."""
         code = self._codes.telemetry
         return (
             f"{self.gate.admitted} frames accepted, {sum(self.gate.refused.values())} refused, "
@@ -349,7 +349,7 @@ class StreamGround:
     """Stream of frames over TCP or a serial line. A lost stream is opened again when a frame is sent."""
 
     def __init__(self, name: str, framing: Framing, connect: Callable[[], Opened]) -> None:
-        """Open a stream by the function `connect`. Raises KnightCubeError if it raises OSError."""
+        """Open a stream by the function `connect`. Raises KnightCubeError if `connect` raises OSError."""
         self._name, self._framing, self._connect = name, framing, connect
         # The descriptor of the poll object stays the same when the stream is opened again.
         self._readable = select.epoll()
@@ -424,7 +424,7 @@ class StreamGround:
 
 
 def _nothing() -> None:
-    """Do nothing, in the place of the function that closes a lost stream."""
+    """Do nothing: the function to close a stream while no stream is open."""
 
 
 def _serial_port(place: str) -> Opened:
