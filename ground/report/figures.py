@@ -273,7 +273,7 @@ def fit_figure(record: Record, found: PlantFit) -> Figure:
 SPIN_MARGIN = 0.2
 """Time shown before and after detumbling, as a fraction of the duration of detumbling."""
 POWER_MEAN_S = 30.0
-"""Time (s) over which the power is averaged, because the coils are off every one or two seconds."""
+"""Averaging time (s) of the power. The coils pause every one or two seconds."""
 SHADOW = 0.5
 """Visible fraction of the solar disc below which the satellite is drawn in shadow."""
 TRACK_INTERVAL_S = 10.0
@@ -309,7 +309,7 @@ def spin_figure(signals: RunSignals) -> Figure | None:
 
 
 def _detumbling_rate(ax: Axes, run: Run) -> None:
-    """Draw the true rate or gyro rate, and the rate from the magnetometer with its uncertainty."""
+    """Draw the true rate, or else the gyro's, and the rate from the magnetometer with its uncertainty."""
     time, speed, source = orbit.body_speeds(run)
     spin = orbit.magnetometer_rates(run)
     if len(spin):
@@ -658,8 +658,7 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
     ax.plot(times, 1e6 * across, color=panels.BLUE, linewidth=1.3, label="across the field")
     label = "along the field, not available"
     ax.plot(times, 1e6 * along, color=panels.VERMILLION, linewidth=1.3, label=label)
-    # Largest ratio over the axes of the dipole that produces this torque (perpendicular to the field) and
-    # its limit.
+    # Largest ratio, over the body axes, of the dipole for the torque across the field to its limit.
     share = np.max(np.abs(np.cross(field, torque)) / size[:, None] ** 2 / craft.limit, axis=1)
     if share.max() > 0.3:
         label = "limit of the torque across the field"

@@ -36,9 +36,9 @@ MIN_DIPOLE = 1e-9
 SETTLED_AFTER_S = 600.0
 """Time (s) from the start of pointing at a target until its pointing error is evaluated."""
 _SAME_CYCLE_S = 0.5
-"""Longest time (s) from a description packet to the attitude error that is used with it."""
+"""Time (s) within which a description packet and an attitude error belong to the same control cycle."""
 _LATEST_START_S = 2.0
-"""Latest time (s) of the first packets of a complete log. The packets are sent every second, so a log that
+"""Latest mission time (s) at which a complete log begins. The packets are sent every second, so a log that
 begins later has lost its oldest segments."""
 
 
@@ -180,8 +180,8 @@ def stars_age(run: Run, times: FloatArray) -> FloatArray:
 def camera_errors(run: Run) -> AttitudeErrors:
     """Return the errors of the estimated attitude of the star camera, about the body axes.
 
-    The star camera's attitude errors do not contain its misalignment, which is part of the errors of the
-    body's attitude. The result is empty without description packets of the estimate and of the truth.
+    The misalignment of the star camera is part of the body's attitude errors, but not of the star camera's.
+    The result is empty without description packets of the estimate and of the truth.
     """
     errors, packets, true = attitude_errors(run), run["description"], run["true_description"]
     if not len(packets) or not len(true) or not len(errors.times):
@@ -288,9 +288,9 @@ def pointing_errors(run: Run) -> AttitudeErrors:
 def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Object | None:
     """Return the pointing results of each target, or None for a run without pointing.
 
-    A target's error is evaluated from `SETTLED_AFTER_S` s after the target's first pointing cycle, or from
-    the end of its first slew if that is later. The pointing axis in body axes is `axis` (3,). A target whose
-    event is not in the log is named "-".
+    The evaluation of a target begins `SETTLED_AFTER_S` s after its first pointing cycle, or at the end of its
+    first slew if the slew ends later. The pointing axis in body axes is `axis` (3,). A target whose event is
+    not in the log is named "-".
     """
     found = pointing_errors(run)
     if not len(found.times):
@@ -438,10 +438,10 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
 
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return start and end times (n,), s, of the frame periods, and whether the body then rotates slowly.
+    """Return start and end (n,), s, of the frame periods, and whether the body rotates slowly at each start.
 
-    The body rotates slowly if its rate is below `camera.max_rate`. As in flight, an instant at which the body
-    rotates too fast for a frame does not delay the next instant. If the oldest segments of the log were
+    The body rotates slowly if its rate is below `camera.max_rate`. As in flight, the wait for the next frame
+    begins at the last instant at which the body rotated slowly. If the oldest segments of the log were
     deleted, the intervals before the oldest remaining packets are omitted.
     """
     names = ("truth", "orbit_truth", "navigation")

@@ -55,8 +55,7 @@ class PowerHistory:
         time: start times (n,) of the intervals, s.
         end: end of the last interval, s.
         supply: mean of V |I| (n,), W, which the coils draw from their supply.
-        heat: mean of R I^2 (n,), W, the ohmic heat if the current were not pulsed. The planner minimises
-            this heat.
+        heat: mean of R I^2 (n,), W, the ohmic heat of a constant current. The planner minimises this heat.
         source: "truth" if computed from the simulated coils, "written" if computed from the commanded
             currents.
     """
@@ -98,7 +97,7 @@ def seconds(packets: PacketArray) -> FloatArray:
 def last_time(run: Run) -> float:
     """Return the mission time (s) at which the flight log of a run ends, or 0 for a log without packets.
 
-    The result is the latest time of four packet types, because a satellite in orbit writes no packets
+    The end is the latest time in four types of packets, because a satellite in orbit writes no packets
     `control`. The result is at least 0, even if all packets have negative mission times.
     """
     names = ("control", "attitude", "health", "event")
@@ -290,7 +289,7 @@ def failed_frames(run: Run) -> list[Object]:
 
 
 def estimate_errors(run: Run) -> Object | None:
-    """Return the rms errors of the estimated angle and rate about the thread, or None without a truth.
+    """Return the rms errors of the estimated angle and rate about the thread, or None without a truth log.
 
     A name that ends with `_normalised` is the rms of the error divided by the estimated standard deviation. A
     normalised value is 1 if the standard deviations are correct.

@@ -63,7 +63,10 @@ class StepCommand:
 
     @property
     def rise_is_judged(self) -> bool:
-        """Whether the thesis limits the rise time: for steps after the first that start at a held target."""
+        """Whether the thesis limits the rise time of the step.
+
+        The first step, and a step that does not begin at a held target, have no limit.
+        """
         return self.index > 0 and self.from_target
 
 
@@ -250,7 +253,7 @@ def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Ob
 
 
 def against_thesis(steps: list[tuple[StepCommand, StepResponse | None]], power: Object) -> list[Object]:
-    """Return the worst value of each performance measure, compared with the thesis's limit.
+    """Return the worst value, the thesis's limit and the verdict of each performance measure.
 
     The argument `power` is the report's section about power.
     """

@@ -28,7 +28,7 @@ from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 _LOST_S = 2.0
-"""Time (s) from the end of the flight log to the end of the truth log above which packets count as lost."""
+"""Longest time (s) by which the flight log may end before the truth log without a note on lost packets."""
 _TRUE_POWER_S = 1.0
 """Interval (s) of the packets `true_power`."""
 
@@ -196,12 +196,12 @@ def _rate_groups(packets: PacketArray) -> list[Object]:
 def _cycles(timing: PacketArray, control: PacketArray) -> Object:
     """Return the numbers of control cycles and statistics of their times.
 
-    The cycles are `count` in the log and `missing` from the log according to the sequence counts; in the
-    `skipped` slots the loop ran no cycle.
+    The value `count` is the number of cycles in the log, `missing` that of the cycles absent from the log
+    according to the sequence counts, and `skipped` that of the slots in which the loop ran no cycle.
     """
     absent = np.maximum(np.diff(control["cycle"].astype(np.int64)) - 1, 0)
     counts = LAYOUTS[CONTROL.name].sequence_counts(control.tobytes())
-    # A gap of the log hides multiples of the sequence count's range. They count as missing, not as skipped.
+    # Sequence counts do not show gaps of multiples of their range: such cycles count as missing.
     skipped = np.maximum(absent - (np.diff(counts) - 1) % SEQUENCE_MODULUS, 0) % SEQUENCE_MODULUS
     return {
         "count": len(control),
@@ -318,7 +318,7 @@ def _battery(run: Run) -> Object:
         errors = judged["charge"] - at
         errors = errors[np.isfinite(errors)]
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
-        # The power (W) of each packet is that since the previous packet, which may be missing from the log.
+        # The power (W) in a packet applies since the previous packet; before the first packet, for 1 s.
         spans = np.diff(signals.seconds(true), prepend=signals.seconds(true)[0] - _TRUE_POWER_S)
         sums = [float(spans @ true[f"{name}_power"].astype(float)) for name in ("solar", "load", "coil")]
         values = [rms, float(true["charge"].min()), float(true["charge"][-1]), *sums]
