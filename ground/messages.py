@@ -298,7 +298,7 @@ def orbits_of(run: Run) -> list[ObjectOrbit]:
 
 
 def _start_ns(run: Run) -> int:
-    """Return the UTC of mission time zero, ns since 1970. Raises UsageError if the log does not have it."""
+    """Return the UTC of mission time zero, ns since 1970. Raises UsageError if the log lacks it."""
     known = run["run"]["utc_ns"][run["run"]["utc_ns"] > 0]
     if not len(known):
         raise UsageError(f"{run.folder}: the log has no packet `run` with the UTC of the flight")

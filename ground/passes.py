@@ -35,8 +35,8 @@ _SPEED = 7.6e3  # typical speed (m/s) in a low orbit, which converts an along-tr
 NEWER = "give newer elements (`knightcube elements` with --fixes or --read)"
 """Remedy named in messages if the times predicted from the orbital elements are uncertain."""
 _KNOWN_SHARE = 0.25
-"""Standard deviation of the predicted times, as a fraction of the orbital period, above which the revolution
-in which the satellite passes over a station is unknown."""
+"""Largest standard deviation of the predicted times, as a fraction of the orbital period, with which the
+revolution of a pass is known."""
 SENDING = timedelta(minutes=1)
 """Shortest time from now until a scheduled command is due, because the satellite must receive it first."""
 _BETWEEN = timedelta(seconds=1)
@@ -124,12 +124,12 @@ def facts_of(one: Pass) -> dict[str, object]:
 def scheduled_targets(
     passes: Sequence[Pass], lead: float = LEAD_S, earliest: datetime | None = None
 ) -> list[list[tuple[datetime, PointingTarget]]]:
-    """Return UTC and pointing target of the commands for each pass: to the station, and back to nadir.
+    """Return UTC and target of the commands for each pass, which point to the station and back to nadir.
 
     The passes are in order of rise. The first command of a pass is due `lead` s before the rise, but not
-    before the last command of the preceding pass, because the satellite points to a station until the pass
-    over this station ends. No command is due before `earliest`. A pass that ends during an earlier pass, or
-    before `earliest`, has no commands.
+    before the preceding pass ends, because until then the satellite points to the station of the preceding
+    pass. No command is due before `earliest`. A pass that ends during an earlier pass, or before `earliest`,
+    has no commands.
     """
     found: list[list[tuple[datetime, PointingTarget]]] = []
     # End of the latest pass that has commands.
@@ -251,7 +251,7 @@ class OrbitPrediction:
                 yield self._described(station, place, own)
 
     def _described(self, station: Station, place: GeographicPosition, own: list[datetime]) -> Pass:
-        """Return the pass with the given times `own` of rise, culminations and set."""
+        """Return the pass whose rise, culminations and set are at the times `own`."""
         elevations, azimuths, ranges = self._seen_from(place, own)
         top = 1 + int(np.argmax(elevations[1:-1]))
         sun = -earth_from_sun(float(terrestrial_time(julian_date(own[top]))))[0]

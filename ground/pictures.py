@@ -163,7 +163,7 @@ def _draw_compass(
     origin = np.array([1.6 * size, shape[0] - 1.6 * size])
     assert solution.fix is not None
     roll = Pointing.of(solution.fix.quaternion).roll
-    # The picture's upward direction has the position angle `roll`, from north to east; east is left of north.
+    # Up in the picture has the position angle `roll`, counted from north to east. East is left of north.
     north = np.array([np.sin(roll), -np.cos(roll)])
     east = np.array([north[1], -north[0]])
     if solution.mirrored:
@@ -188,7 +188,7 @@ def draw_horizon(
     """
     drawn = picture.copy()
     if solution.view is not None:
-        # The limb is rarely longer than the picture's perimeter, so the points are at most a pixel apart.
+        # The limb is rarely longer than four picture perimeters, so its points are at most 1 px apart.
         limb = camera.project(limb_rays(solution.view, 8 * (camera.columns + camera.rows)))
         for point in limb[camera.contains(limb)]:
             draw_ring(drawn, point, _DOT, STREAK)

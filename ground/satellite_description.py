@@ -179,7 +179,7 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
 
 
 def _worst_pressure(perigee: float) -> float:
-    """Return the sum of the largest drag and solar pressure (Pa) at `perigee`, m from the Earth's centre."""
+    """Return the largest pressure (Pa) of air and sunlight, `perigee` m from the Earth's centre."""
     place, sun = np.array([[perigee, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
     density = math.exp(float(log_density(place, sun, 0.0)[0]))
     return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / perigee + 2.0 * _SUN_PRESSURE

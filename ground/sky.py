@@ -121,7 +121,7 @@ def _polynomials(
 
 
 def header_text(sky: SkyMap, reversed_rows: bool = False) -> str:
-    """Return the text of a FITS file that consists only of the header from `world_coordinates`."""
+    """Return a FITS file, as text, that has the header from `world_coordinates` and no data."""
     values = world_coordinates(sky, reversed_rows)
     cards: list[Card] = [("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 0), *values.items()]
     text = "".join(_card(key, value) for key, value in cards) + "END".ljust(_CARD)
@@ -200,7 +200,7 @@ def _place_facts(sky: SkyMap, point: tuple[float, float]) -> dict[str, Any]:
 
 
 def _coordinates(direction: FloatArray) -> dict[str, float]:
-    # The remainder of a tiny negative angle is rounded to 360 deg, whose remainder is 0.
+    # The remainder of a tiny negative angle is rounded to 360 deg; the second remainder is then 0.
     right_ascension = math.degrees(math.atan2(direction[1], direction[0])) % 360.0 % 360.0
     declination = math.degrees(math.atan2(direction[2], math.hypot(direction[0], direction[1])))
     return {"right_ascension_deg": right_ascension, "declination_deg": declination}

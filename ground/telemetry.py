@@ -185,7 +185,7 @@ def flight_segments(folder: Path) -> list[Path]:
 
 
 def not_a_folder(path: Path) -> UsageError:
-    """Return the error for a file that is given as a run, with its folder if that contains a flight log."""
+    """Return the error for a file given as a run; it names the file's folder if a flight log is there."""
     near = f", such as {path.parent}" if find_segments(path.parent, "flight") else ""
     return UsageError(f"{path}: is not a folder: give the folder of a run{near}")
 

@@ -367,7 +367,7 @@ class PlainLines:
     """Writer of text lines: events, and the state once per period of mission time."""
 
     def __init__(self, state: FlightState, every: float, write: Callable[[str], object]) -> None:
-        """Create a writer of all events, and of `state` about every `every` s of mission time."""
+        """Create a writer of all events, and of `state` once in each `every` s of mission time."""
         self._state = state
         self._every = every
         self._write = write
