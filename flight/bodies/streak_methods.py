@@ -1,4 +1,4 @@
-"""Estimators of the rate from streaks, other than maximum likelihood, that a configuration may select."""
+"""Estimators of the rate from streaks that a configuration may select instead of maximum likelihood."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CornerEstimator:
         prior_sigma: float,
         previous_checksum: int | None,
     ) -> StreakResult:
-        """Return the mean body rate over the exposure, for the arguments of `estimate_rate`."""
+        """Return the mean body rate over the exposure. The arguments are those of `estimate_rate`."""
         from knightcube.reference.corner_streak_rate import estimate_rate  # noqa: PLC0415 - see above
 
         return estimate_rate(
@@ -52,7 +52,7 @@ class CornerEstimator:
         settings: SolveSettings,
         prior: AttitudePrior | None,
     ) -> tuple[FrameSolution, FrameMotion]:
-        """Return attitude and rate from identified streaks, for the arguments of `solve_ends`."""
+        """Return attitude and rate from identified streaks. The arguments are those of `solve_ends`."""
         from knightcube.reference.corner_streak_rate import solve_ends  # noqa: PLC0415 - see above
 
         return solve_ends(cast("StreakResult", found), camera, scale, sky, settings, prior)

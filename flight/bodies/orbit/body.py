@@ -218,7 +218,7 @@ class OrbitFeed:
 
 
 SUNLIT_SHARE = 0.5
-"""Fraction of its peak current above which a string of solar cells is in sunlight."""
+"""Fraction of its peak current above which a string of solar cells counts as sunlit."""
 _LIGHTEST = 1.6
 """Largest possible current of a string, as a fraction of its peak current, in the light of Sun and Earth."""
 _BELOW = 0.8
@@ -401,7 +401,7 @@ class SatelliteControl(BodyControl):
         self._objects.accept(tracks, now_ns)
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first start time (ns) from `from_ns` on of an exposure during which no coil switches."""
+        """Return the first start time (ns), not before `from_ns`, of an exposure without coil switching."""
         return self._pauses.calm(from_ns, exposure_ns)
 
 

@@ -186,8 +186,8 @@ class HorizonCameraFeed:
 
         The residual lens error after calibration is `lens_error` (rad per axis). The object `sun` holds the
         newest reading of the solar cells. The intensity response of all cameras is `response`, or linear if
-        None is given. The maps `structure` mark the parts of the images that the spacecraft covers, by camera
-        index.
+        None is given. For each camera index, `structure` contains a map of the part of the image that the
+        spacecraft covers.
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
@@ -239,7 +239,7 @@ class HorizonCameraFeed:
         if not self._filter.runs or self._against >= CONTRADICTED:
             first, nadir = seen
             if first is not None and not of_cells:
-                # The filter adds only the misalignment of nadir's cameras to the error of a first attitude.
+                # When it starts, the filter adds only the misalignment of the cameras that measure nadir.
                 first = replace(first, covariance=first.covariance + self._filter.sun_misalignment)
             began = self._begin(time_ns, [one for one in (first, nadir) if one is not None])
             return began and first is not None, began and nadir is not None
@@ -332,7 +332,7 @@ def horizon_camera_feed(
 ) -> HorizonCameraFeed:
     """Return the horizon camera feed of a configuration.
 
-    A structure file that cannot be used, which `knightcube check` reports, does not prevent the flight.
+    An unusable structure file, which `knightcube check` reports, does not prevent the flight.
     """
     cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
     error = math.radians(max(one.lens_error_deg for one in sections))

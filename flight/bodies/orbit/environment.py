@@ -35,7 +35,7 @@ from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, earth_ve
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
-"""Time spans (s) after and before the requested time that the short prediction covers."""
+"""Times (s) by which the short prediction extends after and before the requested time."""
 GATE, ELEMENTS_GATE = 5.0 * math.sqrt(3.0), 4.0
 """Gates (standard deviations) for a GPS fix: the first for the distance from earlier fixes, the second for
 the distance from the elements."""
@@ -65,7 +65,8 @@ LOWEST_ORBIT = 1.01 * EARTH_RADIUS
 EARLIEST = 2.0
 """Longest time (days) by which orbital elements may be published before their epoch."""
 TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
-"""Largest accepted step (ns) of the receiver's time relative to the host's clock, and drift of that clock."""
+"""Largest accepted step (ns) of the receiver's time relative to the host's clock, and largest drift (s/s) of
+the host's clock."""
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
 """Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not state them."""
 WITNESS_GATE, LATEST_WITNESS_NS = 4.0, 20 * SECOND_NS
@@ -105,7 +106,7 @@ class FixSequence:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the fixes agree long enough to replace the orbit known before."""
+        """Whether the fixes have agreed for long enough to replace the orbit known before."""
         span = (self._newest.julian_date - self.first.julian_date) * DAY
         return span >= CONFIRMED and self.joined >= max(_LEAST_FIXES, self._offered // 2)
 
@@ -156,7 +157,7 @@ _DARK = 0.01
 
 
 def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
-    """Return whether a fix agrees with a known orbit; a position deviation up to `least` (m) is accepted.
+    """Return whether a fix agrees with a known orbit; position errors up to `least` (m) are always accepted.
 
     Every fix is accepted if the elements cannot be propagated to the time of the fix.
     """
@@ -254,7 +255,7 @@ class EstimatedEnvironment:
         """Return field, position, pressures and sunlight, or None while the orbit is unknown.
 
         The pressures are interpolated linearly over `STEP`, in which their directions rotate by 0.01 rad. The
-        interpolated pressures are at most 2e-5 too small.
+        interpolated pressures are too small by at most a fraction of 2e-5.
         """
         near, times = self._prediction(now_ns)
         if near is None:
@@ -285,7 +286,7 @@ class EstimatedEnvironment:
         return strength * min(1.0, STEEPEST * self._near_sigma / float(np.linalg.norm(near.position[0])))
 
     def sun(self, now_ns: int) -> FloatArray | None:
-        """Return the Sun direction (3,), ICRS, without aberration (21"), or None for an unknown orbit."""
+        """Return the Sun direction (3,), ICRS, without aberration (21 arcsec); None for an unknown orbit."""
         near, times = self._prediction(now_ns)
         return None if near is None else np.asarray(near.sun_at(times)[0])
 
@@ -302,7 +303,7 @@ class EstimatedEnvironment:
         return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
 
     def _state(self, date: float) -> OrbitState | None:
-        """Return the orbit state from a recent fix or else from the elements, None if neither is usable."""
+        """Return the orbit state from a recent fix or else from the elements; None if neither is usable."""
         fix = self._recent(date)
         if fix is not None:
             state = fix.at(date)
@@ -316,7 +317,8 @@ class EstimatedEnvironment:
     def _unconfirmed(self, state: OrbitState) -> OrbitState:
         """Return `state`, which follows from only a few fixes, with an increased standard deviation.
 
-        The increase covers the distance between the state and the position predicted by the elements.
+        The increased standard deviation includes the distance between the state and the position predicted by
+        the elements.
         """
         sigma = UNCONFIRMED_SIGMA
         if self._elements is not None:
@@ -327,7 +329,10 @@ class EstimatedEnvironment:
         return replace(state, sigma=math.hypot(sigma, state.sigma))
 
     def _recent(self, date: float) -> GpsFix | None:
-        """Return the newest used fix, or None if it is too old. The age limit is shorter after few fixes."""
+        """Return the newest used fix, or None if it is too old.
+
+        The age limit is shorter for an unconfirmed orbit.
+        """
         fix = self._fix
         if fix is None:
             return None
@@ -335,7 +340,7 @@ class EstimatedEnvironment:
         return fix if abs(date - fix.julian_date) * DAY <= limit else None
 
     def _prediction(self, now_ns: int) -> tuple[Ephemeris | None, FloatArray]:
-        """Return the short prediction, renewed if needed, and the time (1,), s, since its start."""
+        """Return the short prediction, a new one if needed, and the time (1,), s, since its start."""
         near = self._near
         seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
@@ -393,7 +398,7 @@ class EstimatedEnvironment:
         return False
 
     def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
-        """Return whether a fix sequence starts an orbit estimate, or continues an estimate from few fixes."""
+        """Return whether a fix sequence may start or continue an orbit estimate that is not yet confirmed."""
         first = FIRST_FIXES if self._elements is None else 1
         known = self._elements is None or self._is_tight(sequence.first.julian_date)
         if not known or self._is_doubted or sequence.refuted or sequence.joined < first:
@@ -438,8 +443,7 @@ class EstimatedEnvironment:
     def _has_false_time(self, fix: GpsFix, time_ns: int) -> bool:
         """Return whether only the time stated by a fix contradicts the elements.
 
-        A fix with a false time agrees with the elements if its time is replaced by the time that was known
-        before.
+        In this case, the fix agrees with the elements if its time is replaced by the time known before.
         """
         if self._elements is None or self._agrees_with_elements(fix):
             return False
@@ -458,8 +462,8 @@ class EstimatedEnvironment:
 
 
 STUCK, FIELDS_CONTRADICTED = 20, 4
-"""Numbers of consecutive measurements that indicate a fault: equal fields, and contradictions of the
-model."""
+"""Number of consecutive equal fields, and number of consecutive fields that contradict the estimate, that
+indicate a fault."""
 
 
 class StuckFieldCheck:

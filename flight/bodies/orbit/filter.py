@@ -79,7 +79,7 @@ from knightcube.gnc.estimation.free_filter import (
 ERRORS, SOURCES, BODY, LEARNED_AT = "attitude-errors", "attitude-torques", "body", "learned-at"
 COIL_FACTORS = "coil-factors"
 UNKNOWN_AGE = 86_400.0
-"""Largest assumed age (s) of learned states, which is also assumed after the clock was set back."""
+"""Largest assumed age (s) of learned states. This age is also assumed if the clock was set back."""
 
 
 def _places(*parts: slice) -> IntArray:
@@ -111,8 +111,8 @@ def start_from(
 ) -> tuple[SlowStates, list[str]]:
     """Return the prior of the slow states at a time (UTC, s), and why learned states were rejected.
 
-    The expected residual dipole is `dipole` (3,), A m^2. A boot changes each state by `changed` times its
-    initial standard deviation (one sigma).
+    The expected residual dipole is `dipole` (3,), A m^2. Each boot is assumed to change each state by
+    `changed` times its initial standard deviation (one sigma).
     """
     initial, walks = layout.prior[SLOW, SLOW], layout.walks[SLOW]
     prior = SlowStates(np.zeros(len(initial)), initial.copy())
@@ -144,12 +144,13 @@ FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradiction by the gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
 _KNOWN_RATE = 0.01
-"""Largest standard deviation (rad/s) of a magnetometer rate that is used to propagate a direction."""
+"""Largest standard deviation (rad/s) of a rate from the magnetometer that is used to propagate a
+direction."""
 _MEASURED_SIGMA = 0.7
 """Standard deviation (rad) of the attitude below which a measured attitude updates the estimate linearly
 instead of restarting the filter."""
 _NEGLIGIBLE = 1e-9
-"""Current (A) below which a coil is not driven."""
+"""Current (A) below which a coil counts as not driven."""
 _EYE: FloatArray = np.eye(3)
 
 
@@ -202,8 +203,8 @@ class StepReplay:
     Attributes:
         free: the filter, with the estimate at the end of the newest step.
         refused_gyros: number of consecutive steps whose mean gyro rate contradicts the estimated motion.
-        contradicted: number of consecutive steps, with current in the coils, whose gyro contradicts the
-            motion; reset after `FORGOTTEN_NS`, because coils that are off give no evidence.
+        contradicted: number of steps whose gyro contradicted the motion since the last agreement in a step
+            with current in the coils; reset after `FORGOTTEN_NS` without a contradiction.
         refused_fields: number of consecutive field measurements that contradict the estimate.
         contradictions: texts about learned states that measurements have contradicted.
     """
@@ -216,7 +217,7 @@ class StepReplay:
         self.refused_gyros = self.refused_fields = self.contradicted = 0
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
-        # The states that the newest gyro innovation tests, and the normalised square of the innovation.
+        # Names of the states tested by the newest gyro innovation, and its normalised square.
         self._innovation = states.BODY_NAMES, 0.0
         self._refused_ns = 0
 
@@ -259,7 +260,7 @@ class StepReplay:
             self.take_again(first)
 
     def doubt_since(self, since_ns: int, *, gyro: bool = False) -> set[int]:
-        """Process the steps since a time again with unknown dipoles, and return the measurements used.
+        """Process the steps since a time again with unknown dipoles; return the IDs of the measurements used.
 
         If `gyro` is true, the gyro bias may also have changed since this time.
         """
@@ -325,7 +326,10 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in the step `place`; if `doubted`, earlier estimates were contradicted."""
+        """Start from an attitude in the step with index `place`.
+
+        If `doubted`, earlier estimates were contradicted.
+        """
         first = self.steps[place]
         self.free.start(
             attitude.quaternion,
@@ -365,7 +369,7 @@ class StepReplay:
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
         """Return the body's rotation (4,) between two times, from gyro data.
 
-        Returns None if a time is outside the history, or if a rate without a gyro is too uncertain.
+        Returns None if a time is outside the history, or if a rate from the magnetometer is too uncertain.
         """
         if to_ns < from_ns:
             back = self.turned(to_ns, from_ns)
@@ -444,11 +448,11 @@ class StepReplay:
             self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _rate_change(self, step: FilterStep, since: float, impulse: FloatArray) -> FloatArray:
-        """Return the difference (3,), rad/s, of the present rate from the mean rate over an interval.
+        """Return the present rate minus the mean rate over an interval (3,), rad/s.
 
-        The middle of the interval is `since` s ago. The argument `impulse` (3,), A m^2 s, is
-        `DipoleHistory.impulse` minus the impulse of the newest dipole, because the present acceleration
-        includes the torque of the newest dipole.
+        The middle of the interval was `since` seconds ago. The present acceleration, which includes the
+        torque of the newest dipole, is used for the whole interval. `impulse` (3,), A m^2 s, corrects for
+        earlier dipoles: it is `DipoleHistory.impulse` minus the impulse of the newest dipole.
         """
         free = self.free
         shown = attitude_matrix(free.quaternion) @ step.around.field
@@ -497,7 +501,7 @@ class OrbitFilter:
     ) -> None:
         """Create a filter without an estimate; `around` returns the environment at a time, or None."""
         self._settings, self._around = settings, around
-        # Dipoles are stored for longer than the history, whose first step may begin earlier.
+        # Dipoles are stored for longer than `history_ns`, because the oldest stored step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
         self._replay = StepReplay(settings, self._dipoles)
         self.contradictions = self._replay.contradictions
@@ -561,7 +565,7 @@ class OrbitFilter:
 
     @property
     def refused(self) -> int:
-        """The number of rejections by gates. A rejection in a repeated step is counted again."""
+        """The number of rejections by gates. A rejection is counted again if its step is processed again."""
         return self._free.refused
 
     @property
@@ -701,7 +705,7 @@ class OrbitFilter:
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times, and call `applied` with flags of those that passed the gate.
+        """Apply measurements of past times, and call `applied` with flags: which of them passed the gate.
 
         Measurements that are older than the history are ignored.
         """
@@ -797,7 +801,7 @@ class OrbitFilter:
         if around is None:
             if not self._steps:
                 return
-            # While the orbit is unknown, the gyro continues the estimate. The last field is used, and the
+            # While the orbit is unknown, the estimate follows the gyro, the last field is used, and the
             # dipole counts as unknown. A missing step would make the attitude wrong.
             around = self._steps[-1].around
         dipoles_known = self._dipoles.is_known and self._dipoles.unknown_ns < begin_ns

@@ -2,10 +2,10 @@
 
 A path is a table of feedback gains and reference motion for the pointing law. A path is planned when a target
 is set, when the attitude becomes known again, and when the body leaves its path. Paths are also planned
-periodically, because the orbit prediction loses accuracy and a free roll angle is adapted to the present roll
-of the body.
+periodically, for two reasons: the orbit prediction loses accuracy, and a roll angle that the target leaves
+free is adapted to the present roll of the body.
 
-During a slew, the rest of the slew is planned again every few seconds from the newest estimate, with the
+During a slew, the remainder of the slew is planned again every few seconds from the newest estimate, with the
 estimated inertia, residual dipole and torques. The running path is followed until the new path begins. If a
 new path arrives late, the satellite skips the part of the path that lies in the past.
 
@@ -78,7 +78,7 @@ near the end, because the time is too short for a new plan."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Followed:
-    """A path that is followed from `begin_ns` on, with or without a slew; times are since `origin_ns`."""
+    """A path that is followed from `begin_ns` on; its times are since `origin_ns`. `slew` may be None."""
 
     law: PointingLaw
     origin_ns: int
@@ -109,9 +109,9 @@ class PointingPaths:
     ) -> str:
         """Follow the part of a new path table in which the body rate does not exceed the limit.
 
-        Return why the path is rejected, or an empty text if the path is followed. A table that continues the
-        present slew (`continues`) is followed from the first time of the table. Other tables are followed at
-        once.
+        Return why the path is rejected, or an empty text if the path is followed. If `continues` is true, the
+        table continues the present slew, and is followed once its first time is reached. Any other table is
+        followed at once.
         """
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
@@ -149,7 +149,7 @@ class PointingPaths:
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
     def running(self, now_ns: int) -> RunningSlew | None:
-        """Return the slew whose rest may be planned again; None if no slew runs, or if its end is near."""
+        """Return the slew whose remainder may be replanned; None if no slew runs, or if its end is near."""
         point, followed = self.sample(now_ns), self._followed
         if point is None or followed is None or followed.slew is None or self._next is not None:
             return None
@@ -238,7 +238,10 @@ class PointingTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError for a q2, a target of the testbed."""
+        """Return the target of command `number`.
+
+        Raises UsageError for a q2, which only the testbed accepts.
+        """
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite needs a pointing goal; a target q2 is for the testbed")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
@@ -277,7 +280,7 @@ RATE = math.radians(1.0)
 """Rate error (rad/s) that has unit cost, chosen because a fast roll blurs the stars at the edge of the
 image."""
 FORESIGHT = 30.0
-"""Prediction time (s) of a track, by which its exit from the field of view is reported in advance."""
+"""Prediction time (s) of a track. If it leaves the field of view within this time, its exit is reported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,7 +335,7 @@ class ObjectAim:
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return a job; if an object is the target, it points at the object's track or search direction."""
+        """Return the job or, for an object as target, a job that points at its track or search direction."""
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:
@@ -354,7 +357,7 @@ class ObjectAim:
         return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
-        """Report an event if the object will leave the field of view on the path in `table`."""
+        """Report an event if, along the path in `table`, the object will leave the field of view."""
         sensor, sight = self._sensor, job.sight
         if sensor is None or sight is None or not sight.velocity.any():
             return
@@ -402,11 +405,11 @@ class ObjectAim:
 AGAIN_NS = 10_000_000_000
 """Time (ns) until the next planning request after a failed plan, or while the orbit is unknown."""
 REST_AGAIN_NS = 5_000_000_000
-"""Shortest time (ns) between two plans for the rest of a slew."""
+"""Shortest time (ns) between two plans for the remainder of a slew."""
 MOST_WAITS = 4
-"""Longest time, in units of `REST_AGAIN_NS`, until the rest of a slew is planned again. The time grows by one
-unit with each plan that does not improve the present plan, because most later plans do not improve it either.
-If a coil fails or is used again, the rest is planned at once."""
+"""Longest time, in units of `REST_AGAIN_NS`, until the remainder of a slew is planned again. The time grows
+by one unit with each plan that does not improve the present plan, because most later plans do not improve it
+either. If a coil fails or is used again, the remainder of the slew is planned at once."""
 _SMALLEST = 0.5
 """Smallest plausible principal moment of inertia, relative to the smallest configured moment."""
 
@@ -427,9 +430,9 @@ class LearnedBody:
 
 
 ACROSS = 0.03
-"""Largest dipole moment normal to the plane of two usable coils in a slew, as a fraction of the weakest
-coil's dipole moment. The limit reduces the torque little, because a dipole moment in the plane of the two
-coils can produce nearly every possible torque."""
+"""Limit for slews with only two usable coils: largest dipole moment normal to the plane of the coils, as a
+fraction of the weakest coil's dipole moment. The limit reduces the torque little, because a dipole moment in
+the plane of the two coils can produce nearly every possible torque."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -523,7 +526,8 @@ class PointingPlanner:
         if job is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
-        # Disturbance torques along the field move the body off its target temporarily, which needs no slew.
+        # Without a slew: disturbance torques along the field move the body off a reached target only
+        # temporarily.
         if self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None:
             job = replace(job, slew=None)
         job = self._objects.directed(job)
@@ -535,7 +539,7 @@ class PointingPlanner:
         return now_ns >= self._after_ns or not np.array_equal(self._usable(), self._planned_with)
 
     def _plan_rest(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> None:
-        """Submit the job that plans the rest of the running slew again, unless the slew is near its end."""
+        """Submit a job that plans the remainder of the running slew, unless the slew is near its end."""
         running = self._paths.running(now_ns)
         job = None
         with suppress(UsageError):  # the running plan is kept
@@ -582,7 +586,7 @@ class PointingPlanner:
         elif job.running is not None:
             self._continue(job, result.value, now_ns)
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
-            self._wanted = True  # a plan requested before the damping is replaced
+            self._wanted = True  # replace a plan that was requested before the damping
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:
@@ -594,7 +598,7 @@ class PointingPlanner:
                 self._events.report(events.SLEW_BEGUN, now_ns, text)
 
     def _continue(self, job: PointingJob, table: PointingTable | None, now_ns: int) -> None:
-        """Follow a new plan for the rest of the running slew; if there is none, keep the present plan."""
+        """Follow a new plan for the remainder of the slew; if there is none, keep the present plan."""
         paths = self._paths
         self._unimproved = 0 if table is not None else self._unimproved + 1
         self._after_ns = job.origin_ns + min(1 + self._unimproved, MOST_WAITS) * REST_AGAIN_NS

@@ -121,8 +121,8 @@ class FilterStep:
 
     Attributes:
         dipole: mean commanded dipole (3,), A m^2.
-        doubt: standard deviation of the error of `dipole`, A m^2 per axis, in addition to the error of the
-            coils' matrix; zero for known dipoles of three coils.
+        doubt: standard deviation (A m^2 per axis) of the error of `dipole`, without the error of the coils'
+            matrix; zero if three coils have a known dipole.
         gyro: mean angular rate (3,), rad/s, of `samples` gyro readings with the mean time `gyro_ns`. Without
             a gyro reading, `gyro` is the rate at the end of the step, estimated from the magnetometer, and
             `spread` is the covariance (3, 3), rad^2/s^2, of this rate.
@@ -266,7 +266,7 @@ class _Motion(NamedTuple):
 
 
 _Moved = tuple[float, Vector, Quaternion, Vector, Vector, Vector]
-"""The elements of `_Motion`."""
+"""The fields of `_Motion` as a plain tuple, for compiled functions."""
 
 
 class PropagatedEstimate(Estimate):
@@ -474,12 +474,12 @@ def _spread_numpy(
     placed: IntArray,
     size: int,
 ) -> FloatArray:
-    """Return the covariance (size, size) after a motion, in the order of the loop's estimates.
+    """Return the covariance (size, size) after a motion, with the states in the order of `Estimate`.
 
-    The covariance (n, n) of the filter's states before the motion is `before`. The noise during the motion
-    increases the covariance of the rate by `grown` (3, 3). The indices of the states on which attitude and
-    rate depend are `moving` (21,), and the states `picked` (k,) have the indices `placed` (k,) in the result.
-    Attitude and rate are the first of these states. See `_transition` for the other arguments.
+    The filter's states have the covariance `before` (n, n) before the motion. The noise during the motion
+    increases the covariance of the rate by `grown` (3, 3). Attitude and rate depend on the states with the
+    indices `moving` (21,). The states with the indices `picked` (k,), which begin with attitude and rate, get
+    the indices `placed` (k,) in the result. See `_transition` for the other arguments.
     """
     seconds, transition = moved[0], _transition(inertia, inverse, moved)
     spread = np.zeros((size, size))

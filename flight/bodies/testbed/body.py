@@ -79,8 +79,8 @@ _UNKNOWN_RATE = 1.0
 _LEAST_FIELD = 0.5
 """Smallest measured horizontal field that gives a heading, as a fraction of the modelled field."""
 _COILS_DECAYED_NS = 50_000_000
-"""Time (ns) after a coil current until the coil's field no longer affects the filtered readings of the
-inertial unit."""
+"""Time (ns) from switching a coil off until its field no longer affects the filtered readings of the inertial
+unit."""
 _CONSTANT_FOR = 5.0
 """Time (s) during which the coils' field at the magnetometer is treated as constant."""
 _REFUSED_TO_RESTART = 8
@@ -314,7 +314,7 @@ def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
 def _tracker(
     config: TestbedConfig, plant: SingleAxisPlant, reader: ThreadReader, cage: CageField | None
 ) -> Tracker:
-    """Return the path tracker of the coil on body x or, in a Helmholtz cage, of the coils on x and z."""
+    """Return the path tracker. It uses the coil on body x or, in a Helmholtz cage, the coils on x and z."""
     period, dipole = 1.0 / CONTROL_RATE_HZ, dipole_per_ampere(config)
     controller = controller_of(config.control, plant, period, config.identification)
     tracker = ThreadTracker(controller, reader, dipole)

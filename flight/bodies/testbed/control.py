@@ -9,12 +9,12 @@ horizon after the time of planning (Sease, chapter 5, Optimal Path Planning). Th
 the controller tracks the target itself.
 
 The control laws are B-dot detumbling and a controller of the rotation about the suspension thread. A
-Helmholtz cage reproduces the magnetic field along an orbit, which the flight software predicts. The cage
-produces the field that a satellite would measure in its local orbital frame: x along the flight direction, z
-down, and y, the axis of the thread, opposite to the orbit normal. The rotation about the thread is therefore
-the pitch of an Earth-pointing satellite, in a field that rotates once per revolution and varies in strength.
-The cage produces only the two field components normal to the thread, multiplied by `scale`. The component
-along the thread would cause no torque about the thread.
+Helmholtz cage reproduces the magnetic field along an orbit. The cage produces the field that a satellite
+would measure in its local orbital frame: x along the flight direction, z down, and y, the axis of the thread,
+opposite to the orbit normal. The rotation about the thread is therefore the pitch of an Earth-pointing
+satellite, in a field that rotates once per revolution and varies in strength. The cage produces only the two
+field components normal to the thread, multiplied by `scale`. The component along the thread would cause no
+torque about the thread.
 
 Both the cage's control computer and the flight software predict the field as a function of UTC, by the World
 Magnetic Model along the orbit of the two-line elements. The coil on body x has no torque while the field is
@@ -96,7 +96,8 @@ class ThreadEstimate(NamedTuple):
     """Angle (rad), rate (rad/s) and disturbance (rad/s^2) about the thread.
 
     The estimate `whole`, from which these values follow, contains the covariance and `measured_ns`, the time
-    of the newest measurement. The disturbance is relative to a plant with the parameters `model`.
+    of the newest measurement. The disturbance refers to a plant with the parameters `model`, as described at
+    `about_thread`.
     """
 
     time_ns: int
@@ -143,10 +144,10 @@ def _gain_ratio(estimate: Estimate, model: Parameters) -> float:
 
 
 def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstimate:
-    """Return the rotation about the thread, which is exact for a suspended body.
+    """Return the rotation about the thread; it is exact if the body rotates only about the thread.
 
-    The disturbance is the acceleration that a plant with the parameters of `model` does not explain, scaled
-    so that this plant and the body need the same current to hold an attitude.
+    The disturbance is the part of the acceleration that a plant with the parameters `model` does not explain.
+    It is scaled so that this plant needs the same current as the body to hold an attitude.
     """
     angle, rate = angle_about_axis_y(estimate.quaternion), float(estimate.rate[1])
     torsion, damping, _ = estimate.parameters
@@ -196,7 +197,7 @@ def law_of(target: Target) -> ThreadLaw:
 
 _AGAIN_NS = 1_000_000_000
 _ARRIVED_NS = 100_000_000
-"""Remaining time (ns) to the goal time up to which a new plan only keeps the body at the target."""
+"""Remaining time (ns) to the goal time below which a new plan only holds the target."""
 _MAX_HORIZON = 60.0
 """Longest planning horizon (s) of a path."""
 
@@ -437,7 +438,7 @@ class Planning:
 
 
 def _moved(law: ThreadLaw, since: float) -> float:
-    """Return the angle (rad) of a target `since` s after it was due, clipped to the coil's working range."""
+    """Return a target's angle (rad) `since` seconds after it was due, clipped to the coil's working range."""
     return min(max(angle_of(law.q2) + law.rate * since, -FARTHEST), FARTHEST)
 
 
@@ -532,7 +533,7 @@ class BdotLaw:
 def controller_of(
     section: Control, plant: SingleAxisPlant, period: float, identification: Identification
 ) -> AngleController:
-    """Return the controller that `section` selects for `plant`, with a control period in s."""
+    """Return the controller that `section` selects for `plant`, with the control period `period` (s)."""
     if section.tracker == "excitation":
         move = identification
         return ExcitationController(
@@ -609,7 +610,7 @@ class CageField:
         near = self._near
         seconds = math.inf if near is None else (self._date(now_ns) - near.julian_date) * DAY
         if near is None or not 0.0 <= seconds <= AHEAD:
-            # The prediction begins one second earlier, because measurements may be late.
+            # The prediction begins one second before `now_ns`, because measurements may be late.
             state = self._elements.at(self._date(now_ns) - 1.0 / DAY)
             near = self._near = predict(state, AHEAD)
             self._local = np.array(
@@ -646,7 +647,7 @@ class CageField:
 
 
 def local_frame(position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return the rotation matrix (3, 3) to the local orbital frame: x along the flight, z down."""
+    """Return the rotation matrix (3, 3) to the local orbital frame: x along the flight direction, z down."""
     down = -position / np.linalg.norm(position)
     across = np.cross(velocity, position)
     across = across / np.linalg.norm(across)
@@ -676,7 +677,10 @@ class CageTracker:
     def __init__(
         self, inner: Tracker, reader: ThreadReader, plant: SingleAxisPlant, field: CageField, dipole: float
     ) -> None:
-        """Use a tracker for a constant field, and coils with `dipole` A m^2 per ampere."""
+        """Use `inner`, which assumes a constant field.
+
+        Each coil has the dipole moment `dipole` (m^2) per ampere.
+        """
         self._inner = inner
         self._read = reader.read
         self._plant, self._field, self._dipole = plant, field, dipole
@@ -696,5 +700,5 @@ class CageTracker:
         return CoilCommand(self._dipole * currents, currents, wanted.saturated or excess > 1.0)
 
     def reset(self) -> None:
-        """Discard the inner tracker's integrated errors."""
+        """Discard the integrated errors of the inner tracker."""
         self._inner.reset()
