@@ -64,7 +64,7 @@ ELECTRICAL = (
 )
 _VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
 PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
-"""Index of each fault variant in a prediction, where the variant None is a healthy bridge."""
+"""Index of each fault variant in a prediction; the variant None is a healthy bridge."""
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
@@ -97,8 +97,8 @@ class Sampling:
     """Error bounds of a reading of a chopped current that changes within the reading's time window.
 
     Attributes:
-        scatter: error due to chopping, as a fraction of the bridge's current or, if smaller, of the
-            difference from the full current. A bridge that is fully on is not chopped.
+        scatter: error due to chopping, as a fraction of the smaller of two currents: the bridge's current,
+            and its difference from the full current. A bridge that is fully on is not chopped.
         range_share: error of the mean, as a fraction of the current's range within the time window.
     """
 
@@ -110,8 +110,8 @@ NEWEST = Sampling(0.2, 1.0)
 """Error bounds of one ADC sample at an unknown time in its window. The PWM chopping of the current alone
 causes an error of 18 % (`hal.drivers.current_monitors`)."""
 MEAN = Sampling(0.02, 0.25)
-"""Error bounds of the mean of five ADC samples. An error of 7 % that is common to all readings is part of the
-gain error instead."""
+"""Error bounds of the mean of five ADC samples. A further error of 7 %, which is common to all readings, is
+included in `Bounds.gain`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +211,7 @@ def is_healthy_current(
     mean = sum(map(abs, values)) / count
     slack = bounds.noise + bounds.uncertainty * (len(values) - values.count(0.0)) / count
     if abs(current - mean) <= slack:
-        return True  # the other error bounds only widen the interval
+        return True  # all other error bounds would only widen the interval
     drawn = np.abs(commands)
     rest = np.minimum(drawn, np.array(bounds.full_current) - drawn)
     chopped = sampling.scatter * float(np.maximum(rest, 0.0).sum()) / count
@@ -234,9 +234,9 @@ _SURE = 2
 _PATIENCE = 12
 """Number of ADC samples without agreement after which a step of the search is abandoned."""
 _PAUSE = 50
-"""Minimum number of ADC samples from a check at zero current that finds no fault to the next check."""
+"""Minimum number of ADC samples between a check at zero current that finds no fault and the next check."""
 _UNCLEAR = 20
-"""Number of consecutive ADC samples with ambiguous commands after which the coils are checked at zero."""
+"""Number of consecutive ADC samples with ambiguous commands after which a check at zero current begins."""
 
 
 class _Step(Enum):
@@ -275,7 +275,10 @@ class StuckLeg:
 
     @property
     def is_searching(self) -> bool:
-        """Whether a search is running, in which the coils are commanded to zero and may be braked."""
+        """Whether a search is running.
+
+        In a search, all coils are commanded to zero, and bridges may be braked.
+        """
         return self.rest
 
     def exceeds(self, supplied: Supplied) -> bool:
@@ -398,7 +401,7 @@ class BrakeProof:
         self._exceeds: deque[bool] = deque(maxlen=_PROOFS)
 
     def __bool__(self) -> bool:
-        """Return whether any braked bridge is unconfirmed."""
+        """Return whether the diagnosis of any braked bridge is not yet confirmed."""
         return bool(self._axes)
 
     def add(self, axis: int) -> None:
@@ -424,11 +427,12 @@ class BrakeProof:
 _MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 """Maximum number of predictions in a segment, and maximum number of segments."""
 _TELLING = 4.0
-"""Smallest expected current that shows the gain of the monitor, as a multiple of a coil's error bound."""
+"""Smallest expected current from which the monitor's gain is computed, as a multiple of a coil's error
+bound."""
 
 
 class Evidence:
-    """Predictions of the current readings since a fault was suspected. Each probe begins a new segment.
+    """Predictions for the readings since a fault was suspected. Each probe begins a new segment.
 
     A hypothesis must explain the readings of each segment. Without segments, the few readings of a probe that
     contradict a hypothesis would be treated as outliers, because the many other readings agree with every
@@ -469,9 +473,10 @@ class Evidence:
     def monitor_gain(self, known: Mapping[int, CoilFault]) -> float | None:
         """Return the gain of a current monitor that measures all currents with a common error, or None.
 
-        With this gain, healthy coils, besides the `known` faults, fit the readings of each segment, and no
-        segment agrees better with a correct monitor. At least two coils must have been driven, because a
-        fault of the only driven coil explains the readings too.
+        With this gain, the readings of each segment agree with coils that have the `known` faults only. In
+        each segment, the ratio of measured to expected current must be closer to this gain than to 1. At
+        least two coils must have been driven, because a fault of the only driven coil would explain the
+        readings too.
         """
         coils = range(len(self._bounds.full_current))
         if any(PLACE.get(fault) is None or fault is CoilFault.SHORTED for fault in known.values()):
@@ -497,7 +502,7 @@ class Evidence:
         return [max(current, self._bounds.noise) / due for current, due in pairs if due > least]
 
     def possible_faults(self, known: Mapping[int, CoilFault]) -> list[tuple[int, CoilFault]]:
-        """Return axes and faults that explain the readings, together with the known faults."""
+        """Return the pairs of axis and fault that, besides the known faults, explain the readings."""
         segments = [segment for segment in self._segments if segment]
         return [
             (axis, fault)

@@ -10,15 +10,16 @@ coil, and it detects an open coil only while that coil is driven. Every reading 
 prediction of each hypothesis (`flight.loop.coil_currents`). One hypothesis is that all coils are healthy.
 Each other hypothesis assumes one fault of one coil: the coil is open or shorted, or one leg of its H-bridge
 is stuck. A coil is diagnosed as broken when the readings reject the hypothesis of healthy coils, and all
-hypotheses that explain the later readings concern this coil. Several axes remain possible if no axis or
-several axes are driven. The axes that remain possible are driven alone, one after another, by a small probe
-current. The other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil
-draws current. If all coils are at zero current after a suspicion, they are probed too, because their drives
-may be too short for a diagnosis. A reversed coil is detected from the angular acceleration, which also
-distinguishes a faulty current monitor from a broken coil. Averaged over longer bins, the acceleration reveals
-missing torque at currents that are too small for the current monitor. If torque is missing, a probe shows
-whether the coil is open. If one gain of the current monitor explains the readings while different coils are
-driven, the current monitor is considered faulty, and its later readings are divided by this gain.
+hypotheses that explain the later readings concern this coil. If no axis or several axes are driven, several
+axes may remain suspected. The suspected axes are driven alone, one after another, by a small probe current.
+During the 1.6 s of a probe, the other coils carry no current, so that the probe shows whether its coil draws
+current. Coils that have been at zero current since a fault was suspected are probed too, because the control
+law may drive them too briefly for a diagnosis. A reversed coil is detected from the angular acceleration,
+which also distinguishes a faulty current monitor from a broken coil. Averaged over longer bins, the
+acceleration reveals missing torque at currents that are too small for the current monitor. If torque is
+missing, a probe shows whether the coil is open. If one gain of the current monitor explains the readings
+while different coils are driven, the current monitor is considered faulty, and its later readings are divided
+by this gain.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -38,14 +39,15 @@ of each coil, and converts between the actual coil currents, which determine the
 effective currents, with which healthy coils would cause the same torque. A correction made in a tumble is
 reviewed when the body is slower than `tumble_rate`. In the review, the motion confirms the coil's sign, or
 the sign is changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current
-until the body is slow, or for ten minutes.
+until the body is slow, but at most for ten minutes.
 
 The diagnosis of a broken coil is not final. While the body is slow, a broken coil is used again for a trial
 ten minutes after its diagnosis, and at most three times. If the fault persists, the coil is diagnosed as
 broken again.
 
-The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
-and 18 % for a single ADC sample of the chopped current (`hal.drivers.current_monitors`).
+The predicted supply current has three error bounds: 3.5 mA for each coil's current (Sease thesis, chapter 5),
+the error of the coils' resistance, and 18 % for a single ADC sample of the chopped current
+(`hal.drivers.current_monitors`).
 """
 
 from __future__ import annotations
@@ -127,9 +129,9 @@ class SelfTest:
     signs +, -, -, + in four equal quarters. After the four quarters of a test, neither the rate nor the
     attitude has changed. Duration and current of a test follow from the gyro's noise, so that a test measures
     the gain of a healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a
-    test is the angular acceleration times the square of the duration of one of the four quarters.
-    `CoilResponse` evaluates the response, with the errors of the inertia as nuisance parameters. During a
-    test, the supply current is also compared with the command, as at any other time.
+    test is the angular acceleration times the square of the duration of one quarter. `CoilResponse` evaluates
+    the response, with the errors of the inertia as nuisance parameters. The supply current is compared with
+    the command during a test too.
     """
 
     def __init__(self, response: CoilResponse, rate_noise: float, settings: SelfTestSettings) -> None:
@@ -152,7 +154,7 @@ class SelfTest:
         self._tested.clear()
 
     def wave(self, wanted: FloatArray, usable: Callable[[], BoolArray], now_ns: int) -> FloatArray | None:
-        """Return test currents (n,), A, of one coil instead of the `wanted` currents, or None.
+        """Return test currents (n,), A, which drive one coil and replace the `wanted` currents, or None.
 
         The function `usable`, which is called before a test, returns flags (n,) of the coils to be tested.
         """
@@ -221,9 +223,10 @@ class CoilMonitorSettings:
     """Properties of the coil circuit, and the settings of the diagnosis by the body's motion.
 
     Attributes:
-        full_current: current (A) of each coil when fully on, which is the supply voltage divided by its
+        full_current: current (A) of each coil when fully on: the supply voltage divided by the coil's
             resistance.
-        response: settings for evaluating the coils from the body's motion, or None if the motion is not used.
+        response: settings of the fit of the coil gains to the body's motion, or None if the motion is not
+            used.
         slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the diagnosis of a broken coil to its next trial.
@@ -252,7 +255,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
-        """Drive the next untried axis, `prime` first; return the end time (ns), or None if all were tried."""
+        """Drive the next untried axis, first `prime`. Return the end time (ns), or None if all were tried."""
         candidates = axes - self._tried
         if not candidates:
             self._tried.clear()
@@ -264,7 +267,7 @@ class Probe:
 
     @property
     def has_begun(self) -> bool:
-        """Whether an axis was tried since the last suspicion."""
+        """Whether at least one axis has been tried in the present round of probes."""
         return bool(self._tried)
 
     def stop(self) -> None:
@@ -327,7 +330,7 @@ class CoilMonitor:
         self._reading_ns = -(1 << 62)
         self._fresh = self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # time (ns) after which a diagnosis may leave the kind of fault open
+        self._judge_ns = 0  # time (ns) after which a diagnosis need not determine the kind of fault
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
         self._unmixed_ns = 0  # time (ns) since which the circuit has not changed
         self._evidence = Evidence(self._bounds)
@@ -342,7 +345,7 @@ class CoilMonitor:
         self._weak = ""  # text about a coil without the expected torque
         self._weak_ns = -_AGAIN_NS  # time (ns) of the last search for an axis without torque
         self._prime: int | None = None  # axis to probe first
-        # Suspected fault that is not confirmed, while another coil is probed for comparison.
+        # Suspected, unconfirmed fault, while another coil is probed for comparison.
         self._compared: tuple[int, CoilFault] | None = None
         self._begun_at_rest = False  # whether probes began before any reading of a driven coil
         self._verdicts: dict[int, CoilVerdict] = {}
@@ -399,7 +402,7 @@ class CoilMonitor:
 
     @property
     def braked(self) -> Axes:
-        """Indices of the bridges to brake, which have a leg stuck high or are tested in the search."""
+        """Indices of the bridges to brake: bridges with a leg stuck high, and bridges tested in a search."""
         if not self._verdicts:
             return self._leg.brake
         stuck = {axis for axis, verdict in self._verdicts.items() if verdict.fault in _BRAKED}
@@ -445,8 +448,8 @@ class CoilMonitor:
     ) -> None:
         """Record the actual coil currents (n,), A, and the braked bridges in force at `time_ns`.
 
-        The evaluation of the motion uses the time `written_ns`, at which the command was sent, if it is
-        given.
+        If `written_ns` is given, the evaluation of the motion uses it as the time at which the command was
+        sent.
         """
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
@@ -494,7 +497,7 @@ class CoilMonitor:
                 self._probe_weak_coil(feeble[0], now_ns)
 
     def _probe_weak_coil(self, axis: int, now_ns: int) -> None:
-        """Start probe currents, from which the current monitor decides whether a coil is open."""
+        """Suspect a fault of a weak coil, so that a probe shows whether the coil is open."""
         silent = now_ns - self._reading_ns > _WINDOW_NS
         if silent or self._suspected_ns is not None or now_ns - self._weak_ns < _AGAIN_NS:
             return
@@ -540,7 +543,7 @@ class CoilMonitor:
         self._news.append(f"coil {COIL_NAMES[axis]}: {seen}; {self.correction.text(axis)}")
 
     def _end_rests(self, now_ns: int, speed: float) -> None:
-        """Use axes again that were kept at zero current, if the body is slow or after ten minutes."""
+        """Stop keeping axes at zero current if the body is slow or ten minutes have passed."""
         oldest_ns = min(since_ns for since_ns, _ in self._rests.values())
         if speed <= self.tumble_rate or now_ns - oldest_ns > LONGEST_REST_NS:
             self._rests.clear()
@@ -626,7 +629,7 @@ class CoilMonitor:
         self._looked_ns = reading.time_ns
         seen = commands.supplied(reading, self._bounds, self._known)
         if self._proof:
-            for axis in self._proof.ingest(self._leg.exceeds(seen)):  # these bridges are released
+            for axis in self._proof.ingest(self._leg.exceeds(seen)):  # braking had no effect
                 self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
             return
         found = self._leg.look(seen)
@@ -752,8 +755,8 @@ class CoilMonitor:
     def _begin_comparison(self, axis: int, fault: CoilFault, now_ns: int) -> bool:
         """Probe another coil for comparison, and return whether the probe began.
 
-        If the current monitor measures the current of the other coil, the monitor works, and its reading of
-        the suspected coil is trusted.
+        If the current monitor measures the current of the probed coil correctly, its readings of the
+        suspected coil are trusted.
         """
         ends_ns = self._probe.begin(set(range(len(self._trials))) - {axis} - self._known.keys(), now_ns)
         if ends_ns is None or self._compared is not None:

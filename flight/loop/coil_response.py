@@ -1,4 +1,4 @@
-"""Evaluation of the coils' responses to commands, as shown by the body's motion and the supply current.
+"""Estimation of the torque gain of each coil from the motion of the body.
 
 The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
 seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
@@ -6,11 +6,11 @@ over short bins. Differences of neighbouring bins yield accelerations. A general
 the last bins estimates the gain of each coil, together with a constant disturbance, a torsion and a damping
 about each free axis. The fit accounts for the correlated noise of neighbouring differences. The gain is 1 for
 a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the commands vary too little, the
-standard deviation of the gain is large, and no finding about the axis is made. A gain larger than
-`LARGEST_GAIN` is physically impossible and shows that the model is wrong. If the model is wrong, no finding
-about any axis is made.
+standard deviation of the gain is large, and the fit yields no finding about the axis. A gain larger than
+`LARGEST_GAIN` is physically impossible and shows that the model is wrong; then the fit yields no finding
+about any axis.
 
-The torques of the coils are normal to the field, and their gains can hardly be separated from each other
+The torques of all coils are normal to the field, so that the gains of the coils can hardly be separated
 within a short time. The gain of each coil is therefore estimated under the assumption that the other coils
 are healthy. The gains of healthy coils may differ from 1 by the relative errors of the configured coil
 dipoles. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of another
@@ -63,7 +63,7 @@ _NOTED_LATE_NS = 25_000_000
 
 
 class CoilCommands:
-    """A record of the commanded currents and of the braking; `braked` lists the bridges braked at present."""
+    """Record of the commanded currents and of the braking; `braked` lists the bridges that are braked now."""
 
     def __init__(self, reach_ns: int) -> None:
         """Store commands for `reach_ns` ns."""
@@ -106,7 +106,7 @@ class CoilCommands:
         return sampled[::-1]
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
-        """Return the newest ADC sample, with bounds of the supply current if only `known` faults exist."""
+        """Return the newest ADC sample, with bounds of the supply current for the `known` faults only."""
         window = self.window(reading.newest_since_ns, reading.time_ns)
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
         unsure = [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]
@@ -137,7 +137,7 @@ class ResponseSettings:
         dipole_per_ampere: dipole moment per ampere, m^2, of three equal coils along the body axes, or one
             column (3,) in body axes for each coil.
         rate_noise: standard deviation (rad/s) of a gyro sample about each axis.
-        free: flags (3,) of the axes about which the body can rotate; on a thread only y.
+        free: flags (3,) of the axes about which the body can rotate; a body on a thread rotates only about y.
         bin_samples: number of gyro samples in a bin.
         bins: largest number of differences of neighbouring bins in the fit.
         least_bins: minimum number of differences of neighbouring bins for a fit.
@@ -145,11 +145,11 @@ class ResponseSettings:
         torsion, damping: prior standard deviations of torsion (1/s^2) and damping (1/s) about each free axis.
         errors: largest errors of the coils' gains, and of inertia and gyro of a body that is free about three
             axes.
-        sure: standard deviation of a gain below which the gain is used to assess a coil.
+        sure: a gain is used to assess a coil if its standard deviation is below this value.
         settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed,
             or None if their field is small compared with the Earth's.
-        disturbance: function that returns the largest expected accelerations (3,), rad/s^2, that
-            disturbance torques cause at a time (ns), or None if the disturbance is constant within a fit.
+        disturbance: function of a time (ns) that returns the largest accelerations (3,), rad/s^2, expected
+            from disturbance torques. None if the disturbance is constant within a fit.
     """
 
     inertia: FloatArray
@@ -196,15 +196,15 @@ _WEAK_GAIN, _SIGMAS = 0.7, 2.5
 """Largest gain of a coil that is reported as weak, and number of standard deviations by which the estimate
 must be below this gain."""
 _USED_WEAK_GAIN = 0.6
-"""Gain of a weak coil below which the coil is used with its estimated gain. Coil misalignments, which the fit
-neglects, can make a true gain of 0.8 appear as small as 0.5."""
+"""Gain below which a weak coil is used with its estimated gain. Coil misalignments, which the fit neglects,
+can make a true gain of 0.8 appear as small as 0.5."""
 _STRONG_GAIN = 1.25
-"""Lower limit of the gain of a coil that is stronger than assumed."""
+"""Gain above which a coil counts as stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
 """Smallest gain at which a weak coil is used, and largest standard deviation of a used gain."""
 _STEADY = 2.0
-"""Threshold for a steady gain: the largest difference between the gain from the newest half of the bins and
-the gain from all bins, divided by the standard deviation of the former."""
+"""Threshold for a steady gain: largest difference between the gain from the newest half of the bins and the
+gain from all bins, in standard deviations of the gain from the newest half."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
 """Thresholds for differences of cost between hypotheses. The cost of a hypothesis is the weighted sum of the
 squared residuals of its fit. A fault of one coil is accepted if its cost is lower by `_CLEARLY` than the cost
@@ -231,15 +231,16 @@ class CoilResponse:
         # Row a is the axis of coil a, scaled by its dipole relative to the strongest coil's dipole.
         directions = dipoles.T / strongest
         self._count_of_coils = coils = len(directions)
-        # Accelerations per ampere (3, 3 n) of the n coils in a unit field along each body axis. The
-        # acceleration by coil a with the dipole d_a per ampere is J^-1 (d_a x B).
+        # Accelerations per ampere (3, 3 n): row b is for a unit field along body axis b, with three columns
+        # per coil. Coil a, whose dipole per ampere is d_a, causes the acceleration J^-1 (d_a x B).
         torques = np.cross(directions, np.eye(3)[:, None])
         per_field = torques @ (strongest * np.linalg.inv(settings.inertia).T)
         self._per_field: FloatArray = per_field.reshape(3, 3 * coils)
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)
         count = len(self._free)
-        # Coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of its changes by k inertia errors.
+        # Coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of its changes due to k inertia
+        # errors.
         self._gyroscopic: FloatArray = np.zeros((3, 6))
         if count == 3:
             modes = coefficient_modes(settings.inertia, settings.errors)
@@ -249,9 +250,10 @@ class CoilResponse:
         spreads = [settings.torsion] * count + [settings.damping] * count + [1.0] * errors
         self._others = len(spreads)
         self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
-        # Prior weight (inverse variance) of a healthy coil's gain, for an error uniform within a bound.
+        # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniformly distributed.
         healthy = np.full(coils, 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2)
-        # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
+        # The hypotheses: all gains are free (1), one gain is free (n), no gain is free (1), one coil is
+        # reversed (n).
         each = np.eye(coils, dtype=bool)
         self._prior_weights: FloatArray = np.concatenate(
             [
@@ -300,7 +302,7 @@ class CoilResponse:
             self._commands.popleft()
 
     def interrupted(self, until_ns: int) -> None:
-        """Ignore samples up to `until_ns`, because the coil currents of that time are unknown."""
+        """Ignore samples up to `until_ns`, because the coil currents up to this time are unknown."""
         self._known_ns = until_ns
         self.reset()
 
@@ -342,20 +344,20 @@ class CoilResponse:
         return next(earlier, self._commands[0][1])
 
     def axes(self, finding: Finding) -> list[int]:
-        """Return the axes for which a finding held in the last `_PERSISTENCE` fits."""
+        """Return the axes for which a finding held in each of the last `_PERSISTENCE` fits."""
         counts = self._in_a_row[finding]
         return [axis for axis, count in enumerate(counts) if count >= _PERSISTENCE]
 
     def is_healthy(self, axis: int) -> bool:
-        """Return whether an axis had the gain of a healthy coil in the last `_PERSISTENCE` fits."""
+        """Return whether an axis had the gain of a healthy coil in each of the last `_PERSISTENCE` fits."""
         return axis in self.axes(Finding.SOUND)
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
         """Return the observed change of torque, divided by the change that a suspected fault would cause.
 
-        The hypothesis is that the coil carries `constant` A instead of its command. The residuals before
-        `since_ns` are compared with those after `settled_ns`. The result is None if the change is too small
-        to be observed, and NaN if there are too few residuals.
+        With the suspected fault, the coil carries the current `constant` (A) instead of its commanded
+        current. The residuals before `since_ns` are compared with those after `settled_ns`. The result is
+        None if the expected change is too small to be observed, and NaN if there are too few residuals.
         """
         before = [rows for time_ns, rows, _ in self._history if time_ns < since_ns]
         after = [(rows, field) for time_ns, rows, field in self._history if time_ns >= settled_ns]
@@ -372,7 +374,7 @@ class CoilResponse:
         return float(change @ expected) / size
 
     def _residual(self, equations: list[FloatArray]) -> FloatArray:
-        """Return the mean residual acceleration (3,) for healthy coils; `equations` has arrays (3, p + 1)."""
+        """Return the mean residual acceleration (3,) of equations (3, p + 1), assuming healthy coils."""
         rows = np.mean(equations, axis=0)
         modes, gains = rows[:, 2 * len(self._free) : self._others], rows[:, self._others : -1]
         return np.asarray(rows[:, -1] - gains.sum(axis=1) - modes @ self._weights)
@@ -417,7 +419,7 @@ class CoilResponse:
     def _fit(self, span: float) -> None:
         """Fit the gains over all bins, and look for a reversed coil over the newest bins as well.
 
-        Bins from before a fault would hide the fault from a fit over all bins.
+        In a fit over all bins, the bins before a fault would hide the fault.
         """
         rows = np.concatenate(self._rows).reshape(len(self._rows), len(self._free), -1)
         counts = [len(rows)]
@@ -442,7 +444,7 @@ class CoilResponse:
         """Fit all gains freely, and fit each gain under the assumption that the other coils are healthy.
 
         The equations `rows` (m, f, p + 1) belong to m neighbouring bins, and `span` is the time (s) from bin
-        to bin. Each fit uses as many of the newest bins as `counts` states.
+        to bin. Each element of `counts` is the number of newest bins that one fit uses.
         """
         free, coils = len(self._free), self._count_of_coils
         equations = self._whitened(rows, counts, span)
@@ -469,12 +471,13 @@ class CoilResponse:
         return fits
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
-        """Count the consecutive fits that agree on an axis.
+        """Count the consecutive fits with the same finding about an axis.
 
         Args:
             axis: index of the axis.
             possible: whether the gains of all axes are physically possible.
-            alone: whether a fault of this axis explains the motion, clearly better than that of another axis.
+            alone: whether a fault of this axis explains the motion clearly better than a fault of any other
+                axis.
             is_reversed: whether a reversed coil on this axis explains the motion clearly better than a fault
                 of another axis, and far better than healthy coils.
             is_steady: whether the newest half of the bins yields the same gain as all bins.
@@ -500,12 +503,12 @@ class CoilResponse:
     def _whitened(self, rows: FloatArray, counts: tuple[int, ...], span: float) -> FloatArray:
         """Return the equations (w, m f, p + 1) of w fits, whitened and without the constant disturbance.
 
-        The equations `rows` (m, f, p + 1) belong to m bins. In each fit, the equations of bins before the
-        newest `counts` bins are zero. Whitening is needed, because the noise of a bin enters two differences
-        of bins with opposite signs.
+        The equations `rows` (m, f, p + 1) belong to m bins. Each element of `counts` is the number of newest
+        bins that one fit uses; the equations of its older bins are zero. Whitening is needed, because the
+        noise of each bin enters two neighbouring differences with opposite signs.
         """
         settings = self._settings
-        # The span is rounded to ns, so that equal spans use the stored matrix.
+        # The span is rounded to ns, so that equal spans share a cached matrix.
         span = round(span, 9)
         variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
         white = [
@@ -544,24 +547,25 @@ def _bin_equations_numpy(
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return the equations of the angular acceleration between two neighbouring bins of samples.
 
-    The integrals (3 n + 6,) are those of the accelerations (rad/s) by n coils, coil by coil, and of the six
-    rate products (rad^2/s).
+    The 3 n + 6 time integrals are those of the accelerations by n coils (rad/s, three per coil) and of the
+    six rate products (rad^2/s).
 
     Args:
         samples: samples (m, 7 + n) of the second bin: time (s) since the previous sample, rate, field (T) and
             currents (A).
-        per_field: accelerations per ampere (3, 3 n) by the coils in a unit field along each body axis.
-        gyroscopic: coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of k error modes.
+        per_field: accelerations per ampere (3, 3 n), with one row for a unit field along each body axis, and
+            three columns for each coil.
+        gyroscopic: coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of its k error modes.
         free: indices (f,) of the axes about which the body can rotate.
-        sums: the integrals at the end of the first bin, and the mean of each integral over the first bin,
-            (2, 3 n + 6).
-        motion: rotation vector (rad) until the first bin, and mean rate in the first bin, (2, 3).
-        span: time (s) between the bins, or 0.0 without a first bin.
+        sums: the integrals (2, 3 n + 6): their values at the end of the first bin, and their means over it.
+        motion: rotation vector (rad) up to the first bin, and mean rate (rad/s) in the first bin, (2, 3).
+        span: time (s) between the bins, or 0.0 if there is no first bin.
 
     Returns:
         The sums and the motion of the second bin, the equations (3, 2 f + k + n + 1), and the largest body
-        rate in the second bin. The columns of the equations are the coefficients of torsions, dampings, error
-        modes and coil gains, and the acceleration. Without a first bin, the equations are zero.
+        rate in the second bin. The columns of the equations contain the coefficients of torsions, dampings,
+        error modes and coil gains; the last column contains the acceleration. If there is no first bin, the
+        equations are zero.
     """
     count, coils, rates = len(samples), samples.shape[1] - 7, samples[:, 1:4]
     products = rate_products(rates)
@@ -647,16 +651,17 @@ class Finding(Enum):
 
 
 class MotionFit(NamedTuple):
-    """Fit of the gains over some bins.
+    """Result of a fit of the coil gains over the newest bins.
 
     Attributes:
         gain, sigma: gain (n,) of each coil with the other coils assumed healthy, and standard deviation (n,)
             of this gain.
         weights: weights (k,) of the error modes.
         possible: whether the gains of all axes are physically possible.
-        alone: whether a fault of one axis explains the motion clearly better than that of another axis.
-        is_reversed: whether a reversed coil explains the motion clearly better than another fault, and far
-            better than healthy coils.
+        alone: for each axis, whether its fault explains the motion clearly better than a fault of any other
+            axis.
+        is_reversed: for each coil, whether its reversal explains the motion clearly better than a fault of
+            any other coil, and far better than healthy coils.
     """
 
     gain: Sequence[float]
@@ -668,10 +673,10 @@ class MotionFit(NamedTuple):
 
 
 def _judged(costs: list[float]) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-    """Return whether only a fault of the coil explains the motion, and whether the coil is reversed.
+    """Return for each of n coils whether only its fault explains the motion, and whether it is reversed.
 
-    Both results contain a value for each of n coils. The 2 n + 2 `costs` belong to the hypotheses that all
-    gains are free, that one is free, that none is free, and that one coil is reversed.
+    The 2 n + 2 `costs` belong to the hypotheses that all gains are free, that one is free, that none is free,
+    and that one coil is reversed.
     """
     coils = len(costs) // 2 - 1
     free, sound = costs[0], costs[coils + 1]
@@ -712,16 +717,16 @@ class CoilCorrection:
         self._unreviewed: set[int] = set()
 
     def effective(self, wire: FloatArray) -> FloatArray:
-        """Return currents (n,), A, with which healthy coils have the dipole of the actual coils at `wire`."""
+        """Convert actual to effective currents (n,), A, which cause the same dipole in healthy coils."""
         return self.factors * wire
 
     def wire(self, effective: FloatArray) -> FloatArray:
-        """Return the actual currents (n,), A, that cause the dipole of healthy coils at `effective`."""
+        """Convert effective to actual currents (n,), A, which cause the same dipole in the actual coils."""
         return effective / self.factors
 
     @property
     def unreviewed(self) -> frozenset[int]:
-        """The axes whose sign was changed in a tumble. Each new sign is confirmed when the body is slow."""
+        """The axes whose sign was changed in a tumble, and not yet confirmed while the body was slow."""
         return frozenset(self._unreviewed)
 
     def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
@@ -806,7 +811,7 @@ class MotionWitness:
         self.doubt, self._doubted_ns = why, now_ns
 
     def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
-        """Return whether the coil's torque has not changed, which means that the current monitor is faulty.
+        """Return whether the coil's torque is unchanged, which means that the current monitor is faulty.
 
         The coil last drew the expected current at `begun_ns`, and the fault began after this time. The fault
         was suspected at `suspected_ns`, and the newest reading was made at `now_ns`.
