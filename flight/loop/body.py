@@ -1,4 +1,4 @@
-"""The body interface, through which the loop uses the body that it flies.
+"""Interface between the loop and the body that it flies.
 
 A body is a vehicle of some kind, such as a satellite or the testbed. The loop itself uses only attitudes,
 rates and dipoles. The body defines its targets, the planning and tracking of paths to a target, and its own
@@ -84,7 +84,7 @@ class CoilCommand(NamedTuple):
 
 
 class SteeringState(IntEnum):
-    """Use of the coils; the values are the numbers in the control packet."""
+    """State of steering; the values are the numbers in the control packet."""
 
     OFF = 0
     FOLLOWING = 1
@@ -134,7 +134,8 @@ class ReadingAgreement(NamedTuple):
     """Agreement of an inertial unit's reading with the estimate.
 
     Attributes:
-        holds: whether at least one quantity of the reading agrees; if so, the estimate counts as measured.
+        holds: whether at least one quantity of the reading agrees with the estimate; if so, the estimate
+            counts as measured.
         objection: name of a quantity of the reading that contradicts the estimate; empty if all quantities
             agree.
     """
@@ -173,10 +174,10 @@ class Filter(Protocol):
         """Treat the coil currents recorded since a time as unknown."""
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times, and call `applied` with flags for the accepted measurements."""
+        """Apply measurements of past times, and call `applied` with flags: which of them were accepted."""
 
     def catch_up(self, most: int | None = None) -> None:
-        """Repeat the filter updates made after a late measurement: all updates, or at most `most` of them."""
+        """Repeat the filter updates that follow a late measurement: all, or at most `most` of them."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`, without changing the filter."""
@@ -208,7 +209,7 @@ class WindowedLaw(Protocol):
         """Begin without knowledge of the magnetic field."""
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,), T, and a gyro rate (3,), rad/s; used only if the coils' field has decayed."""
+        """Accept a field (3,), T, and a gyro rate (3,), rad/s, if the coils' field has already decayed."""
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the present command, which is zero while the field is measured or the rate is unknown."""
@@ -367,8 +368,8 @@ class BodyEstimation(Protocol):
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
         """Adapt to coil dipoles that were multiplied by `change` (n,).
 
-        The standard deviations of the dipoles, relative to the dipoles, are `deviations` (n,). The default
-        method does nothing, for a filter that does not estimate the coils separately.
+        The relative standard deviations of the dipoles are `deviations` (n,). The default method does
+        nothing; it suits a filter that does not estimate the coils separately.
         """
         del change, deviations
 
@@ -447,7 +448,7 @@ class BodyControl(Protocol):
         return
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first start time from `from_ns` on at which no coil switches during the exposure."""
+        """Return the first start time, not before `from_ns`, of an exposure during which no coil switches."""
         return from_ns
 
 

@@ -152,7 +152,7 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a configuration section with values replaced by a table.
+    """Return a configuration section in which the values of a table replace the configured values.
 
     Raises ValidationError for values that the schema rejects.
     """
@@ -283,7 +283,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command of a step of the time line. Raises CommandError unless there is exactly one."""
+    """Return the command of a step of the time line. Raises CommandError unless it has exactly one."""
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

@@ -43,7 +43,7 @@ Reactor = Callable[[EventKind, int, str], None]
 
 @dataclass(frozen=True, slots=True)
 class _HeldBack:
-    """The newest event of a kind that is held back, and the number `count` of all events held back."""
+    """The newest held-back event of a kind, and the number `count` of held-back events of this kind."""
 
     kind: EventKind
     time_ns: int
@@ -87,13 +87,13 @@ class EventLog:
             self._react(kind, time_ns, text)
 
     def release(self, now_ns: int) -> None:
-        """Write the newest event of each kind that is held back and may be written again."""
+        """Write the newest held-back event of each kind whose throttle time is over."""
         for code, held in list(self._held_back.items()):
             if now_ns - self._last_written[code] >= self._throttle_ns:
                 self._release(held, now_ns)
 
     def flush(self, now_ns: int) -> None:
-        """Write the newest event of each kind that is held back, at the end of the flight."""
+        """At the end of the flight, write the newest held-back event of each kind."""
         for held in list(self._held_back.values()):
             self._release(held, now_ns)
 
@@ -276,7 +276,7 @@ class Facts:
         return bool(found)
 
     def release(self, fact: Fact) -> None:
-        """Make a latched condition inactive, because its cause is examined again."""
+        """Make a latched condition inactive, so that it is reported again if its cause persists."""
         self._states[fact.name] = _State()
 
     def enter(self, mode: Mode) -> None:
@@ -362,7 +362,7 @@ class StreamWatch:
         self._valid = True
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings; measure the rate and the time without a reading from `time_ns` on."""
+        """Discard earlier readings. From `time_ns` on, measure the rate and the time without a reading."""
         self._times.clear()
         self._begin_ns = self._since_ns = time_ns
 
@@ -423,7 +423,7 @@ class Streams:
         self._watches = {row.name: StreamWatch(row, 0) for row in rows}
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings; measure rates and times without a reading from `time_ns` on."""
+        """Discard earlier readings. From `time_ns` on, measure rates and times without a reading."""
         for watch in self._watches.values():
             watch.begin(time_ns)
 
@@ -439,7 +439,7 @@ class Streams:
         return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
 
     def look(self, now_ns: int) -> list[tuple[StreamLimits, bool | None, str]]:
-        """Return for each stream its limits, whether the stream is poor, and why."""
+        """Return for each stream its limits, whether its readings are poor, and why."""
         return [(watch.stream, *watch.poor(now_ns)) for watch in self._watches.values()]
 
 

@@ -255,7 +255,7 @@ class GroupsAndWorkers:
 
     def __init__(self, groups: list[RateGroup], workers: list[WorkerWatch]) -> None:
         self._workers = workers
-        # For each group: number of completed cycles, and time (ns) of the last increase.
+        # For each group: number of completed cycles, and time (ns) at which this number last increased.
         self._progress = {group: (group.completed, 0) for group in groups}
 
     def begin(self, time_ns: int) -> None:
@@ -312,7 +312,10 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report skipped slots of the control group; other groups skip slots only if it skips slots too."""
+        """Report skipped slots of the control group.
+
+        Other groups skip slots only if the control group does.
+        """
         if group.name != CONTROL:
             return
         self.lost += slots
@@ -380,7 +383,7 @@ class Housekeeping:
         return self._coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
-        """Write the housekeeping packet with the use of the coils (`state`) in the newest control cycle."""
+        """Write the housekeeping packet with the steering state (`state`) of the newest control cycle."""
         now_ns, power, log_error = cycle.start_ns, self._power, self._log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
@@ -633,7 +636,7 @@ class BusyPeriods:
     """Counts the jobs that have run for longer than a limit."""
 
     def __init__(self, busy_since_ns: Callable[[], int | None], limit_ns: int) -> None:
-        """Watch the worker whose job began at `busy_since_ns`, which is None while the worker is idle."""
+        """Watch a worker; `busy_since_ns` returns the start time (ns) of its job, or None if it is idle."""
         self._busy_since_ns, self._limit_ns = busy_since_ns, limit_ns
         self._counted_ns = -1
         self.count = 0
@@ -674,7 +677,7 @@ class Shedding:
         return made
 
     def run(self, lost_cycles: int, now_ns: int) -> None:
-        """Evaluate the load and the number of `lost_cycles`, and change the shedding level by at most one."""
+        """Look for overload, change the shedding level by at most one, and record `lost_cycles`."""
         self._plans.look(now_ns)
         seen = [sign for sign in self._signs if sign.look(now_ns)]
         if seen:

@@ -85,8 +85,8 @@ class ImagingSettings:
         fine_rest_ns: minimum time (ns) between exposures while the attitude estimate is accurate, the body
             rotates slowly and no object is searched for.
         seeks: function that returns whether the body searches for an object.
-        calm: function of a time and an exposure time that returns the first start time, from this time on, of
-            an exposure during which no coil is switched.
+        calm: function of a time and an exposure time (ns) that returns the first start time (ns), not before
+            this time, of an exposure during which no coil is switched.
         late_ns: time (ns) after the end of an exposure from which its frame counts as late.
         max_rate: body rate (rad/s) above which no exposure is made.
         slow_ns: processing time (ns) of a frame above which vision is reported as slow.
@@ -229,7 +229,7 @@ class FrameMeasurer:
         return turn @ found.rate, turn @ found.covariance @ turn.T
 
     def _off_middle(self, frame: Frame, motion: FrameMotion) -> FloatArray:
-        """Return the covariance (3, 3), rad^2, of the star fix relative to the attitude at mid-exposure."""
+        """Return the covariance (3, 3), rad^2, of the star fix minus the attitude at mid-exposure."""
         turns = np.zeros((len(NODES), 3))
         middle = self._navigation.past(middle_ns(frame))
         if middle is not None:
@@ -317,7 +317,7 @@ class FrameReport:
         )
 
     def lens(self, frame: Frame, before: LensKnowledge, lens: LensKnowledge, now_ns: int) -> None:
-        """Record the lens parameters, and report if the frame contradicted the parameters `before` it."""
+        """Record the lens parameters, and report if the frame contradicted the earlier ones (`before`)."""
         if lens.contradictions > before.contradictions:
             text = (
                 f"frame {frame.sequence} contradicts the lens estimated from {before.frames} frames: "
@@ -390,7 +390,7 @@ class RepeatedRows:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
     def count(self, pixels: Image) -> int:
-        """Return how many sampled rows are copies from earlier frames, or 0 if all of them are copies."""
+        """Return how many sampled rows are copies from earlier frames; 0 if all are (a repeated frame)."""
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
         sampled = np.ascontiguousarray(pixels[rows])
         noisy = np.mean(sampled[:, 1:] != sampled[:, :-1], axis=1) >= _LEAST_CHANGES
@@ -635,7 +635,7 @@ class Imaging:
         """Set how much work is done: the search for objects, and the fraction of exposures that are made.
 
         Frames are searched for objects only if `search` is true, and only every n-th exposure is made, where
-        n is `frame_every`. The largest permitted age of the newest frame limits n.
+        n is `frame_every`. n is at most `ImagingSettings.most_every`.
         """
         self._searches = search
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
@@ -648,7 +648,7 @@ class Imaging:
         return self._shed, self._late
 
     def begin(self, time_ns: int) -> None:
-        """Measure the age of the newest frame from `time_ns` on, until the first frame arrives."""
+        """Until the first frame arrives, measure the age of the newest frame from `time_ns`."""
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:

@@ -111,7 +111,7 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
     },
-    Mode.SAFE: {  # a command or the end of a low battery ends SAFE; pointing needs acquisition
+    Mode.SAFE: {  # a command or a recharged battery ends SAFE; pointing needs acquisition
         **_USUAL,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
@@ -122,7 +122,7 @@ TRANSITIONS: Table = {
         Trigger.CHARGED_HOLD: Mode.HOLD,
         Trigger.CHARGED_DEMO: Mode.TESTBED_DEMO,
     },
-    Mode.DETUMBLE: {  # a command to point takes effect after the rate is low and the attitude known
+    Mode.DETUMBLE: {  # a command to point takes effect once the rate is low and the attitude is known
         **_USUAL,
         Trigger.COMMAND_SUN: TriggerAnswer.STAY,
         Trigger.COMMAND_POINT: TriggerAnswer.STAY,

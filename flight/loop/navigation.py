@@ -48,8 +48,8 @@ from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Estimate, Me
 from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 _AT_A_TIME = 16
-"""Number of filter updates that one control cycle repeats after a late measurement. They take a few ms, and
-the filter updates of one second are repeated within a few control cycles."""
+"""Number of filter updates that one control cycle repeats after a late measurement. These updates take a few
+ms, so that the updates of one second are repeated within a few control cycles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class NavigationSettings:
 _UNSEEN_NS = 600_000_000
 """Longest time (ns) from a PWM error to its detection; the driver reads its outputs back twice a second."""
 _UNSUSPECTED_NS = 800_000_000
-"""Longest time (ns) from a coil fault until it is suspected, after four readings of the current monitor."""
+"""Longest time (ns) from a coil fault to its suspicion, which needs four readings of the current monitor."""
 STOOD_NS = 200_000_000
 """Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
 
@@ -385,7 +385,7 @@ class Positioning:
         self._link_recorded_ns: int | None = None
 
     def begin(self, time_ns: int) -> None:
-        """Measure the age of the newest fix from `time_ns` on, until the first fix arrives."""
+        """Until the first fix arrives, measure the age of the newest fix from `time_ns`."""
         self._fixed_ns = time_ns
 
     def run(self, now_ns: int) -> None:
@@ -468,7 +468,7 @@ class SunSensing:
         self._read_ns = 0
 
     def begin(self, time_ns: int) -> None:
-        """Measure the age of the newest reading from `time_ns` on, until the first reading arrives."""
+        """Until the first reading arrives, measure the age of the newest reading from `time_ns`."""
         self._read_ns = time_ns
 
     def run(self, now_ns: int) -> None:
@@ -543,7 +543,7 @@ class HorizonCameraTask:
         return None if self._job is None else self._job[2]
 
     def run(self, now_ns: int) -> None:
-        """Collect the frames of the last trigger, submit them to the worker, and trigger when it is due."""
+        """Collect the frames of the last trigger, submit them to the worker, and trigger again if due."""
         if self._waits:
             self._collect(now_ns)
         period_ns = self._settings.period_ns if self._sight.needed else self._settings.fine_period_ns
@@ -568,7 +568,7 @@ class HorizonCameraTask:
             return
         found: HorizonCameraResult = result.value
         if found.false is not None:
-            # The attitude was known well enough to check the images against it.
+            # The worker had an attitude that was accurate enough to check the images.
             text = "all images agree with the attitude"
             if found.false:
                 names = ", ".join(str(number + 1) for number in found.false)

@@ -7,8 +7,8 @@ crashes repeatedly soon after its start still counts its earlier crashes.
 
 The learned parameters are estimated properties of the devices, such as biases; attitude and rate are not
 stored. The next boot starts its filter from the learned parameters. The covariance of the learned parameters
-is increased by a fraction of the configured prior, because the devices may have changed since then. Learned
-values that are implausible under the configured prior are rejected.
+is increased by a fraction of the configured prior, because the devices may have changed since the last boot.
+Learned values that are implausible under the configured prior are rejected.
 
 Each copy of the state is a file with a line of JSON and a line with the CRC-32 of the first line. Both copies
 are written each time, one after the other, so that at least one copy survives a crash. A file is replaced
@@ -174,7 +174,7 @@ class BootRecord:
         boot_count: number of this boot, which is 1 for the first boot.
         unclean_recent: number of unclean shutdowns in the recent operating time (`CRASH_WINDOW`).
         after_unclean: whether the previous boot ended uncleanly.
-        mode: name of the mode at the last stop; empty at the first boot.
+        mode: name of the mode at the end of the last boot; empty at the first boot.
     """
 
     boot_count: int
@@ -348,7 +348,7 @@ class LinuxFiles:
         os.close(file)
 
     def rename(self, old: Path, new: Path) -> None:
-        """Rename a file atomically, and replace any file with the new name."""
+        """Rename a file atomically; if a file already has the new name, it is replaced."""
         os.rename(old, new)
 
     def sync_folder(self, folder: Path) -> None:
@@ -488,7 +488,7 @@ def encode(generation: int, state: StoredState) -> bytes:
 
 
 def decode(data: bytes) -> _StateCopy:
-    """Return the content of one copy of the state. Raises ValueError for a copy that `encode` cannot make."""
+    """Return the content of one copy of the state. Raises ValueError for a damaged or invalid copy."""
     if len(data) > LARGEST_FILE:
         raise ValueError(f"{len(data)} bytes are too many")
     line = line_of(data)
@@ -526,7 +526,7 @@ class StateKeeper:
 
     The `record` and the parameters `learned` come from earlier boots. The flag `counted` states whether the
     number of this boot was written. The attribute `table` is the table of onboard parameters to be used. The
-    flag `is_flying` states whether the flight has noted its state, which it does about once a second.
+    flag `is_flying` states whether the flight has called `note`, which it does about once a second.
     """
 
     def __init__(

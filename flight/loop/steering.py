@@ -162,8 +162,9 @@ class CoilDrive:
     ) -> None:
         """Command effective currents (n,), A, which a self-test may replace if `testable`.
 
-        Unless all coils are usable and within their limits, the current is reallocated among the usable coils
-        by the magnetic field (3,), T, that `field` returns.
+        Unless all coils are usable and within their limits, the currents are reallocated among the usable
+        coils. The allocation preserves the direction of the torque in the magnetic field (3,), T, that
+        `field` returns.
         """
         watch, settings = self._watch, self._settings
         sizes = watch.correction.sizes
@@ -325,7 +326,7 @@ class Steering:
         dipole: FloatArray,
         saturated: bool = False,
     ) -> Steered:
-        """Check the PWM chip, whose fault switches the coils off, and return the result of this cycle."""
+        """Check the PWM chip (its fault switches the coils off), and return the result of this cycle."""
         error = self._drive.fault()
         text = error or "the PWM chip accepts commands again"
         self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)

@@ -323,7 +323,7 @@ class _WithoutTables(MetaPathFinder):
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a module spec for scipy's `_array_api` that makes its decorator have no effect."""
+        """Return a module spec for scipy's `_array_api`, in which its decorator has no effect."""
         if name != _ARRAY_API:
             return None
         spec = PathFinder.find_spec(name, path, target)
