@@ -255,7 +255,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
-        """Drive the next untried axis, first `prime`. Return the end time (ns), or None if all were tried."""
+        """Drive an untried axis, preferably `prime`; return the end time (ns), or None if all were tried."""
         candidates = axes - self._tried
         if not candidates:
             self._tried.clear()

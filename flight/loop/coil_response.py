@@ -553,8 +553,7 @@ def _bin_equations_numpy(
     Args:
         samples: samples (m, 7 + n) of the second bin: time (s) since the previous sample, rate, field (T) and
             currents (A).
-        per_field: accelerations per ampere (3, 3 n), with one row for a unit field along each body axis, and
-            three columns for each coil.
+        per_field: accelerations per ampere (3, 3 n), with one row per field axis and three columns per coil.
         gyroscopic: coefficients (3 + 3 k, 6) of the gyroscopic acceleration, and of its k error modes.
         free: indices (f,) of the axes about which the body can rotate.
         sums: the integrals (2, 3 n + 6): their values at the end of the first bin, and their means over it.
@@ -563,9 +562,8 @@ def _bin_equations_numpy(
 
     Returns:
         The sums and the motion of the second bin, the equations (3, 2 f + k + n + 1), and the largest body
-        rate in the second bin. The columns of the equations contain the coefficients of torsions, dampings,
-        error modes and coil gains; the last column contains the acceleration. If there is no first bin, the
-        equations are zero.
+        rate in the second bin. The columns of the equations are the coefficients of torsions, dampings, error
+        modes and coil gains, then the acceleration. Without a first bin, the equations are zero.
     """
     count, coils, rates = len(samples), samples.shape[1] - 7, samples[:, 1:4]
     products = rate_products(rates)

@@ -660,7 +660,11 @@ class Shedding:
         frames: Callable[[], tuple[int, int]],
         services: Services,
     ) -> None:
-        """Start without reductions; `apply` applies a level, `frames` counts omitted and late frames."""
+        """Start without reductions.
+
+        `apply` puts a level into effect. `frames` returns how many frames were omitted, and how many were
+        late.
+        """
         self._signs, self._plans, self._apply, self._frames = tuple(signs), plans, apply, frames
         self._recorder, self._events = services.recorder, services.events
         self._level = 0

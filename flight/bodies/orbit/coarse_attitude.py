@@ -239,7 +239,8 @@ class HorizonCameraFeed:
         if not self._filter.runs or self._against >= CONTRADICTED:
             first, nadir = seen
             if first is not None and not of_cells:
-                # When it starts, the filter adds only the misalignment of the cameras that measure nadir.
+                # To the error of its first attitude, the filter itself adds only the misalignment of the
+                # cameras that measure nadir.
                 first = replace(first, covariance=first.covariance + self._filter.sun_misalignment)
             began = self._begin(time_ns, [one for one in (first, nadir) if one is not None])
             return began and first is not None, began and nadir is not None

@@ -255,7 +255,7 @@ class EstimatedEnvironment:
         """Return field, position, pressures and sunlight, or None while the orbit is unknown.
 
         The pressures are interpolated linearly over `STEP`, in which their directions rotate by 0.01 rad. The
-        interpolated pressures are too small by at most a fraction of 2e-5.
+        interpolated pressures are too small by at most 2e-5 of their values.
         """
         near, times = self._prediction(now_ns)
         if near is None:

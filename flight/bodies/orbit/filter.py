@@ -448,7 +448,7 @@ class StepReplay:
             self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _rate_change(self, step: FilterStep, since: float, impulse: FloatArray) -> FloatArray:
-        """Return the present rate minus the mean rate over an interval (3,), rad/s.
+        """Return the present rate (3,), rad/s, minus the mean rate over an interval.
 
         The middle of the interval was `since` seconds ago. The present acceleration, which includes the
         torque of the newest dipole, is used for the whole interval. `impulse` (3,), A m^2 s, corrects for

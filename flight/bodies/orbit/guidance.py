@@ -78,7 +78,7 @@ near the end, because the time is too short for a new plan."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Followed:
-    """A path that is followed from `begin_ns` on; its times are since `origin_ns`. `slew` may be None."""
+    """A path that is followed from `begin_ns` on; its times count from `origin_ns`. `slew` may be None."""
 
     law: PointingLaw
     origin_ns: int
@@ -280,7 +280,7 @@ RATE = math.radians(1.0)
 """Rate error (rad/s) that has unit cost, chosen because a fast roll blurs the stars at the edge of the
 image."""
 FORESIGHT = 30.0
-"""Prediction time (s) of a track. If it leaves the field of view within this time, its exit is reported."""
+"""Prediction time (s) of a track: an exit from the field of view within this time is reported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
