@@ -4,8 +4,8 @@ import os
 import signal
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # Ctrl-C ends a command at once and without a traceback, even during imports.
-    # The code that runs a flight later installs its own signal handler.
+    # Ctrl-C ends a command at once and without a traceback, even during imports. The code that runs a flight
+    # installs its own signal handler later.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # Multithreaded BLAS would slow the computation down, because all matrices are small.

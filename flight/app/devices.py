@@ -481,7 +481,7 @@ def open_ina219(rig: Rig, monitor: PowerMonitorSection) -> Ina219:
 
 
 def check_ina219(monitor: PowerMonitorSection) -> int:
-    """Return the range bits of the current monitor. Raises OutOfRange if no range covers its current."""
+    """Return the range bits of an INA219. Raises OutOfRange if no range covers its current."""
     return range_for(monitor.maximum_current, monitor.shunt)
 
 

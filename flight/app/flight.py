@@ -122,7 +122,7 @@ def open_flight(
     patient: bool = False,
     earlier: Sequence[Path] = (),
 ) -> tuple[FlightLoop, FlightLog]:
-    """Open logs, devices and workers, and return the loop, which is ready to run, and the flight log.
+    """Open logs, devices and workers. Return the loop, which is ready to run, and the flight log.
 
     The stack closes everything in the opposite order, with the coils at zero. A `patient` flight waits in
     BOOT for missing devices and for a disk that cannot be written; any other flight raises DeviceError for a
@@ -228,10 +228,10 @@ class _Opened:
 
 
 def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None = None) -> RunResult:
-    """Fly a configuration to its end. Raises UsageError, and DeviceError for a device that fails.
+    """Fly a configuration to its end.
 
-    On a flight computer, the start is retried until it succeeds. Raises StoppedError if a signal ends the
-    attempts to start.
+    Raises UsageError if the flight cannot begin, and DeviceError for a device that fails. On a flight
+    computer, the start is retried until it succeeds. Raises StoppedError if a signal ends these attempts.
     """
     with EndingSignals() as signals, ExitStack() as stack:
         opened = _start(request, signals, stack)

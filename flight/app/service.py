@@ -141,8 +141,8 @@ def retried_start(
 ) -> T:
     """Return the result of the first `attempt` that succeeds, whose resources `stack` closes.
 
-    Each attempt opens the configuration that `judge` returns. Raises UsageError, and StoppedError after a
-    signal.
+    Each attempt opens the configuration that `judge` returns. Raises UsageError if the
+    configuration is invalid, and StoppedError after a signal.
     """
     for pause in pauses():
         try:

@@ -62,7 +62,7 @@ def pseudo_random(kind: str) -> bytes:
 
 
 def randomised(data: bytes, kind: str | None) -> bytes:
-    """Return bytes combined by exclusive-or with a pseudo-random sequence, unchanged if `kind` is None."""
+    """Return the exclusive or of bytes and a pseudo-random sequence, or the same bytes if `kind` is None."""
     if kind is None:
         return data
     sequence = pseudo_random(kind)[: len(data)]
@@ -183,7 +183,7 @@ that no line accepted is sent again."""
 
 
 class TelemetryCode:
-    """Code of telemetry: Reed-Solomon code and pseudo-randomiser, both optional."""
+    """Telemetry code: Reed-Solomon code and pseudo-randomiser, both optional."""
 
     def __init__(self, frame_bytes: int, randomiser: str | None, depth: int | None) -> None:
         """Encode frames of `frame_bytes` bytes, with `depth` interleaved Reed-Solomon codewords."""
@@ -294,7 +294,7 @@ class CltuStream:
     """
 
     def __init__(self, kind: str | None, count: Callable[[int], object]) -> None:
-        """Decode frames randomised by the sequence `kind`; `count` receives numbers of corrected bits."""
+        """Decode frames randomised by the sequence `kind`; pass the number of corrected bits to `count`."""
         self._kind, self._count = kind, count
         self._data = b""
 

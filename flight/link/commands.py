@@ -3,7 +3,7 @@
 Telecommands are CCSDS space packets of type 1. The field `time_ns` of the secondary header must be unique per
 command, for example the sender's UTC, so that a packet duplicated by the network is executed only once.
 Ground and satellite check the arguments of a command against the states and ranges in its packet definition.
-The words of the command `knightcube command` follow from the same definitions.
+The words of the command `knightcube command` are derived from the same definitions.
 
 The receive queue of a socket is short. An unknown sender could fill the queue between two polls, and commands
 from known senders would then be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel drop

@@ -8,11 +8,11 @@ from frame to frame, and the receiver ignores the salt. If a folder of keys is r
 counters are used again, but with another salt. The MAC covers the virtual channel, the SPI and the data, as
 in Yamcs.
 
-The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
-CRC-32. Both files are overwritten in place, one after the other, so that a full disk does not prevent the
-update and a crash damages at most one copy. If the two copies differ, the copy with the newer key or the
-higher counter is used. One folder contains the security associations of one end of the link, and only the
-folder's owner may read them.
+The key and counter of each SPI are stored in two files, which are copies of each other. Each file is a record
+of fixed size that ends with a CRC-32. Both files are overwritten in place, one after the other, so that a
+full disk does not prevent the update and a crash damages at most one copy. If the two copies differ, the copy
+with the newer key or the higher counter is used. One folder contains the security associations of one end of
+the link, and only the folder's owner may read them.
 
 A folder of keys that was restored from a backup contains old counters, with which old commands would be
 executed again. The satellite therefore keeps a reference folder (argument `witness`), which no backup may
@@ -230,7 +230,7 @@ class Vault:
         """Return the newest valid copy of a security association, or None if no copy is valid.
 
         An association in the reference folder that is newer than both copies is returned instead. For an
-        outdated primary command SPI, the result is None, because its counters could be repeated.
+        outdated primary command SPI, the result is None, because old frames could be accepted again.
         """
         newest = max(self._copies(name), default=None)
         if newest is None or self._witness is None or not self._witness.outdates(newest):
@@ -438,7 +438,7 @@ class Gate:
         return self._open[spi]
 
     def admit(self, frame: bytes) -> Admitted:
-        """Return the content of a frame. Raises RefusedError, also for a frame that was accepted before."""
+        """Return the content of a frame. Raises RefusedError for an invalid or repeated frame."""
         try:
             admitted = self._admit(frame)
         except RefusedError as error:
@@ -504,7 +504,7 @@ class Gate:
         return known
 
     def _by_newer_key(self, entry: Association, header: bytes, protected: bytes) -> tuple[Association, bytes]:
-        """Return association and data of a frame with a key newer than that of `entry`. Raises RefusedError.
+        """Return association and data of a frame whose key is newer than `entry`. Raises RefusedError.
 
         On the ground, another process that shares the folder of keys may already have replaced the key.
         """

@@ -168,7 +168,7 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
 
 
 def as_testbed(config: Config) -> TestbedConfig:
-    """Return a configuration of the testbed unchanged. Raises ConfigError for any other body."""
+    """Return the same configuration as a `TestbedConfig`. Raises ConfigError for any other body."""
     if not isinstance(config, TestbedConfig):
         raise ConfigError("body", f"is {config.body}: this needs a configuration of the testbed")
     return config
@@ -199,7 +199,7 @@ ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 class CraftAccuracy(Section, frozen=True, kw_only=True):
     """Largest errors of the configured satellite; the true errors are assumed uniform within them.
 
-    `centre_of_mass` (m) is the distance of the true from the configured centre of mass, whose default is the
+    `centre_of_mass` (m) is the distance of the true from the configured centre of mass; the default is the
     largest offset that the CubeSat Design Specification permits.
 
     `moments` is the relative error of the principal moments of inertia, and `axes_deg` the rotation of the
@@ -477,7 +477,7 @@ def _two_digits(value: float) -> float:
 
 
 def as_orbit(config: Config) -> OrbitConfig:
-    """Return a configuration of a satellite in orbit unchanged. Raises ConfigError for any other body."""
+    """Return the same configuration as an `OrbitConfig`. Raises ConfigError for any other body."""
     if not isinstance(config, OrbitConfig):
         raise ConfigError("body", f"is {config.body}: this needs the configuration of a satellite in orbit")
     return config

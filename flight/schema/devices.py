@@ -190,7 +190,7 @@ class Winding(Section, frozen=True, kw_only=True):
         return self.channels or (2 * index, 2 * index + 1)
 
     def strength(self) -> float:
-        """Return the dipole moment per ampere, m^2. Raises ConfigError unless exactly one form is given."""
+        """Return the dipole moment per ampere, m^2. Raises ConfigError if it is missing or given twice."""
         if (self.turns is None) != (self.area is None):
             raise ConfigError("turns" if self.area is None else "area", "needs both `turns` and `area`")
         given = self.dipole_per_ampere
@@ -846,7 +846,7 @@ def with_drivers(shape: type[Any], document: Document) -> type[Any]:
 
 
 def _drop_inherited(kind: str, section: type[Any], document: Document) -> None:
-    """Remove the keys of another driver that an extended file gives, because they do not apply."""
+    """Remove keys that an extended file gives for another driver, because they do not apply."""
     known = {field.encode_name for field in msgspec.structs.fields(section)}
     for key in set(document.values[kind]) - known:
         if f"{kind}.{key}" in document.files:

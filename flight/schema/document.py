@@ -103,7 +103,7 @@ _MISTAKES = (
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
-    """Return the object `module:object`; `known` maps short names to such objects. Raises ConfigError.
+    """Return the object `module:object`; `known` maps short names to such texts. Raises ConfigError.
 
     A flight computer imports only known objects and the objects in the file that `KNIGHTCUBE_MODULES` names.
     Raises OSError if a flight computer cannot read a file, because a later attempt may succeed.
@@ -649,7 +649,7 @@ def _kinds_at(shape: Any, path: str) -> list[inspect.Type]:
 
 
 def _description(kinds: list[inspect.Type]) -> str:
-    """Return the description of a value in the configuration's types, or an empty text without one."""
+    """Return the description of a value from its type, or an empty text if there is none."""
     schemas = [kind.extra_json_schema or {} for kind in kinds if isinstance(kind, inspect.Metadata)]
     return " or ".join(str(schema["description"]) for schema in schemas if "description" in schema)
 

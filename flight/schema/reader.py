@@ -70,7 +70,7 @@ _BEYOND = 1.01
 _PREFIX = 24
 """Default prefix length of the network whose hosts may send frames to the link."""
 _MOST_SEGMENTS = 10_000
-"""Maximum number of segment files of a log, whose folder the link lists in 0.1 s."""
+"""Maximum number of segment files of a log. The link lists a folder of this size in 0.1 s."""
 _DATA_SYMBOLS = 223
 """Number of data symbols in a codeword of the link's Reed-Solomon code."""
 
@@ -628,7 +628,7 @@ def load_orbit(path: Path) -> OrbitConfig:
 
 
 def load_camera(path: Path) -> Camera:
-    """Read the camera of a configuration, or of a `camera` section alone. Raises ConfigError."""
+    """Read the camera of a configuration, or of a file with only a `camera` section. Raises ConfigError."""
     text = read_text(path)
     document = read_document(text, str(path))
     if set(document.values) == {"camera"} and document.values["camera"] != "none":

@@ -69,7 +69,7 @@ _NICE = 10
 _KEYS_WAIT_NS = 60 * SECOND_NS
 """Time (ns) for which the start waits for the folder of keys before it rebuilds the folder from the reference
 folder."""
-_WRITE_TIMEOUT_S = 0.0  # a radio that is slower than the configured rate takes the rest of a frame later
+_WRITE_TIMEOUT_S = 0.0  # a radio that is slower than the configured rate accepts the rest of a frame later
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +114,7 @@ def link(options: argparse.Namespace) -> int:
 
 
 def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
-    """Run the link until `ended` returns true; start it again if lost keys are found again."""
+    """Run the link until `ended` returns true; start it again when lost keys can be read again."""
     with ExitStack() as stack:
         retry, overseer = StartRetry(ended), ServiceManager(os.environ, os.getpid())
         for callback in (retry.close, overseer.close, overseer.stopping):

@@ -6,9 +6,9 @@ repeated EOFs.
 
 A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next
 protocol data unit (PDU) whenever one can be sent, and regularly lets the entity check and store complete
-files. Replies are sent first, followed by PDUs of the open
-transfers in round-robin order. No method of an entity waits, and the caller states the current time. State
-that must survive a restart of the process is stored on disk (`flight.link.files.store`).
+files. Replies are sent first, followed by PDUs of the open transfers in round-robin order. No method of an
+entity waits, and the caller states the current time. State that must survive a restart of the process is
+stored on disk (`flight.link.files.store`).
 """
 
 from __future__ import annotations
@@ -340,7 +340,7 @@ class Receiver:
         record: state of the transfer, which `keep` writes to disk.
         closed: whether the sender has acknowledged the end of the transfer or no longer answers.
         said: description of the end of the transfer.
-        unplaced: whether the complete file has not been moved to its final path yet.
+        unplaced: whether the file is complete but not yet moved to its final path.
     """
 
     def __init__(
@@ -524,7 +524,7 @@ class Receiver:
         return self.record.name is not None and end is not None and self._ranges.cover(end[1])
 
     def _next_request(self, begin: int) -> Nak | None:
-        """Return the request for the next gaps from offset `begin`, None at the end of the file."""
+        """Return the request for the next gaps from offset `begin`, or None at the end of the file."""
         size = self.record.end[1] if self.record.end is not None else self.record.size
         gaps = self._ranges.gaps(begin, size, self._most_requests - 1)
         self._requested_to = gaps[-1][1] if gaps and gaps[-1][1] < size else None
@@ -714,7 +714,7 @@ class Entity:
         return side
 
     def take(self, unit: bytes, now_ns: int) -> None:
-        """Process a received PDU for this entity. Raises PduError, and FileError if the disk fails."""
+        """Process a received PDU. Raises PduError for an invalid PDU, and FileError if the disk fails."""
         transaction, content = unpack(unit)
         if transaction.source == self.number:
             replies = self._take_as_sender(transaction, content, now_ns)

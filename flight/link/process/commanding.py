@@ -199,7 +199,7 @@ class ControlLine(Generic[T]):
 
     @property
     def is_full(self) -> bool:
-        """Whether the maximum number of commands (`AT_MOST`) wait for answers."""
+        """Whether the maximum number of commands (`AT_MOST`) is waiting for answers."""
         return len(self._waiting) >= AT_MOST
 
     def send(self, command: T, data: bytes, now_ns: int) -> str:

@@ -59,7 +59,7 @@ class _Directive:
 
 @dataclass(frozen=True, slots=True)
 class Play(_Directive):
-    """Directive to play back telemetry from mission time `begin` to `end` (s) of the run with a number."""
+    """Directive to play back the telemetry of a run from mission time `begin` to `end`, s."""
 
     run: int
     begin: float
@@ -334,7 +334,7 @@ class _OnRenewal(_Directive):
 
 
 class Confirm(_OnRenewal):
-    """Directive to end a trial in favour of the new artefact."""
+    """Directive to end a trial and keep the new artefact."""
 
     packet = telecommand("confirm", 0x2B1, "End the trial of an artefact and keep the artefact", _KIND)
 

@@ -138,7 +138,7 @@ class LogFollower:
 def stretch(
     folder: Path, begin: float, end: float, missing: list[str], now_ns: Callable[[], int]
 ) -> Iterator[bytes]:
-    """Yield packets of mission time `begin` to `end` (s), and b"" after each read, for interruptions.
+    """Yield packets of mission time `begin` to `end` (s), and b"" after each read, to allow pauses.
 
     Failed accesses to the disk are repeated. The list `missing` receives each part of the log that cannot be
     read; the rest of its segment is skipped.
@@ -242,7 +242,8 @@ _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
     for packet in (RUN, TARGET, MODE, PLAN, STREAK, STARS, EVENT, COMMAND)
 }
-"""Identifiers of the packet types that are thinned out only if the queue is four times as full as usual."""
+"""Identifiers of the packet types that are thinned out only when the queue is four times as long as for other
+types."""
 
 _BURST_S = 0.1
 _WAITING_S = 0.5

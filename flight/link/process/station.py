@@ -118,7 +118,7 @@ class Line(Protocol):
 
 
 class _Output:
-    """Output of a stream, which completes the last frame that was sent in part before it takes new frames."""
+    """Output of a stream, which completes a partly sent frame before it accepts new frames."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -199,7 +199,7 @@ class UdpLine:
         self._heard[sender] = now_ns
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> int | None:
-        """Send each frame as one datagram to each listener, until the network takes no more datagrams."""
+        """Send each frame as one datagram to each listener, until the network accepts no more datagrams."""
         self._heard = {who: at for who, at in self._heard.items() if now_ns - at < _HEARD_NS}
         fixed = () if self._fixed is None or self._fixed in self._heard else (self._fixed,)
         listeners = (*fixed, *self._heard)
@@ -344,7 +344,7 @@ class TncLine(Line):
     """Client of a TNC, such as Direwolf, by KISS over TCP; reconnects after five seconds."""
 
     def __init__(self, address: str, framing: Framing) -> None:
-        """Connect to the address HOST:PORT as soon as frames can be sent."""
+        """Connect to the address HOST:PORT when frames are first sent."""
         self.name = f"KISS {address}"
         self._address = host_port(address)
         self._framing = framing
@@ -646,7 +646,7 @@ class Station:
         try:
             self._filing.close(self._clock.now_ns())
         except FileError:
-            if not self._keys_returned:  # a late folder belongs to other transfers, which continue
+            if not self._keys_returned:  # the folder mounted late has its own transfers, which continue
                 raise
 
     def turn(self) -> bool:
@@ -775,8 +775,8 @@ class Station:
                 return self._filing.obey(directive, done, self._utc_ns(), self._clock.now_ns())
 
     def _schedule(self, directive: Scheduled | Deletion | Listing, done: Report) -> list[Report]:
-        """Change or list the schedule. Nothing is scheduled while the folder of keys may be mounted late."""
-        if isinstance(directive, Scheduled) and self._vault.rebuilt:  # the late folder has another schedule
+        """Change or list the schedule. No command is added if the folder of keys was rebuilt."""
+        if isinstance(directive, Scheduled) and self._vault.rebuilt:  # the lost folder has another schedule
             return [replace(done, stage=Stage.FAILED, text=REBUILT)]
         return self._scheduling.obey(directive, done, self._utc_ns())
 

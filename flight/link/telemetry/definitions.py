@@ -747,7 +747,7 @@ TRANSFER = _packet(
 )
 
 _LATENESS = Limits(fault=(0.0, 0.0125))
-"""Nominal range of the delay (s) of a control cycle, which is skipped if delayed by half its period."""
+"""Nominal range of the delay (s) of a control cycle. A cycle that is late by half its period is skipped."""
 _EXECUTION = Limits(warning=(0.0, 0.0125), fault=(0.0, 0.025))
 
 CYCLE_TIMING = _packet(

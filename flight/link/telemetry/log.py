@@ -161,7 +161,7 @@ class SegmentStore:
         path = self._folder / f"{self._stem}-{self._number + 1:04d}{SUFFIX}"
         try:
             self._file = self._opener(path)
-        except FileExistsError:  # a failing disk has kept the file of an earlier attempt
+        except FileExistsError:  # a failed attempt left this file, and it could not be removed
             self._number += 1
             raise
         self._path = path
@@ -240,7 +240,7 @@ MOST_RUNS = 1000
 """Maximum number of runs, which limits the runs of a flight computer that crashes at every start."""
 
 LEAST_FREE_BYTES = 256 << 20
-"""Free disk space (bytes) that the runs of an archive leave, enough for the largest update in orbit."""
+"""Disk space (bytes) that the runs of an archive leave free, enough for the largest update in orbit."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EUCLEAN, errno.EBADMSG})
 """Error numbers (errno) of a full, failing or damaged disk. Any other error number means that the path of the
@@ -265,9 +265,9 @@ def find_runs(archive: Path) -> list[Path]:
 def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
     """Create the folder of the next run, and delete old runs to make room for the new run.
 
-    All runs have at most `budget_bytes` bytes, and the new run at most `coming_bytes`. Only run folders are
-    deleted. A full or failing disk raises no error here, because the log reports the failure. Raises
-    UsageError if the budget is smaller than the new run or if the path is wrong.
+    All runs together have at most `budget_bytes` bytes, and the new run has at most `coming_bytes`. Only run
+    folders are deleted. A full or failing disk raises no error here, because the log reports the failure.
+    Raises UsageError if the budget is smaller than the new run or if the path is wrong.
     """
     if coming_bytes > budget_bytes:
         raise UsageError(
@@ -309,7 +309,7 @@ def _drop(run: Path) -> None:
 
 
 def _numbered(archive: Path) -> list[tuple[int, Path]]:
-    """Return the run numbers and paths of all files and folders with the name of a run, in order.
+    """Return the run numbers and paths of all files and folders with the name of a run, sorted by number.
 
     The list is empty if the disk is failing or damaged.
     """
@@ -421,7 +421,7 @@ class FlightLog:
 
     @property
     def lost(self) -> int:
-        """Number of packets passed to `write` that were lost, or may be lost because a sync failed."""
+        """Number of packets passed to `write` that are lost, or possibly lost because a sync failed."""
         doubtful = self._store.doubtful if self._store is not None else 0
         return self._refused + self._unwritten + doubtful
 

@@ -29,8 +29,8 @@ from flight.link.telemetry.definitions import PACKETS, Field, Packet
 from knightcube.errors import KnightCubeError
 
 PacketArray = Any
-"""Structured array (n,) with a column for each field of a packet. numpy's type of a structured array does not
-contain the types of its columns; with `Any`, mypy needs a third less time for the repository."""
+"""Structured array (n,) with a column for each field of a packet. The type is `Any`, because numpy's types do
+not describe the columns, and because mypy then needs a third less time for the repository."""
 
 HEADER_BYTES = 6
 SECONDARY_BYTES = 9
