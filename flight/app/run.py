@@ -42,8 +42,8 @@ class RunResult:
 
     The attribute `ending` is the state of the loop at the end of the flight. The text `restart` states why
     the process should be restarted; it is empty if no restart is needed. The attribute `faults` contains the
-    text of each injected fault. The attribute `devices_late` contains how many events of the simulated
-    devices were late, and the largest delay (s).
+    text of each injected fault. The attribute `devices_late` contains the number of delayed events of the
+    simulated devices, and the largest delay (s).
     """
 
     folder: Path

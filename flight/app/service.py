@@ -24,10 +24,10 @@ environment variables. After a minute of flight, the release is recorded as prov
 another release was abandoned.
 
 The external supervisors of the flight are the guardian of the coils and the service manager. The loop calls
-`beat` at the end of every control cycle without an error, and `feed` while no task is stalled. A running loop
-does not prove that commands reach the coils, so heartbeats are passed to the guardian only while the job of
-the coil driver runs. With the first heartbeat, READY is reported to the service manager, because the devices
-are open and the loop runs.
+`beat` at the end of every error-free control cycle, and `feed` while no task is stalled. A running loop does
+not prove that commands reach the coils, so heartbeats are passed to the guardian only while the job of the
+coil driver runs. With the first heartbeat, READY is reported to the service manager, because the devices are
+open and the loop runs.
 
 When large memory blocks are freed, glibc raises its threshold for mapping blocks separately (mallopt(3)).
 With a raised threshold, frames are allocated on the heap, where small blocks cause fragmentation, and the
@@ -437,7 +437,7 @@ class Supervision:
         self._events.flush(self._clock.now_ns())
 
     def feed(self) -> None:
-        """Trigger the watchdog, restart the guardian if needed, and report its state changes."""
+        """Trigger the watchdog, restart the guardian if needed, and report the guardian's state changes."""
         self._overseer.feed_watchdog()
         now_ns = self._clock.now_ns()
         notes = self._notes + [(_EVENTS[news], news.value) for news in self._guardian.tend(now_ns)]

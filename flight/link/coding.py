@@ -316,7 +316,7 @@ class CltuStream:
         return found
 
     def _frame(self, coded: bytes) -> tuple[bytes, int] | None:
-        """Return the frame (b"" if invalid) and the length of valid codeblocks, or None if incomplete."""
+        """Return frame (b"" if damaged) and length of the valid codeblocks, or None if data are missing."""
         data, corrected, length = b"", 0, _BLOCK_DATA
         for end in range(_BLOCK, len(coded) + 1, _BLOCK):
             block = coded[end - _BLOCK : end]

@@ -274,7 +274,7 @@ class FrameStream:
 
         The function `length_of` returns the length (bytes) of a frame from its header of `header_bytes`
         bytes, and `decode` returns the frame in the bytes after a sync marker. A sync marker directly after a
-        valid frame may have `wrong_bits` wrong bits.
+        valid frame may have up to `wrong_bits` wrong bits.
         """
         self._length_of, self._header_bytes, self._decode = length_of, header_bytes, decode
         self._wrong_bits = wrong_bits

@@ -125,7 +125,7 @@ class Step(Section, frozen=True, kw_only=True):
 
 
 class Cage(Section, frozen=True, kw_only=True):
-    """A Helmholtz cage that reproduces the magnetic field of an orbit by UTC (`bodies.testbed.control`).
+    """A Helmholtz cage that reproduces the field of an orbit as a function of UTC (`bodies.testbed.control`).
 
     The orbit is given by the two-line elements `elements`, and `scale` is the ratio of the cage's field to
     the orbit's field. If there is a cage, `plant.field` is the weakest field that plans assume.
@@ -182,7 +182,7 @@ is flown."""
 _FIELD = 3.3e-5
 """Typical magnetic field in a low orbit, T."""
 _PRESSURE = 5.0e-6
-"""Expected pressure (Pa) by air drag and solar radiation on a face at an altitude of 500 km. The expected
+"""Expected pressure (Pa) of air drag and solar radiation on a face at an altitude of 500 km. The expected
 pressure is a tenth of the largest pressure (solar maximum, perpendicular incidence)."""
 _LARGEST_PRESSURE = 10.0
 """Ratio of the largest to the expected pressure."""

@@ -344,7 +344,7 @@ class Battery(Section, frozen=True, kw_only=True):
 
 
 class LowBattery(Section, frozen=True, kw_only=True):
-    """The states of charge below which the flight application sheds loads, in the order of the keys.
+    """The states of charge below which the flight application sheds loads.
 
     Below `low`, the coils carry at most the fraction `coil_share` of their current limits. Below `very_low`,
     the star camera takes at most one frame every `camera_period` s. Below `critical`, the mode changes to
@@ -609,7 +609,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:
-    """Return the calibrated lens of a camera, or else a pinhole with its field of view.
+    """Return the calibrated lens of a camera, or else a pinhole with the camera's field of view.
 
     Raises LensError for lens parameters outside their ranges.
     """
@@ -755,7 +755,8 @@ DRIVERS: Mapping[str, Mapping[str, str]] = {
     "solar_strings": {"ads1115": f"{__name__}:ADS1115"},
     "camera": {"v4l2": f"{__name__}:V4L2", "aravis": f"{__name__}:ARAVIS"},
 }
-"""Registrations (`module:object`) of each section by built-in name; the first name is the default."""
+"""Driver registrations (`module:object`) for each section, by built-in name; the first name is the
+default."""
 
 
 SENSOR_PARTS: Mapping[str, str] = {

@@ -264,7 +264,7 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
 
 
 def config_path(text: str) -> Path:
-    """Return the file of a command line argument, which is the name of a packaged configuration or a path.
+    """Return the file that a command line argument names: a packaged configuration or a path.
 
     For example, `step_demo` is a name, whereas `step_demo.yaml` and `./step_demo` are paths.
     """
@@ -324,8 +324,8 @@ def read_document(text: str, name: str) -> Document:
     configuration. Mappings are merged key by key; lists and scalars replace the values of the extended file.
     Error messages name the file that contains the value.
 
-    Raises ConfigError, also if files extend each other in a circle, and UnreadConfigError if an extended file
-    cannot be read.
+    Raises ConfigError, for example if files extend each other in a circle, and UnreadConfigError if an
+    extended file cannot be read.
     """
     return _extended(_read_single(text, name), ())
 
@@ -664,7 +664,7 @@ def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
 
 
 def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
-    """Return the types of `key` or `index` within the type `kind`; a union's tag has its literal type."""
+    """Return the types of `key` or `index` within the type `kind`; the tag of a struct has a literal type."""
     if isinstance(kind, inspect.StructType) and key:
         if key == kind.tag_field:
             return [inspect.LiteralType((kind.tag,))]

@@ -327,7 +327,8 @@ def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
 def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
     """Yield the dotted key, the value and the address of each device file and each I2C address in use.
 
-    Two devices must not have the same address. As devices share an I2C bus, an I2C address includes the bus.
+    Two devices must not have the same address. An I2C address includes its bus, because devices on different
+    buses may have the same address.
     """
 
     def chip(key: str, address: int, bus: int | str | None) -> tuple[str, str, str]:

@@ -136,7 +136,7 @@ that is too short."""
 
 
 class DiskTimer(Timer):
-    """Timer of the attempts to read or write a file, because a single failure may pass."""
+    """Timer of repeated attempts to read or write a file after a failed access."""
 
     def __init__(self, now_ns: int) -> None:
         super().__init__(_DISK_NS, now_ns)
@@ -639,7 +639,7 @@ class Entity:
         now_ns: int,
         unit_bytes: int = LONGEST_UNIT,
     ) -> None:
-        """Continue the stored transfers of at most `most` bytes, in PDUs of at most `unit_bytes` bytes."""
+        """Continue the stored transfers. Files have at most `most` bytes, PDUs at most `unit_bytes` bytes."""
         self.number = number
         self._segment_bytes = min(SEGMENT_BYTES, (unit_bytes - FILE_DATA_OVERHEAD) // 4 * 4)
         self._most_requests = min(MOST_REQUESTS, (unit_bytes - NAK_OVERHEAD) // REQUEST_BYTES)

@@ -385,7 +385,7 @@ class Scheduling:
         """Execute the entries of a timetable; commands to the `foreign` modes are refused."""
         self._timetable, self._foreign = timetable, foreign
         self._mode: int | None = None
-        # Texts of the newest entries that were due and their results, by SPI and counter.
+        # Command text and result of each of the newest entries that were due, by SPI and counter.
         self._past: dict[tuple[int, int], tuple[str, str]] = {}
 
     def beginning(self) -> list[Report]:

@@ -412,7 +412,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
-    """Yield the segments of a packet as packets, with times from `utc_ns` on.
+    """Yield the segments of a packet as packets, with the times `utc_ns`, `utc_ns` + 1 and so on.
 
     Raises CommandError if the packet is longer than `LONGEST_IN_PORTIONS`.
     """

@@ -461,7 +461,7 @@ class Playback:
         return reports
 
     def turn(self) -> list[Report]:
-        """Return the final report of a playback once all readable packets were sent, otherwise nothing."""
+        """Return the final report of a playback once all readable packets were sent, else an empty list."""
         if self._done is None or self._downlink.playing:
             return []
         done, self._done = self._done, None

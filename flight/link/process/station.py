@@ -732,7 +732,7 @@ class Station:
     def _execute_due(self, now_ns: int) -> None:
         """Send due scheduled commands to the control process, and report commands that are not executed.
 
-        If too many commands are due at once, the others wait for the answers to the first ones.
+        If too many commands are due at once, the later commands wait for the answers to the first ones.
         """
         waits = self._log.label and now_ns - self._begun_ns < _UTC_WAIT_NS
         if self._utc_offset_ns is None and waits:

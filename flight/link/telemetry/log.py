@@ -295,7 +295,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
 
 
 def _free(archive: Path) -> float:
-    """Return the free space (bytes) on the disk of the archive, infinity if the free space is unknown."""
+    """Return the free space (bytes) on the disk of the archive, or infinity if it is unknown."""
     try:
         disk = os.statvfs(archive)
     except OSError:
@@ -431,7 +431,7 @@ class FlightLog:
         return self._store.dropped if self._store is not None else 0
 
     def error(self) -> str:
-        """Return the present problem, or the loss of packets of a closed log, or an empty text."""
+        """Return the present problem and the number of lost packets, or an empty text without a problem."""
         problem = self._problem()
         waiting = len(self._queue)
         waits = f", {waiting} waiting" if problem and waiting else ""

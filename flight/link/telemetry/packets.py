@@ -186,8 +186,8 @@ class Packer:
 
         A text that is too long for its field is truncated between two characters, and a counter that exceeds
         its range wraps. NaN is accepted in all floating-point fields. Raises TelemetryError for a missing or
-        unknown field, a wrong array length or a value out of range; the sequence count is unchanged after an
-        error.
+        unknown field, a wrong array length or a value out of range. An error does not change the sequence
+        count.
         """
         given = fields if values is None else {**values, **fields} if fields else values
         layout = self._layouts[packet.name]
