@@ -47,7 +47,7 @@ def _position(position: ArrayLike) -> FloatArray:
     """Return geocentric positions (..., 3), m, as an array of floats.
 
     Raises ArgumentError for another shape, for positions that are not finite, and for positions deep within
-    the Earth, which are usually in km.
+    the Earth, because such positions are usually in km.
     """
     at = finite_array("position", position)
     if at.shape[-1:] != (3,):
@@ -74,7 +74,7 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
     The model is the World Magnetic Model 2025 (WMM2025) up to degree 12. A call takes 0.2 ms.
 
     Args:
-        time: UTC, or a datetime with a time zone, in the years 2025 to 2030.
+        time: datetime in UTC or with a time zone, in the years 2025 to 2030.
         position: (3,) geocentric position in ICRS axes, m.
 
     Raises:
@@ -94,7 +94,7 @@ def magnetic_field_on_ground(
     """Return the north, east and down components (3,) of the geomagnetic field, T, at geodetic coordinates.
 
     Args:
-        time: UTC, or a datetime with a time zone, in the years 2025 to 2030.
+        time: datetime in UTC or with a time zone, in the years 2025 to 2030.
         latitude: geodetic latitude, rad.
         longitude: longitude, positive towards the east, rad.
         height: height above the WGS 84 ellipsoid, m.
@@ -102,7 +102,7 @@ def magnetic_field_on_ground(
     Raises:
         GeomagneticError: for a time outside the years of the model, or a position that is not finite, beyond
             a pole, more than 12 km below the ellipsoid, or farther than ten Earth radii.
-        ArgumentError: for a longitude beyond 2 pi rad, which is usually in degrees.
+        ArgumentError: for a longitude beyond 2 pi rad; such a longitude is usually in degrees.
     """
     check_numbers(latitude=latitude, longitude=longitude, height=height)
     _check_angle("longitude", longitude)
@@ -127,7 +127,7 @@ def _check_near_earth(distance: float) -> None:
 
 
 def _check_angle(name: str, angle: float, least: float = -2.0 * math.pi, most: float = 2.0 * math.pi) -> None:
-    """Raise ArgumentError for a finite angle (rad) beyond its limits, which is usually in degrees."""
+    """Raise ArgumentError for a finite angle (rad) beyond its limits; such an angle is usually in degrees."""
     if math.isfinite(angle) and not least <= angle <= most:
         raise ArgumentError(
             name, f"{angle:g}: give {least:.4g} to {most:.4g} rad; math.radians converts degrees"
@@ -156,7 +156,7 @@ def sun_direction(
     The Sun's position is computed by VSOP2000. Parallax and aberration due to the observer are included.
 
     Args:
-        time: UTC, or a datetime with a time zone.
+        time: datetime in UTC or with a time zone.
         position: (3,) geocentric position of the observer in ICRS axes, m; by default the Earth's centre.
         velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
 
@@ -176,7 +176,7 @@ def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conic
     The Earth is modelled as a sphere with its equatorial radius and without an atmosphere.
 
     Args:
-        time: UTC, or a datetime with a time zone.
+        time: datetime in UTC or with a time zone.
         position: (..., 3) geocentric positions in ICRS axes, m.
         shadow: shadow model, either "conical" with penumbra, or "cylindrical" with the values 0 and 1 only.
 
@@ -192,7 +192,7 @@ def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conic
 def _check_elements(
     semi_major_axis: float, eccentricity: float, inclination: float, angles: dict[str, float]
 ) -> None:
-    """Raise UsageError for Kepler elements that `orbit_state` refuses; `angles` are the other angles, rad."""
+    """Raise UsageError for Kepler elements that `orbit_state` rejects; `angles` are the other angles, rad."""
     sizes = {"semi_major_axis": semi_major_axis, "eccentricity": eccentricity, "inclination": inclination}
     check_numbers(**sizes, **angles)
     for name, value in (sizes | angles).items():
@@ -231,7 +231,7 @@ def orbit_state(
 
     Raises:
         UsageError: for elements that are not finite or whose orbit intersects the Earth, and for angles out
-            of range, which are usually in degrees.
+            of range; such angles are usually in degrees.
     """
     angles = {
         "ascending_node": ascending_node,

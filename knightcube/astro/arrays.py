@@ -66,7 +66,7 @@ def real_number(value: object) -> float:
 
 
 def check_numbers(**given: object) -> None:
-    """Raise ArgumentError, with the name, for an argument that is not a number."""
+    """Raise ArgumentError, with the name of the argument, unless all arguments are numbers."""
     for name, value in given.items():
         if not _is_number(value):
             raise ArgumentError(name, f"{brief(value)}: give a number")

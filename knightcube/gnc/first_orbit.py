@@ -142,7 +142,7 @@ class FirstOrbit:
     """An orbit at one time.
 
     Attributes:
-        time: s.
+        time: time of the state, s.
         state: position and velocity (6,) of the object relative to the Earth's centre, ICRS, m and m/s.
         covariance: covariance (6, 6) of the state due to errors of the directions only.
         distance: distance of the object from the observer at the time of the state, m.

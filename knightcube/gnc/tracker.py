@@ -7,9 +7,8 @@ motion model of the line-of-sight filter is therefore linear at any angular rate
 model is nonlinear. After each step the filter state is divided by the length of the position y, so that y is
 a unit vector again. The filter state is the vector form of the modified polar coordinates of Aidala and
 Hammel (1983, IEEE Transactions on Automatic Control 28). The component of the velocity z across the line of
-sight is the angular rate v. The component of the velocity z along the line of sight is s = (range rate) /
-range. Without forces, the angular acceleration of the line of sight is -2 (range rate) / range times the
-angular rate.
+sight is the angular rate v. The component along the line of sight is s = (range rate) / range. Without
+forces, the angular acceleration of the line of sight is -2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the

@@ -7,8 +7,8 @@ the order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike a computation wi
 rotation, the computation with unit vectors has no singularity. The rotation is computed by OLAE, and outliers
 are rejected by means of a robust, median-based standard deviation of the residuals. In contrast, the
 "Combined Indicator" of Sease uses the ordinary standard deviation of the residuals, which is increased by
-outliers. A single frame cannot distinguish the rate omega from -omega, so that a prior rate must determine
-the sign.
+outliers. A single frame cannot distinguish the rate omega from -omega, so the sign must be determined from a
+prior rate.
 
 The corner detectors compute the cornerness of each pixel in an image region (Sease, eq. 3.1-3.13). The Harris
 response and the structure tensor are computed by `knightcube.vision.objects.streak_ends`. The detector of
@@ -77,7 +77,7 @@ from knightcube.vision.startracker.solve import (
 from knightcube.vision.startracker.survey import FrameKind
 from knightcube.vision.streaks.streak_result import StreakStatus, admit, in_time, validate
 
-# Number of the strongest streaks, from whose pairs possible rotation axes are computed.
+# Number of the strongest streaks. Each pair of these streaks gives a candidate of the rotation axis.
 _MOST_PROPOSERS = 24
 _PARALLEL = 1e-12
 # Minimum fraction of the measured streaks that must agree with the rotation.
@@ -103,7 +103,8 @@ def estimate_rate(
         pinhole: model of the camera.
         exposure: exposure time, s.
         settings: settings of the estimation.
-        prior_rate: (3,) prior rate in camera axes, rad/s, for the sense of rotation only, or None.
+        prior_rate: (3,) prior rate in camera axes, rad/s, which determines only the sense of rotation, or
+            None.
         prior_sigma: standard deviation of each component of the prior rate, rad/s.
         previous_checksum: checksum of the previous frame, by which a frozen camera is detected, or None.
 
@@ -218,7 +219,8 @@ class RotationFit:
         covariance: (3, 3) covariance of the rotation vector, rad^2.
         endpoints: (n, 2, 2) end positions, corrected for bias and consistently ordered, px.
         used: (n,) whether each streak is used in the fit of the rotation.
-        residual: RMS error of a streak end from the residuals of the used streaks (Sease, eq. 4.7), rad.
+        residual: RMS error of a streak end, rad, computed from the residuals of the used streaks (Sease, eq.
+            4.7).
     """
 
     rotation_vector: FloatArray
@@ -269,7 +271,7 @@ def fit_rotation(
 def _consensus(
     endpoints: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Return flags (n,) of streaks with reversed ends, and of streaks that agree with a common rotation."""
+    """Return flags (n,) of the streaks with reversed ends, and flags (n,) of the streaks that agree."""
     vectors = pinhole.unit_vectors(endpoints)
     length = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1)
     allowed = np.maximum(settings.axis_tolerance, settings.outlier_sigmas * sigma)
@@ -358,7 +360,7 @@ _DIAMETERS = {4: ((1, 0), (0, 1)), 8: ((1, 0), (1, 1), (0, 1), (-1, 1))}
 
 
 def cornerness(image: FloatArray, settings: EndpointSettings) -> FloatArray:
-    """Return the response (rows, columns) of the corner detector selected in a `StreakSettings` object."""
+    """Return the response (rows, columns) of the corner detector that `settings` selects."""
     assert isinstance(settings, StreakSettings)
     if settings.detector == "harris":
         return harris_cornerness(image, settings)

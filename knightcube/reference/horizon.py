@@ -19,8 +19,8 @@ contains the body's z axis and intersects the horizon plane in a line. The lines
 point Z on the z axis. The vector from Z to the centre of the horizon circle gives the angle between the z
 axis and nadir. Meller et al. do not state the image scale (px/km). In this implementation, the image scale is
 the distance of the circle's centre below the optical axis (px), divided by the distance of the horizon plane
-below the satellite (km). For a horizontal optical axis, this is exact if the camera is tilted about this
-axis, and correct to first order for other tilts.
+below the satellite (km). This scale is exact if the optical axis is horizontal, even if the camera is rolled
+about this axis, and correct to first order for other tilts.
 
 Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from direction Q to
 direction P, the shortest rotation from Q to P rotates the old nadir direction to the new nadir direction. A

@@ -54,7 +54,7 @@ class KnownAttitude:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation per axis (rad): the root of the mean variance over the axes."""
+        """Standard deviation per axis (rad): the root of the mean of the variances of the three axes."""
         return float(np.sqrt(np.trace(self.covariance) / 3.0))
 
 

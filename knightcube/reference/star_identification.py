@@ -438,7 +438,7 @@ def _triangle_matches(
     found: TriangleShape,
     tolerance: float,
 ) -> Candidates:
-    """Return the guide star triangles in a table that match observed triangles (t, 3)."""
+    """Return the triangles of guide stars in `table` that match observed `triangles` (t, 3)."""
     # The area of a triangle is proportional to scale^2, and the polar moment to scale^4.
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
     # The limits are widened by the rounding error of the float32 values in the table.
@@ -600,7 +600,8 @@ def identify_by_rate(
     """Return the identification of a star field by rate matching.
 
     Without the `motion` of the observed points, all points are treated as stars and the attitude as constant.
-    Raises FieldUnknown for a too uncertain scale, and ValueError if `motion` and `field` differ in length.
+    Raises FieldUnknown if the scale is too uncertain, and ValueError if `motion` and `field` differ in
+    length.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)

@@ -79,7 +79,7 @@ from knightcube.astro.quaternion import (
 
 _MAXIMUM_STEPS = 100
 _MINIMUM_SLOPE = 1e-13
-"""Minimum product of the differences between the largest and the three other eigenvalues of Davenport's K.
+"""Minimum product of the three differences between the largest and another eigenvalue of Davenport's K.
 
 In a narrow field of view, two of the three eigenvalue differences are of the order of one.
 """

@@ -148,7 +148,8 @@ Between two nodes the field rotates by 8 deg, and the linearly interpolated fiel
 NODES_PER_CALL = 5
 """Maximum number of nodes that one call adds to the field prediction."""
 LARGEST_JUMP = 50e3
-"""Change (m) of the satellite's position above which all nodes are discarded, as after a clock error."""
+"""Change (m) of the satellite's position above which all nodes are discarded, for example after a clock
+error."""
 
 
 def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) -> FloatArray:
@@ -188,7 +189,7 @@ class FieldAhead:
         self._fields: list[FloatArray] = []
 
     def along(self, state: OrbitState, times: FloatArray) -> FloatArray:
-        """Return the geomagnetic field (n, 3) in ICRS axes, T, at increasing times (n,) after `state`, s."""
+        """Return the geomagnetic field (n, 3), ICRS axes, T, at increasing times (n,) since `state`, s."""
         since = self._restart(state)
         last = since + float(times[-1])
         for _ in range(NODES_PER_CALL):

@@ -40,7 +40,8 @@ circular orbit. The fit adds 1 to each component of the eccentricity vector, so 
 is also an absolute step of 1e-6.
 """
 _SOON = 10.0
-"""Time (s) after the first state at which a second position is extrapolated from its velocity."""
+"""Time (s) after the first state for which a second position is extrapolated with the velocity of this
+state."""
 _PARAMETER = 1e-9 * GRAVITATIONAL_PARAMETER
 """Gravitational parameter, km^3/s^2."""
 _FAILED = 1e6
@@ -129,7 +130,7 @@ class _Fit:
         self._scale = np.repeat([1.0, _VELOCITY_TIME], 3)[: states.shape[1]]
 
     def first_guess(self) -> FloatArray:
-        """Return the parameters of a nearly circular orbit through the first state or two positions."""
+        """Return the parameters of a nearly circular orbit through the first state or first two positions."""
         first, second = self._measured[0], self._measured[1]
         if len(first) == 6:
             soon = first[:3] + _SOON * first[3:]
@@ -179,7 +180,7 @@ def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) 
 
 
 def _first_guess(positions: FloatArray) -> FloatArray:
-    """Return the parameters of a nearly circular orbit through the first of the positions (n, 3), km."""
+    """Return the parameters of a nearly circular orbit through the first two of the positions (n, 3), km."""
     normal = np.cross(positions[0], positions[1])
     length = float(np.linalg.norm(normal))
     if length <= 1e-6 * float(positions[0] @ positions[0]):

@@ -122,7 +122,8 @@ class GpsFix:
             raise OrbitError(f"the last fix is {age:.0f} s old: fixes are used for {self.longest_age:g} s")
         state = _measured(self)
         later = propagated(state, age) if age else state
-        # In orbit, an along-track velocity error causes a position error three times that in free space.
+        # In orbit, an along-track velocity error causes a position error three times as large as in free
+        # space.
         sigma = math.hypot(self.sigma, 3.0 * age * self.velocity_sigma)
         return OrbitState(julian_date, later[:3], later[3:], sigma)
 

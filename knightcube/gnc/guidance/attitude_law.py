@@ -4,7 +4,7 @@ An attitude law aligns one body axis exactly with a first direction, and a secon
 direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, be nadir, the
 velocity or the orbit normal, or point to the Sun or to a point on the ground.
 
-The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
+The law of a pointing target aligns the pointing axis with the direction of the target, and the body axis
 `across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
 the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
 If the roll is free, the body keeps its roll angle at the time at which the attitude law begins. The free roll
@@ -73,14 +73,14 @@ class AttitudeReferences:
     acceleration: FloatArray
 
     def position(self, time: float) -> tuple[int, float]:
-        """Return the index of the last instant before a time, s, and the elapsed fraction of the step."""
+        """Return the index of the last instant before `time`, s, and the fraction of the step since then."""
         begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
         position = (time - begin) / step
         k = min(max(math.floor(position), 0), len(self.times) - 2)
         return k, min(max(position - k, 0.0), 1.0)
 
     def at(self, time: float) -> AttitudeReference:
-        """Return the commanded motion at a time, s, which is clamped to the range of the given times."""
+        """Return the commanded motion at `time`, s; times outside the range are clamped to its ends."""
         k, share = self.position(time)
         near = k + round(share)
         since = (share - round(share)) * float(self.times[1] - self.times[0])

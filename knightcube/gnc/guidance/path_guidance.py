@@ -162,7 +162,7 @@ class PathGuidance:
         return self._sampled[2]
 
     def state(self, now_ns: int) -> GuidanceState:
-        """Return whether a path is being followed or its end attitude is held at `now_ns`."""
+        """Return the kind of the commanded motion at `now_ns`."""
         if self._path is None:
             return GuidanceState.NONE
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING

@@ -68,12 +68,12 @@ class SingleAxisPlant:
     """The parameters of the equation of motion about the suspension thread.
 
     Attributes:
-        inertia: J, kg m^2.
+        inertia: moment of inertia J, kg m^2.
         torque_constant: torque per current of the coil at theta = 0 (n A B), N m/A.
         resistance: resistance of the coil, ohm.
         current_limit: largest absolute value of the coil current, A.
         stiffness: torsional stiffness k of the thread, N m/rad.
-        damping: c, N m s/rad.
+        damping: damping c, N m s/rad.
         disturbance: estimated constant angular acceleration d in addition to the modelled torques, rad/s^2.
     """
 

@@ -14,7 +14,7 @@ from enum import IntEnum
 from knightcube.astro.arrays import brief, check_numbers
 from knightcube.errors import UsageError
 
-_ROUNDING = 1e-9  # error (rad) of an angle that was converted between degrees and radians
+_ROUNDING = 1e-9  # largest rounding error (rad) of an angle that was converted from degrees
 _LENGTH = 1e-3
 """Largest accepted difference between the length of a commanded quaternion and one."""
 

@@ -48,7 +48,7 @@ _AXES = np.arange(3)
 
 
 def heat_matrix(weights: FloatArray) -> FloatArray:
-    """Return the matrix (3, 3) of heating powers, which are given as a matrix or as its diagonal (3,)."""
+    """Return heating powers, given as a matrix (3, 3) or its diagonal (3,), as a matrix (3, 3)."""
     return np.diag(weights) if weights.ndim == 1 else weights
 
 
@@ -66,7 +66,7 @@ class SlewCraft:
     """The satellite as modelled by the slew planner, in body axes.
 
     Attributes:
-        inertia: (3, 3) kg m^2.
+        inertia: inertia tensor (3, 3), kg m^2.
         limit: dipole limit (3,) along each body axis, A m^2.
         weights: heating power per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         residual: residual dipole moment (3,) of the satellite, A m^2.
@@ -142,7 +142,7 @@ class SlewDynamics:
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
-        """Store the environment, with the position direction scaled by the root of the gravity gradient."""
+        """Store the environment. The position direction is multiplied by the root of the gravity gradient."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
         vectors = np.stack(

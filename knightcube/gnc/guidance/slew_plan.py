@@ -656,7 +656,7 @@ def plan_slew(
         dipole_limit: dipole limits (3,) of the coils along the body axes, A m^2.
         heat: heating power of the coils per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         elements: two lines of the two-line element set of the orbit, with an epoch near `time`.
-        time: UTC at the start of the slew or of the window, or a datetime with a time zone.
+        time: datetime of the start of the slew or of the window, in UTC or with a time zone.
         start: pointing target that is held until the slew begins, with a roll of zero if its roll is free.
         goal: pointing target at the end; if its roll is free, only the direction is an end condition.
         duration: requested duration of the slew, s.
@@ -676,7 +676,7 @@ def plan_slew(
 
     Raises:
         UsageError: if an argument is invalid; the message gives the argument, its value and the remedy.
-        PlanningError: if no slew is found, or if a duration or limit is out of range; a kind of UsageError.
+        PlanningError: if no slew is found, or if a duration or limit is out of range.
         OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
         GeomagneticError: if the slew is outside the years 2025 to 2030 of the magnetic field model.
     """

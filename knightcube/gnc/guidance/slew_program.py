@@ -176,7 +176,8 @@ class LinearisedEquations:
         between: residuals (k, 14) of the collocation equations on k intervals.
         begun: residuals (7,) of the start conditions, which fix the state at the start.
         ended: residuals (ends,) of the end conditions: attitude and rate errors at the end of the slew.
-        jacobian: derivatives (k, 14, WIDE) of the collocation equations by the unknowns of each interval.
+        jacobian: derivatives (k, 14, WIDE) of the collocation equations of each interval with respect to its
+            unknowns.
         ending: derivatives (ends, 7) of the end conditions with respect to the state at the end.
     """
 

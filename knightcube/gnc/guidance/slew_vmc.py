@@ -14,9 +14,9 @@ solution violated one of them. When the dipole limit is reached, the planner doe
 component by adding a dipole moment along the field.
 
 The initial guesses are the smooth rotation about the eigenaxis and the guesses of `slew_search`. The module
-`slew_plan` corrects and integrates a solution in the same way as a path found by collocation, but the
-optimiser of the collocation is not used. Modified Rodrigues parameters are described by Schaub and Junkins,
-Analytical Mechanics of Space Systems, chapter 3.
+`slew_plan` corrects and integrates a solution like a path found by collocation. The optimiser of the
+collocation is not used. Modified Rodrigues parameters are described by Schaub and Junkins, Analytical
+Mechanics of Space Systems, chapter 3.
 """
 
 from __future__ import annotations

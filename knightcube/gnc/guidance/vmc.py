@@ -285,8 +285,8 @@ class StepPlan:
         target_q2: q2 at the end.
         nu: path control parameters (N,) of virtual motion camouflage, relative to the initial guess (prey
             path) of the duration `horizon`.
-        node_times: (N,) s.
-        node_q2: (N,).
+        node_times: times of the nodes (N,), s.
+        node_q2: values q2 on the nodes (N,).
     """
 
     path: PolynomialPath

@@ -68,8 +68,9 @@ class Discretisation:
 
     Attributes:
         rule: the N nodes.
-        cost: evaluation matrices on the 2 N nodes on which the energy is integrated. With N nodes, the
-            optimiser would exploit the quadrature error, because I^2 has about twice the path's degree.
+        cost: evaluation matrices on the 2 N nodes on which the energy is integrated. The quadrature error of
+            N nodes would be large, because I^2 has about twice the degree of the path, and the optimiser
+            would exploit it.
         cost_weights: quadrature weights (2 N,) of the energy, whose sum is 2.
         dense: evaluation matrices at the points at which limits are checked; like the extrema of polynomials,
             the points are denser towards the ends.
