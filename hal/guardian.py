@@ -281,7 +281,7 @@ class GuardianLine:
         if self._lost and now_ns >= self._retry_ns:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
-            # The killed guardian may end later.
+            # The killed guardian has possibly not ended yet.
             self._process.kill()
             self._ended.append(self._process)
             self._line.close()
@@ -329,8 +329,8 @@ class GuardianLine:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Signals to the flight's process group must not reach the guardian.
-                # The kernel continues a stopped guardian when its parent dies.
+                # Signals to the flight's process group must not reach the guardian. When the flight process
+                # dies, the kernel continues a guardian that a signal had stopped.
                 process_group=0,
             )
         except OSError as error:

@@ -7,8 +7,8 @@ A call on an I2C bus waits until the previous transaction has ended. A transacti
 of the I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES
 0), so that the drivers count each failure. An advisory lock on the device file reserves the bus for one
 flight process. The kernel releases the lock when the process ends. A failed transaction does not release the
-lock, unless the adapter was unplugged. The guardian and `deploy/coils-off` ignore the lock, because they may
-switch the coils off at any time.
+lock, unless the adapter was unplugged. The guardian and `deploy/coils-off` ignore the lock, because they must
+be able to switch the coils off at any time.
 """
 
 from __future__ import annotations
@@ -340,8 +340,8 @@ class LinuxI2cBus:
     def _is_current(self) -> bool:
         """Return whether the open file is still the device file of the bus.
 
-        The kernel removes the device file when the adapter is unplugged, and waits for the closing of open
-        files before the adapter can be used again.
+        The kernel removes the device file when the adapter is unplugged. The adapter can be used again only
+        after all open files of the bus have been closed.
         """
         if self._bus is None or self._bus.fd is None:
             return False

@@ -42,7 +42,7 @@ FAKE_PREFIX = "Fake"
 # GigE Vision numbers frames from 1 to 65,535 cyclically; USB3 Vision uses 64-bit numbers.
 _FRAME_IDS = (1 << 16) - 1
 _MICROSECOND_NS = 1_000
-# Largest difference between the set gain and the camera's gain, which has steps, relative to its range.
+# Largest accepted difference between requested and actual gain, relative to the range of gains.
 _GAIN_TOLERANCE = 0.01
 
 

@@ -18,9 +18,10 @@ drive current through the coil, so the job brakes this bridge (both inputs high)
 
 Instead of a PWM chip with H-bridges, DRV8830 bridges (TI SLVSAB2) with an I2C interface and a regulated
 output voltage can drive the coils, one bridge for each coil. The output voltage has 58 steps of 0.08 V, and
-no values between zero and 0.48 V. To produce voltages between the steps on average, a periodic job writes the
-step nearest to the sum of requested voltage and accumulated error. The DRV8830 bridges have the interface of
-a PWM chip, so that `PwmTorqueCoils` performs retries, checks and braking.
+no values between zero and 0.48 V. A periodic job alternates between steps so that the mean voltage is the
+requested voltage: it writes the step nearest to the sum of the requested voltage and the accumulated error.
+The DRV8830 bridges have the interface of a PWM chip, so that `PwmTorqueCoils` performs retries, checks and
+braking.
 """
 
 from __future__ import annotations
@@ -433,7 +434,7 @@ class PwmTorqueCoils:
         self._outputs = CoilOutputs(pca, clock, settings, self._mailbox.lock)
         self._running = False
         self._ticker: Ticker | None = None
-        # The lock is re-entrant, because a signal handler may request zero while its thread holds it.
+        # The lock is re-entrant, because a signal handler may request zero while its thread holds the lock.
         self._wire = threading.RLock()
         self._serving = False
         self._served = -1  # number of the last written request

@@ -12,7 +12,7 @@ voltage is amplified; the output voltage per current is `volt_per_ampere`. A per
 conversion of one channel and starts the conversion of the next channel, on all converters at once. No call
 waits for a conversion, because a conversion takes 7.8 ms and the job runs at intervals of at least 10 ms. A
 current outside the measuring range is reported as the limit of the range, and the text `error` names the
-string of solar cells.
+affected string.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _Reading = TypeVar("_Reading")
 
 
 class PolledMonitor(Generic[_Reading]):
-    """Monitor on an I2C bus that a periodic job of a subclass reads; the lock protects reading and error."""
+    """Monitor on an I2C bus, read by a periodic job of a subclass; the lock protects reading and error."""
 
     _ticker: Ticker
 

@@ -95,7 +95,7 @@ class Pvt:
         valid: validity bits of date and time.
         fix: type of the fix.
         flags: status bits of the fix.
-        satellites: number of GPS satellites used in the solution.
+        satellites: number of satellites used in the solution.
         longitude, latitude: geodetic longitude and latitude, 1e-7 deg.
         height: height above the WGS 84 ellipsoid, mm.
         horizontal, vertical: horizontal and vertical accuracy of the position, mm.
@@ -647,7 +647,7 @@ class NmeaReceiver:
         """
         self._port, self._clock, self._earliest_ns = port, clock, earliest_ns
         self._buffer = b""
-        self._halves: dict[str, tuple[int, list[str]]] = {}  # time (ns) of the first byte, and fields
+        self._halves: dict[str, tuple[int, list[str]]] = {}  # by name: time (ns) of the first byte, fields
         self._height: tuple[float, float] | None = None  # seconds of the day and altitude (m) of the last fix
         self._bytes = self._sentences = self._bad = self._discarded = 0
         self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0

@@ -24,7 +24,7 @@ FULL = 0x10  # bit 4 of an ON_H or OFF_H register: output on or off for the whol
 GENERAL_CALL = 0x00
 """General call address, to which all chips on a bus respond."""
 SOFTWARE_RESET = 0x06
-"""Byte sent to the general call address that resets all chips (NXP data sheet, section 7.6)."""
+"""Byte that resets all chips if it is sent to the general call address (NXP data sheet, section 7.6)."""
 
 CHANNELS = 16
 COUNTS = 4096

@@ -35,7 +35,7 @@ TESLA_PER_UNIT = 1e-6
 _FAILURES = 3
 """Number of consecutive failures after which the sensors are started again."""
 _ALIKE = 10
-"""Largest accepted number of consecutive equal samples; a working sensor has noise."""
+"""Number of repetitions of a sample after which it counts as stuck; a working sensor has noise."""
 _STUCK_S, _AGAIN_S = 3, 60
 """Time (s) of equal values after which the sensors are started again, and interval of further starts."""
 LARGEST_RATE = math.radians(2000.0)
@@ -287,7 +287,7 @@ class CheckedUnit:
         return [checked for reading in self._unit.poll() if (checked := self._checked(reading)) is not None]
 
     def link(self) -> ImuLink:
-        """Return the counters of the unit, which include the readings that were rejected here."""
+        """Return the counters of the unit, plus the readings that this class has rejected."""
         link = self._unit.link()
         return link._replace(
             out_of_range=link.out_of_range + self._out_of_range,

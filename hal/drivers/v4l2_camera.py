@@ -227,7 +227,7 @@ class Filled:
 
 
 class VideoDevice:
-    """Open video device /dev/videoN with its frame buffers."""
+    """An opened video device /dev/videoN and its frame buffers."""
 
     def __init__(self, path: str) -> None:
         """Open the device. Raises OSError."""
@@ -548,7 +548,7 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
         if known is not None:
             if not known[0] <= gain <= known[1]:
                 raise OutOfRange(settings.path, "gain", gain, *known, "")
-            # Many cameras round the gain to their steps.
+            # Many cameras round a requested gain to their nearest gain step.
             tolerance = max(1, (known[1] - known[0]) // _GAIN_STEPS)
             set_checked(device, settings.path, "gain", control, gain, tolerance)
             return

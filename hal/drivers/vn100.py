@@ -58,7 +58,7 @@ class Vn100Settings(UnitSettings):
     """Settings of the VN-100 driver.
 
     For binary packets, `rate_hz` must divide 800; for ASCII lines, register 7 must permit the rate. The
-    largest accepted field is 6 gauss for the testbed's unit, and 2.5 gauss for current units.
+    largest accepted field is 6 gauss for the testbed's unit, and 2.5 gauss for newer units.
 
     Attributes:
         attitude_map: (4, 4) matrix that maps the unit's quaternion (NED into sensor frame) to the project's

@@ -14,7 +14,7 @@ checksum. The remark on polynomial 0x07 in section 4.2 of the manual is wrong.
 an invalid candidate. The computing time and memory of `StreamParser` are limited by the length of the longest
 possible packet.
 
-The length of packets with unknown fields, for example of satellite navigation or firmware 3, is unknown.
+Packets with unknown fields, such as those of satellite navigation or of firmware 3, have an unknown length.
 `StreamParser` counts a packet with unknown fields if the bytes up to the next packet with the same header
 have a valid CRC. A packet with unknown fields shows that the baud rate is correct.
 """

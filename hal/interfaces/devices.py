@@ -96,7 +96,7 @@ class GpsReading:
         velocity: (3,) velocity with respect to the ground, in ITRS axes, m/s.
         sigma: reported standard deviation of the position per axis, m, or NaN if unknown.
         velocity_sigma: reported standard deviation of the velocity per axis, m/s, or NaN if unknown.
-        satellites: number of GPS satellites used in the solution.
+        satellites: number of satellites used in the solution.
         valid: whether the receiver reports time, leap seconds and position as valid.
         rolled_over: whether the date was moved by 1024 weeks, the period of the receiver's week number.
     """

@@ -134,7 +134,7 @@ class SpiDevice(Protocol):
 
 
 class Wires(Protocol):
-    """Connections to the devices, opened by name: those of the board, or emulated connections.
+    """Connections to real or emulated devices, opened by name.
 
     A second request for a connection returns the open connection, and all connections are closed at the end
     of the flight.
@@ -160,13 +160,13 @@ class HostFaults(Protocol):
         """Return copies of the worker specifications whose functions fail during simulated faults."""
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
-        """Return a wrapper of the job runner `runner` that can fail.
+        """Return a job runner that wraps `runner` and fails during simulated faults.
 
         The function `result` creates a job result.
         """
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
-        """Return a wrapper of the file opener `opener` that can fail like a faulty disk."""
+        """Return a file opener that wraps `opener` and fails like a faulty disk during simulated faults."""
 
 
 @dataclass(frozen=True, slots=True)
