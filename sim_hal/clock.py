@@ -1,9 +1,9 @@
 """Simulated time: the clock, the scheduling of emulated devices, and a queue of timed actions.
 
-A sleep on the simulated clock advances the world to the deadline and returns at once. Periodic jobs (tickers)
-that are due run one after the other, in the order in which they were created, so that a repeated flight is
-identical to the bit. A job that sleeps, such as a driver that waits for its chip, advances the world, but
-other periodic jobs do not run during this sleep.
+A sleep on the simulated clock advances the world to the deadline and returns at once. All due periodic jobs
+(tickers) are run one after the other, in the order of their creation, so that a repeated flight is identical
+to the bit. A job that sleeps, such as a driver that waits for its chip, advances the world, but other
+periodic jobs do not run during this sleep.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ class TimedWorld(Protocol):
 class SimClock:
     """A Clock of simulated time, which jumps to each deadline without waiting.
 
-    The clock begins at the time `start_ns`, and `utc_start_ns` is the UTC at the time 0. The list `tickers`
-    contains the periodic jobs in the order of their creation.
+    The clock begins at the time `start_ns`, and `utc_start_ns` is the UTC (ns since 1970) at the time 0. The
+    list `tickers` contains the periodic jobs in the order of their creation.
     """
 
     def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:

@@ -29,8 +29,8 @@ class DescriptionErrors:
     Attributes:
         moments: ratios (3,) of the true to the configured principal moments of inertia.
         axes: rotation vector (3,) from the configured to the true principal axes, rad, body axes.
-        coils: true dipole of each coil divided by the magnitude of its configured dipole, as columns of a
-            matrix (3, 3 g) for g groups of three coils. The columns are vectors in the coil axes from
+        coils: matrix (3, 3 g) for g groups of three coils. Each column is the true dipole of a coil divided
+            by the magnitude of its configured dipole, in the coil axes of
             `sim_hal.worlds.free_body.coil_frames`.
         gyro: matrix (3, 3) from the true rate to the rate that the gyro measures, without the gyro's bias.
         field: matrix (3, 3) from the true to the measured magnetic field, without the magnetometer's bias.

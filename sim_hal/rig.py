@@ -322,7 +322,7 @@ class LockStep:
 
 
 def utc_ns(label: str) -> int:
-    """Return the time since 1970 (ns) of an ISO 8601 time, as `utc_seconds` does. Raises ConfigError."""
+    """Return the time since 1970 (ns) of an ISO 8601 time. Raises ConfigError as `utc_seconds` does."""
     return round(utc_seconds(label)) * 1_000_000_000
 
 

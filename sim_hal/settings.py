@@ -45,8 +45,8 @@ class OrbitSection(Section, frozen=True, kw_only=True):
 
     `altitude` (m) is the semi-major axis minus the Earth's radius. The perigee must be higher than 150 km.
 
-    `local_time`, the local time of the ascending node by the true Sun, h, overrides `ascending_node_deg`.
-    It differs from the mean local time by up to 18 min.
+    `local_time` (h), the true local solar time of the ascending node, overrides `ascending_node_deg`. True
+    and mean local solar time differ by up to 18 min.
     """
 
     altitude: Annotated[float, Meta(ge=200e3, le=2_000e3)] = 500e3

@@ -1,10 +1,10 @@
 """Emulated GPS receivers on a serial line, with the errors of a receiver in orbit: u-blox and NMEA 0183.
 
 The u-blox receiver starts without a configuration and sends NMEA sentences until a message enables NAV-PVT.
-Without a dynamic model for high speeds it has no fix in orbit.
-Fixes are computed at UTC times that are multiples of the period, and their frames are sent `latency` s later.
-The position error is a random walk (ionosphere, ephemerides) plus white noise, and the velocity error is
-white noise. The NMEA receiver sends its sentences without being configured and ignores commands.
+In orbit it has no fix until the dynamic model for high speeds is selected. Fixes are computed at UTC times
+that are multiples of the period, and their frames are sent `latency` s later. The position error is a random
+walk (ionosphere, ephemerides) plus white noise, and the velocity error is white noise. The NMEA receiver
+sends its sentences without being configured and ignores commands.
 """
 
 from __future__ import annotations

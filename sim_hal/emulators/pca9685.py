@@ -76,7 +76,7 @@ class EmulatedPca9685:
         self._now_ns = now_ns
         self._registers = bytearray()
         self._addresses: set[int] = set()
-        self._high: dict[int, tuple[int, int]] = {}  # results of `high` for the present registers
+        self._high: dict[int, tuple[int, int]] = {}  # cached results of `high` for the present registers
         self._halted = 0  # bit mask of channels that sleep mode has stopped until RESTART or a new write
         self._power_on()
 

@@ -300,7 +300,7 @@ def _irradiance(
         rays: directions (m, 3) to ground points in the axes of `local`.
         ground: unit verticals (m, 3) at the ground points.
         reflected: intensity of the light from each ground point if the Sun is at the zenith there.
-        grazing: cosine of the incidence angle beyond which part of the light is reflected.
+        grazing: cosine of the incidence angle below which part of the light is reflected.
     """
     count = len(normals)
     used, turned = np.zeros(count), normals @ local.T
@@ -319,7 +319,7 @@ def _irradiance(
 
 @loop_helper
 def _used(cosine: float, grazing: float) -> float:
-    """Return the fraction of the light that a cell uses at the cosine of an incidence angle."""
+    """Return the fraction of the light that a cell uses, given the cosine of the incidence angle."""
     lit = max(cosine, 0.0)
     return lit * lit / grazing if lit < grazing else lit
 

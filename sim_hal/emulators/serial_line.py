@@ -72,7 +72,7 @@ class _Message:
 
 
 class Wire:
-    """One direction of a serial line; its faults may be replaced. If the buffers are full, bytes are lost."""
+    """One direction of a serial line, with its present faults. If the buffers are full, bytes are lost."""
 
     def __init__(self, rng: np.random.Generator, capacity: int = 6144) -> None:
         """Create the wire with a random generator for faults.

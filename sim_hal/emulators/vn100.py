@@ -606,7 +606,7 @@ class Vn100Emulator:
         self._build_streams(now_ns)
 
     def save_foreign_output(self, packet: bytes, divisor: int, now_ns: int) -> None:
-        """Store an output of a different firmware version in flash, and restart the unit from flash.
+        """Store in flash an output that only other firmware versions have, and restart the unit from flash.
 
         The unit sends `packet` every `divisor` ticks of 1/800 s, also after later restarts.
         """

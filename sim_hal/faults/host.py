@@ -102,11 +102,11 @@ class ProcessFaults:
         return cast("Clock", _SteppedClock(self._clock, self)) if self.concerns("clock") else self._clock
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
-        """Return a function that opens log files on a simulated disk that may fail."""
+        """Return a file opener that wraps `opener` and fails like a faulty disk during simulated faults."""
         return (lambda path: _FailingFile(opener, path, self)) if self.concerns("disk") else opener
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return worker specifications whose functions may fail."""
+        """Return copies of the worker specifications whose functions fail during simulated faults."""
         if not self.concerns("planner", "vision"):
             return list(specs)
         return [dataclasses.replace(spec, function=perform) for spec in specs]

@@ -174,7 +174,7 @@ _SECTIONS = {
     "wide": "wide_cameras",
     **dict.fromkeys(("battery", "battery-monitor", "bus-monitor", "panels"), "power"),
 }
-"""Configuration section of each device that may be absent."""
+"""Configuration section of each optional device."""
 _EMULATED = {
     "imu": ("inertial_unit", "vn100"),
     "magnetometer": ("inertial_unit", "vn100"),
@@ -183,7 +183,7 @@ _EMULATED = {
     "strings": ("solar_strings", "ads1115"),
     **dict.fromkeys(("coil", "bridge", "pwm"), ("coils", "pca9685")),
 }
-"""Section and driver that a device's faults need in the configuration, by first word of the device name."""
+"""Configuration section and driver that the faults of a device need, by first word of the device name."""
 
 
 def _rail_key(device: str) -> str:

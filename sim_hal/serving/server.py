@@ -199,7 +199,7 @@ class DeviceServer:
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
     ) -> Future[Image]:
         assert self._pool is not None
-        # The previous exposure is finished or abandoned, and rendering it now would delay the new exposure.
+        # The previous exposure is finished or abandoned; its rendering would delay the new exposure.
         if self._rendering is not None:
             self._rendering.cancel()
         self._rendering = self._pool.submit(_render, sequence, times, attitudes, tracks)

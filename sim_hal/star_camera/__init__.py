@@ -1,4 +1,4 @@
-"""Image model of the star camera: Sease 2013, chapter 2, corrected, for any motion during the exposure.
+"""Image model of the star camera for any motion during the exposure, after Sease 2013, chapter 2 (corrected).
 
     model = StarCameraModel(field_of_view=np.radians(20.0))
     stars = catalogue.load()

@@ -39,7 +39,7 @@ from knightcube.vision.camera.lens import Lens, Pinhole, streak_camera
 DEVICE = "star camera model"
 
 STEPS = 256
-"""Entries per pixel of the point spread table; its interpolation error is less than 1e-5 of the peak."""
+"""Rows per pixel of the point spread table, whose interpolation error is less than 1e-5 of the peak."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,7 +60,7 @@ _RINGS, _SPOKES = 46, 120
 
 
 def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
-    """Return whether the Earth hides each `target` (m, 3) from its `position` (m, 3), both geocentric, m."""
+    """Return whether the Earth hides `target` (m, 3) from `position` (m, 3), row by row (geocentric, m)."""
     way = target - position
     length = np.sum(way * way, axis=-1)
     nearest = np.clip(-np.sum(position * way, axis=-1) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
@@ -100,9 +100,9 @@ def source_tracks(
 
     `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks are relative to
     the time `zero`, s. An object that is in the umbra or behind the Earth during the entire exposure is
-    omitted. An object that is partly sunlit, or sunlit for part of the time, has its mean brightness over the
-    track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
-    outside the orbits, and for an object within 1 m of the camera.
+    omitted. An object that is partly sunlit, or sunlit for part of the time, is given its mean brightness
+    over the track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for
+    times outside the orbits, and for an object within 1 m of the camera.
     """
     if not start < end:
         raise OutOfRange(DEVICE, "end of the exposure", end, start, math.inf, "s")
@@ -320,10 +320,10 @@ def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
 def view(
     pinhole: Pinhole, to_camera: FloatArray, around: OrbitEnvironment, sky: SkySection
 ) -> tuple[bool, BoolArray | None]:
-    """Return whether stray light blinds the camera, and a mask (rows, columns) of the dark Earth, or None.
+    """Return whether stray light blinds the camera, and a mask (rows, columns) of the dark Earth.
 
-    `sky` contains the exclusion angles of the baffle. Sun or sunlit ground in the field of view always blinds
-    the camera.
+    The mask is None if the camera is blinded or the Earth is not in view. `sky` contains the exclusion angles
+    of the baffle. Sun or sunlit ground in the field of view always blinds the camera.
     """
     corner = float(np.arccos(pinhole.unit_vectors(np.zeros((1, 2)))[0, 2]))
     sun_excluded = max(corner, math.radians(sky.sun_exclusion_deg))

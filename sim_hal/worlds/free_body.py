@@ -724,7 +724,7 @@ def built_craft(
 
     The configured craft is `craft` or, if `craft` is None, the craft of `section`. The argument `description`
     contains the ratios and rotations from the configured to the true properties. The disturbances are drawn
-    from the generator `errors`. Raises ConfigError like `craft_model`.
+    from the generator `errors`. Raises ConfigError as `craft_model` does.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
     if description is NO_ERRORS:
@@ -817,5 +817,5 @@ def body_inputs(
 
 
 def make(inputs: WorldInputs) -> FreeBody:
-    """Return the free body of a configuration. Raises ConfigError like `body_inputs`."""
+    """Return the free body of a configuration. Raises ConfigError as `body_inputs` does."""
     return FreeBody(*body_inputs(inputs, "the world free_body"))

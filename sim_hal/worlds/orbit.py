@@ -190,9 +190,9 @@ def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
     """Return the Sun's apparent geocentric position (..., 3), m, ICRS, at Julian dates (...) TT.
 
     The position follows the "Low-precision formulas for the Sun" of the Astronomical Almanac, accurate to
-    0.01 deg from 1950 to 2050. The series gives the longitude from the equinox of date, from which the drift
-    of the equinox since J2000 is subtracted. The obliquity of the ecliptic is that of J2000. Passing UTC
-    instead of TT changes the Sun's direction by 3".
+    0.01 deg from 1950 to 2050. The series gives the longitude relative to the equinox of date; the drift of
+    the equinox since J2000 is subtracted from this longitude. The obliquity of the ecliptic is that of J2000.
+    Passing UTC instead of TT changes the Sun's direction by 3".
     """
     days = np.asarray(julian_date, dtype=float) - J2000
     anomaly = np.radians(357.528 + 0.9856003 * days)
@@ -206,7 +206,7 @@ def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
 
 
 def julian_date(utc: str) -> float:
-    """Return the Julian date (UTC) of an ISO 8601 time, as `utc_seconds` does. Raises ConfigError."""
+    """Return the Julian date (UTC) of an ISO 8601 time. Raises ConfigError as `utc_seconds` does."""
     return UNIX_EPOCH + utc_seconds(utc) / DAY
 
 

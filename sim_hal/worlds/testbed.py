@@ -198,7 +198,7 @@ class OrbitField:
     """
 
     def __init__(self, section: CageTruth, scale: float, utc: str, seed: int) -> None:
-        # The orbit is imported here because a testbed without a cage does not need an orbit.
+        # The module `orbit` is imported only here, because a testbed without a cage does not need it.
         from sim_hal.worlds.orbit import Environment, elements, julian_date  # noqa: PLC0415
 
         date = julian_date(utc)
