@@ -1,11 +1,10 @@
 """Makes the systemd drop-ins that give the services access to the devices and networks of a configuration.
 
-The script install.sh runs board_dropin.py CONFIG FOLDER with the installed Python. The drop-in of
-knightcube.service is written to the file `flight` of the folder, that of knightcube-safe.service to `safe`,
-and that of knightcube-link.service to `link`. The file `link` is empty if the configuration has no link. The
-file `tracker` is written if the star tracker needs the default sky index. Without FOLDER, the script prints
-the drop-in of knightcube.service. For an invalid configuration, the script prints one line and exits with
-status 2.
+The script install.sh runs board_dropin.py CONFIG FOLDER with the installed Python. In FOLDER, the file
+`flight` is the drop-in of knightcube.service, `safe` that of knightcube-safe.service, and `link` that of
+knightcube-link.service. The file `link` is empty if the configuration has no link. The file `tracker` is
+written if the star tracker needs the default sky index. Without FOLDER, the script prints the drop-in of
+knightcube.service. For an invalid configuration, the script prints one line and exits with status 2.
 """
 
 from __future__ import annotations

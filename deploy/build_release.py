@@ -62,7 +62,7 @@ class Build:
             release.mkdir(parents=True)
         try:
             self._fill(release, wanted)
-        except BaseException:  # a release that does not fit on the disk would keep the disk full
+        except BaseException:  # an incomplete release may have filled the disk
             with suppress(OSError):
                 _remove(release)
             raise
@@ -76,7 +76,7 @@ class Build:
             (release / SOURCE).write_text(wanted, encoding="ascii")
             shutil.copyfile(self._source / _BOARD_LOCK, release / LOCK)
             _write(self._prefix / _NUMBER, f"{release.name.rpartition('+')[2]}\n")
-            os.sync()  # the manifest is written after the files that it lists are on disk
+            os.sync()  # the listed files must be on disk before the manifest
             _write(release / MANIFEST, manifest_text(release))
 
     def _environment(self, release: Path) -> Path:

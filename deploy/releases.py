@@ -206,7 +206,7 @@ def main(words: list[str]) -> int:
         if release is not None:
             problem = damage(release, thorough=True)
             sys.stdout.write(f"{link}: {release.name} {problem or 'whole'}\n")
-        else:  # a board has no previous release before its first update
+        else:  # before the first update, no previous release exists
             problem = INCOMPLETE if link == "current" or os.path.lexists(prefix / link) else ""
             sys.stdout.write(f"{link}: none {problem}".rstrip() + "\n")
         problems += bool(problem)

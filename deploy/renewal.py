@@ -127,7 +127,7 @@ class State:
         note: text that the flight reports as an event at its next start.
         note_s: time (s) for which the flight software has run since the note was made.
         boot: the kernel's boot identifier at the last run.
-        at: time (s) of the last run, since boot.
+        at: time (s) from boot to the last run.
         frames: number of authentic frames in the link's last record.
         limit_s: interval (s) of the command-loss timer; 0 disables the timer.
         silent_s: powered-on time (s) of the board since the last authentic frame.
@@ -216,7 +216,7 @@ def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(path)
-    except OSError:  # the part of a file that did not fit on the disk would keep the disk full
+    except OSError:  # an incomplete file may have filled the disk
         beside.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
@@ -309,7 +309,7 @@ class Board:
         for one, path in self._set().items():
             if one in contents:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with suppress(OSError):  # a file that cannot be read is replaced
+                with suppress(OSError):  # an unreadable file is replaced
                     if path.read_bytes() == contents[one]:
                         continue
                 replace_file(path, contents[one])
@@ -448,7 +448,7 @@ class Renewal:
         shown = {"reports": state.reports, "trial": text, "note": state.note}
         try:
             replace_file(self._board.own / "status", encoded(shown))
-        except OSError as error:  # the present step continues, and the next step writes the reports again
+        except OSError as error:  # the step continues, and the next step writes the status again
             sys.stderr.write(f"renewal: cannot write the status: {error}\n")
 
     def _store(self, **changes: Any) -> None:
@@ -603,7 +603,7 @@ class Renewal:
         if kind == "release":
             # If the current release is incomplete, the previous release runs, also after a failed trial.
             old, new, what = board.release("current") or board.release("previous"), "", "release"
-            os.sync()  # the sources are on disk before the trial is stored
+            os.sync()  # the sources must be on disk before the trial is stored
         else:
             old, what = board.keep(""), "configuration"
             if kind == "catalogue":
@@ -633,7 +633,7 @@ class Renewal:
     def _opened(
         self, kind: str, folder: Path, releases: Iterable[str], trusted: Path, utc: str = ""
     ) -> dict[str, Any]:
-        """Return the result of `open_bundle.py`.
+        """Return the result of `open_bundle.py` at the mission time `utc` (s), which is empty if unknown.
 
         The content is written to `folder`. Raises Refused if the program fails with all `releases`.
         """
@@ -666,7 +666,7 @@ class Renewal:
         text = f"{kind} {trial.version} is kept"
         self._report(trial.request, "completed", "activate", text)
         self._report(name, "completed", "confirm", text)
-        with suppress(OSError):  # the end of the step stores the reports again
+        with suppress(OSError):  # if this fails, the end of the step stores the reports
             self._save()
         self._tidy()
 
@@ -695,7 +695,7 @@ class Renewal:
         except (Refused, OSError) as error:
             if trial.stage == "install":
                 self._begin_revert(f"the artefact cannot be installed: {error}")
-            else:  # the new version stays installed until a later run succeeds
+            else:  # the new version stays installed until a later run reverts it
                 sys.stderr.write(f"renewal: cannot revert yet: {error}\n")
 
     def _install(self, trial: Trial) -> None:
@@ -738,7 +738,7 @@ class Renewal:
         try:
             self._check_built(name)
         except Refused:
-            with suppress(OSError):  # the present release has the same sources if it was not built again
+            with suppress(OSError):  # a release in use was not built again, and is kept
                 if name not in {board.linked("current"), board.linked("previous")}:
                     board.remove(name)
             raise
@@ -787,7 +787,7 @@ class Renewal:
         text = f"{trial.kind} {trial.version}: {trial.problem}; {end}"
         state.trial, state.note, state.note_s = None, text, 0.0
         self._report(trial.request, "failed", "activate", text)
-        if trial.what == "configuration" or trial.new:  # no restart is necessary if the release was not built
+        if trial.what == "configuration" or trial.new:  # without a built release, no restart is necessary
             board.restart()  # if killed before the state is stored, this step is repeated
         self._save()
 
