@@ -335,7 +335,7 @@ def talker(
             while rig.clock.now_ns() < until_ns:
                 rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
                 for arrival_ns, chunk in port.receive():
-                    if parser.feed(arrival_ns, chunk):  # a serial port delivers a packet in several chunks
+                    if parser.feed(arrival_ns, chunk):  # one packet may arrive in several chunks
                         arrivals.append(arrival_ns)
                     data += chunk
         except DeviceError:
@@ -434,7 +434,7 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     what, rate, pause = talker(rig, section.device, rates, period_ns)
     rig.wires.serial(section.device, section.baud_rate).set_baud_rate(section.baud_rate)
     found = None
-    # The u-blox driver changes the baud rate of its receiver, for example the factory setting.
+    # The u-blox driver changes the baud rate of its receiver, so the factory setting is not a fault.
     changed = wanted == "gps" and section.driver == "ublox" and rate in GPS_BAUD_RATES
     if what == wanted and rate != section.baud_rate and not changed:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"

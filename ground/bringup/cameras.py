@@ -36,7 +36,7 @@ def step_dark(session: Session) -> Outcome:
     frames = [frame.pixels for frame in taken]
     if session.hand is not None:
         session.hand.cover(False)
-    if len(taken) < 2:  # the finding states how many triggers gave no frame
+    if len(taken) < 2:  # findings[0] states how many triggers gave no frame
         raise StepSkipped("camera delivers only one frame, and its noise needs two", findings[0])
     camera = session.config.camera
     assert camera is not None, "the device is open"
@@ -186,7 +186,7 @@ def psf_width(pixels: Image) -> tuple[float, int]:
     """
     for factor in (16, 8, 4, 2, 1):
         if factor > 1 and min(pixels.shape) < factor * LEAST_SIDE:
-            continue  # too small for the detection
+            continue  # the binned frame would be too small for the detection
         rows, columns = (size // factor * factor for size in pixels.shape)
         squares = pixels[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
         summed = squares.sum(axis=(1, 3), dtype=np.uint32)

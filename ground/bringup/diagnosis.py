@@ -34,7 +34,7 @@ GRAVITY = 9.80665
 RECOGNISED = math.radians(25.0)
 """Largest angle (rad) at which a measured direction is assigned to an expected direction."""
 ASKEW = math.radians(15.0)
-"""Largest accepted angle (rad) from a coil's expected field to the field that an aligned unit measures."""
+"""Largest accepted angle (rad) between a coil's expected and measured field if the sensor axes are exact."""
 FEWEST = 20
 """Smallest number of samples that determines the noise."""
 ALIKE = math.radians(15.0)
@@ -391,7 +391,7 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
 def _gyro_scale(turns: Turns) -> list[Finding]:
     """Return a finding if the gyro's angles about x and y differ from the angles computed from gravity.
 
-    Both angles belong to the same rotation, so that its deviation from 90 deg does not matter.
+    Both angles describe the same rotation, so a deviation of the rotation from 90 deg does not matter.
     """
     first, second = turns.before[:2, 0], turns.after[:2, 0]
     sizes = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
@@ -603,7 +603,7 @@ def diagnose_coils(
     sign, found = _common_sign(strength, misfit, live)
     drawn = np.mean(test.current, axis=1) / test.commanded
     joined = _joined(response, expected, live)
-    exact = np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6)  # each axis is exactly a body axis
+    exact = np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6)  # whether every axis is a body axis
     askew, strength = ASKEW if exact else RECOGNISED, sign * strength
     state = CoilsFound(response, expected, serves, strength, misfit, live, drawn, 1.0, joined, askew, found)
     if moved := _moved(test):
@@ -672,7 +672,7 @@ def _match(
     unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     length = np.linalg.norm(response, axis=1, keepdims=True)
     cosine = response / np.where(length > 0.0, length, 1.0) @ unit.T
-    own = 0.05 * np.eye(count)  # parallel coils do not count as swapped
+    own = 0.05 * np.eye(count)  # parallel coils then do not count as swapped
     rows = np.flatnonzero(live)
     serves, strength, misfit = [-1] * count, np.zeros(count), np.full(count, math.pi)
     if len(rows):

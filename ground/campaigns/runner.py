@@ -40,7 +40,7 @@ _ATTEMPTS = 3  # maximum number of attempts to run a case whose worker process d
 _STOP_S = 5.0  # time (s) in which interrupted worker processes must end before they are killed
 _SCRATCH = "knightcube-campaign-"
 """Prefix of the name of the folder that contains the temporary files of the workers."""
-_TEMPORARY = "temporary"  # name of the link in the campaign's folder to the folder of temporary files
+_TEMPORARY = "temporary"  # name of the link, in the campaign's folder, to the folder of temporary files
 
 
 class Progress:
@@ -98,7 +98,7 @@ def _duration(seconds: float) -> str:
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 _RESULTS = "results.jsonl"  # name of the file of the results in the folder of a campaign
-_LABEL = "campaign.json"  # name of the file of the campaign's name, runs and seed, written at its beginning
+_LABEL = "campaign.json"  # name of the file with the campaign's name, number of runs and seed
 
 Result = dict[str, Any]
 Parameters = dict[str, Any]
@@ -203,7 +203,7 @@ def fly(
     label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
     with _opened(out) as sink:
         done = _resume(label, out, sink)
-        _clear(out / _TEMPORARY)  # temporary folder of a campaign that was killed after its last result
+        _clear(out / _TEMPORARY)  # a killed campaign leaves its temporary folder
         missing = [case for case in cases if case.key not in done]
         if missing:
             bar = Progress(len(cases), len(cases) - len(missing)) if progress else None

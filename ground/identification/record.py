@@ -47,7 +47,7 @@ class HorizontalField:
 
     Attributes:
         magnitude: field, T.
-        sigma: standard deviation of the magnitude from the scatter, T.
+        sigma: standard deviation of the magnitude, from the scatter of the samples, T.
         samples: number of samples.
         offset: offset of the magnetometer that is subtracted, T; 0 if the offset is not significant.
     """
@@ -197,8 +197,8 @@ def _currents(
 
 
 _OFFSET_SIGMAS, _OFFSET_SHARE, _MOST_OFFSET = 6.0, 0.01, 0.5
-"""Smallest magnetometer offset that is subtracted, in standard deviations and as a fraction of the field, and
-largest offset, as a fraction of the field."""
+"""Limits of a subtracted magnetometer offset: minimum in standard deviations, and minimum and maximum as
+fractions of the field."""
 _LEAST_ROTATION = 0.1
 """Smallest standard deviation (rad) of the angle that separates magnetometer offset and field."""
 
@@ -213,7 +213,7 @@ def _field(
     None if the coils were never off, or if most of the measured field does not rotate with the body.
     """
     on = np.flatnonzero(current)
-    since = np.full(len(switch_time), -np.inf)  # end of the last non-zero current
+    since = np.full(len(switch_time), -np.inf)  # end of the newest non-zero current at each switch time
     if len(on):
         newest = np.searchsorted(on, np.arange(len(switch_time)), side="right") - 1
         ends = np.append(switch_time[1:], np.inf)
