@@ -216,7 +216,7 @@ def _keep(options: argparse.Namespace, key: str, known: Mapping[str, Outcome], n
         stored = {}
     stored = {step: one for step, one in stored.items() if step in known and one.get("config") == key}
     if "skipped" in outcome.values:
-        stored.pop(name, None)  # the step is not stored, so a later session tries it again
+        stored.pop(name, None)  # a skipped step is not stored, so a later session tries it again
     else:
         stored[name] = {"config": key, "done": now, **_facts(outcome)}
     _write(folder / REPORT, json.dumps({"config": str(options.config), "steps": stored}, indent=1) + "\n")

@@ -219,7 +219,7 @@ class Fixes:
 
 
 def read_fixes(path: Path) -> Fixes:
-    """Return the fixes of a CSV file, or those of the flight log in a run's folder in order of their UTC.
+    """Return the fixes in a CSV file, or in the flight log of a run's folder in order of UTC.
 
     Raises UsageError.
     """

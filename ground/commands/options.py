@@ -80,7 +80,7 @@ def read_picture(options: argparse.Namespace) -> Image:
         raise UsageError(f"--overlay {options.overlay}: a PNG file is written: give a name that ends in .png")
     if options.raw:
         pixels = read_raw(options.image, *options.raw)
-    else:  # a lens calibration refers to the rows and columns of the detector
+    else:  # for a camera, the picture stays in the orientation of the detector
         pixels = read_image(options.image, upright=options.camera is None)
     check_size(options.image, pixels)
     return pixels

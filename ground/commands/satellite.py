@@ -71,7 +71,7 @@ _OF_TRANSFERS: dict[str, type[directives.CancelFile | directives.SuspendFile | d
 }
 _RATE = 20_000.0  # default rate of frames to the satellite (bytes/s)
 _SILENCE_S = 60.0  # default time (s) without a packet after which a file command fails
-_TURN_S = 0.01  # longest time (s) to wait for packets before the protocol data units that are due are sent
+_TURN_S = 0.01  # longest time (s) to wait for packets before due protocol data units are sent
 _SHOW_S = 1.0  # time (s) between two lines of progress
 _LINGER_S = 0.5
 """Time (s) after a transfer during which the satellite may ask again for the last answer."""
@@ -179,7 +179,7 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
         text = "QX QY QZ QW of inertial, LAT LON of ground, RA DEC of object"
         parser.add_argument("goal", choices=[goal.label for goal in Goal])
         numbers = parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help=text)
-        numbers.required = False  # otherwise argparse names the optional numbers among missing arguments
+        numbers.required = False  # otherwise argparse would name the optional numbers as missing
         parser.add_argument(
             "--roll", type=float, metavar="DEG", help="angle about the pointing axis (default free)"
         )
@@ -290,7 +290,7 @@ def _command_of(options: argparse.Namespace) -> commands.Command:
         value = getattr(options, field.name)
         if field.kind.startswith("S"):
             value, size = " ".join(value), int(field.kind[1:])
-            if len(value.encode(errors="replace")) >= size:  # a command such as `safe` is sent anyway
+            if len(value.encode(errors="replace")) >= size:  # the command is sent with a shorter text
                 sys.stderr.write(f"knightcube: {field.name}: only its first {size - 1} bytes are sent\n")
         numbers_by_label = {label: number for number, label in field.states}
         fields[field.name] = numbers_by_label[value] if field.states else value

@@ -422,7 +422,7 @@ def _listening(port: int) -> socket.socket:
     line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         line.bind(("127.0.0.1", port))
-        line.listen()  # the socket listens before the address is printed
+        line.listen()  # before the address is printed
     except OSError as error:
         line.close()
         raise UsageError(f"--port {port}: {error.strerror or error}; give another, or 0 for any") from error

@@ -219,7 +219,7 @@ class LinkFeed:
         self._received = time.monotonic()
         self._asked = -np.inf
         self._run = b""  # newest packet `run`
-        self._run_changed = False  # whether this packet differs from the one before
+        self._run_changed = False  # whether the newest packet `run` differs from its predecessor
         self._newest_ns = 0  # newest mission time
         self.restarts = 0
 
@@ -261,7 +261,7 @@ class LinkFeed:
                     self._session.transmit(time.monotonic_ns())
                 except FileError:
                     raise
-                except KnightCubeError:  # stored in `problem`; CFDP sends lost segments again
+                except KnightCubeError:  # the error is in `problem`, and CFDP repeats lost segments
                     pass
             live = [packet for channel, packet in packets if channel == LIVE]
         if live:
@@ -454,7 +454,7 @@ class RunFiles:
         paths = [path for path in sorted(self._folder.rglob("*")) if path.is_file() and not path.is_symlink()]
         files = []
         for path in paths[:_MOST_FILES]:
-            with contextlib.suppress(FileNotFoundError):  # a flight deletes its oldest segments
+            with contextlib.suppress(FileNotFoundError):  # the flight may have deleted the file
                 files.append(
                     {"name": path.relative_to(self._folder).as_posix(), "bytes": path.stat().st_size}
                 )

@@ -74,7 +74,7 @@ class FlightSurroundings:
         return cls(elements, view, dipole, body, config.coils.resistance, currents, lines)
 
     def at(self, utc_ns: int) -> Object | None:
-        """Return subsatellite and subsolar points (deg), height (km), field (T), and ICRS directions (3,).
+        """Return subsatellite and subsolar points (deg), height (km), field (T), and directions (3,) in ICRS.
 
         Returns None if the orbit at this time is unknown.
         """

@@ -105,7 +105,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line,
     ):
         own = os.path.join(folder, "answer")
-        os.chmod(folder, 0o711)  # the flight software, possibly of another user, must reach the socket
+        os.chmod(folder, 0o711)  # the flight software may run as another user
         line.bind(own)
         os.chmod(own, 0o777)
         return _ask(line, to, data, timeout, to)
@@ -231,8 +231,8 @@ def command(
 
     The call ends with the final report, as soon as `ended` returns true for the received reports, or after
     `seconds` s. A ping is sent after each silence, because a link process that restarts, or that receives no
-    frame for a minute, forgets the UDP address of the ground. If the frame's counter was used before, or if
-    the reserve SPI is used, the counters of the ground are then raised above those of the satellite.
+    frame for a minute, forgets the UDP address of the ground. Afterwards, the counters of the ground are
+    raised above those of the satellite if the frame's counter was used before, or if the reserve SPI is used.
     """
     found = _followed(terminal, packet, spi, seconds, show, ended)
     if spi == COMMAND_SPIS[1] or any(report.stage is Stage.REPEATED for report in found):
@@ -263,7 +263,7 @@ def _followed(
             if ended(found) or report.stage.final or report.stage is Stage.REPEATED:
                 return found
         if terminal.gate.admitted == heard and left > 0.0:
-            with suppress(KnightCubeError):  # the reports may still arrive
+            with suppress(KnightCubeError):  # the reports may arrive even if the ping fails
                 terminal.send(packer.pack(Ping(), utc_ns()), spi)
     if not found:
         raise no_answer(terminal.gate, seconds)

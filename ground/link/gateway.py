@@ -110,10 +110,10 @@ def new_token() -> str:
 class CommandStream:
     """Decoder that splits the bytes of a connection into command packets and checks each byte as it arrives.
 
-    The first byte that cannot belong to the token or a command packet at its position ends the connection, so
-    that another protocol, such as HTTP from a web page, is refused at its first byte. The token is compared
-    in constant time after the whole token has arrived. Closing a connection at the first wrong character
-    would reveal the token character by character.
+    A byte that cannot belong to the token or a command packet at its position ends the connection. Another
+    protocol, such as HTTP from a web page, is therefore refused at its first byte. The token is compared in
+    constant time after the whole token has arrived. Closing a connection at the first wrong character would
+    reveal the token character by character.
 
     Attributes:
         authenticated: whether the correct token has arrived.
@@ -254,7 +254,7 @@ class Gateway:
                 self._own.append(self._send(self._packer.pack(Ping(), utc_ns())))
         waiting = [line for line, connection in self._connections.items() if connection.unsent]
         reading: list[Terminal | socket.socket] = [self._terminal, *self._connections]
-        if time.monotonic() >= self._accept_at:  # a connection that cannot be accepted stays ready
+        if time.monotonic() >= self._accept_at:  # otherwise `select` would return at once
             reading.append(self._listener)
         ready, writable, _ = select.select(reading, waiting, [], seconds)
         if self._terminal in ready:
@@ -302,7 +302,7 @@ class Gateway:
         if packet[:2] == _VERIFIED:
             report = report_of(packet)
             if report is not None and report.spi == _SPI and report.counter in self._own:
-                return  # a report on one of the gateway's own pings
+                return  # reports on the gateway's own pings are not relayed
         self.down += 1
         for line, connection in list(self._connections.items()):
             if connection.stream.authenticated:
@@ -339,10 +339,10 @@ class Gateway:
                 try:
                     counter = self._send(finished(packet, utc_ns()))
                 except KnightCubeError as error:
-                    if packet[:2] != _UNIT:  # a file transfer repeats its packets
+                    if packet[:2] != _UNIT:  # a file transfer repeats lost packets
                         self._complain(f"{_title(packet)} was not sent: {error}; send it again")
                     continue
-                if counter in self._own:  # after a change of the key the counters begin again at 0
+                if counter in self._own:  # possible after a key change, when counters restart at 0
                     self._own.remove(counter)
                 self.up += 1
         except StreamError as error:

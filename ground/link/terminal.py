@@ -40,8 +40,8 @@ _STORE_EVERY = 256  # number of telemetry frames between two writes of the anti-
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
-_RECONNECT_S = 2.0  # minimum time (s) between the end of an attempt to open a stream and the next
-_CONNECT_S = 1.5  # longest time (s) to wait for a TCP connection; the program waits meanwhile
+_RECONNECT_S = 2.0  # minimum time (s) from the end of an attempt to open a stream until the next
+_CONNECT_S = 1.5  # longest time (s) to wait for a TCP connection; the wait blocks the program
 _LOST = -2  # value of `highest` in the packet `link` for an SPI whose counter is lost
 PORTS = 1 << 16  # number of TCP and UDP ports
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
@@ -162,7 +162,7 @@ class Terminal:
         return self.send_by(sealer, packet)
 
     def sealer(self, spi: int, block: int) -> security.Sealer:
-        """Return a new `sealer` for `send_by`, which reserves `block` counter values at a time."""
+        """Return a new sealer, the argument of `send_by`, that reserves `block` counter values at a time."""
         return security.Sealer(self._vault, spi, frames.TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: security.Sealer, packet: bytes) -> int:
@@ -228,8 +228,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float, *, reported: bool = False) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        If the first report states that the frame's counter was used before, it is also the final report. A
-        later report of a used counter is skipped, because a third party has replayed the frame; if `reported`
+        If the first report states that the frame's counter was used before, it is also the final report. If a
+        later report states this, it is skipped, because a third party has replayed the frame. If `reported`
         is true, the first report was received in an earlier call.
         """
         for _, packet in self.packets(seconds):
@@ -431,7 +431,7 @@ def _serial_port(place: str) -> Opened:
     """Open the serial port /dev/FILE@BAUD. Raises OSError, and ValueError for another form."""
     device, _, baud = place.partition("@")
     port = serial.Serial(device, int(baud), exclusive=True)
-    os.set_blocking(port.fileno(), True)  # pySerial's port fails when its output buffer is full
+    os.set_blocking(port.fileno(), True)  # a nonblocking port fails when its output buffer is full
     return port.fileno(), port.close
 
 
