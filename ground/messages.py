@@ -40,13 +40,13 @@ _SECOND_NS = 1_000_000_000
 def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
     """Write the measured tracks of a run to the file `path`, and return the written files.
 
-    If the satellite's own orbit was known, the file with the suffix `.oem` beside `path` has the positions of
-    the camera at the sightings, as an Orbit Ephemeris Message. Each object has one segment, which contains
-    the measured right ascension and declination (ICRS) at mid-exposure of each frame. Stellar aberration due
-    to the camera's velocity is corrected, but light time is not. Standard deviations are written as comments,
-    because the message format has no keyword for them. The keyword MAG gives the mean magnitude of the last
-    sightings. Raises UsageError if no object was tracked, or if `path` has the suffix `.oem` or cannot be
-    written.
+    Each object has one segment, which contains the measured right ascension and declination (ICRS) at
+    mid-exposure of each frame. Stellar aberration due to the camera's velocity is corrected, but light time
+    is not. Standard deviations are written as comments, because the message format has no keyword for them.
+    The keyword MAG gives the mean magnitude of the last sightings. If the satellite's own orbit was known, an
+    Orbit Ephemeris Message with the positions of the camera at the sightings is written beside `path`, with
+    the suffix `.oem`. Raises UsageError if no object was tracked, or if `path` has the suffix `.oem` or
+    cannot be written.
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
@@ -245,7 +245,7 @@ def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
 
 
 def _of_magnitudes(sigma: FloatArray) -> list[str]:
-    """Return the comment on the standard deviations (n,) of MAG, or no line if none is known."""
+    """Return the comment lines on the standard deviations (n,) of MAG; no line if all are unknown."""
     known = sigma[np.isfinite(sigma)]
     if not len(known):
         return []

@@ -226,8 +226,8 @@ class OrbitPrediction:
     def passes(self, stations: Sequence[Station]) -> list[Pass]:
         """Return the passes over all stations that overlap the span, in order of rise.
 
-        Raises UsageError if the satellite never sets at a station, such as a geostationary satellite, and if
-        the elements are too old to predict in which revolution the satellite passes over a station.
+        Raises UsageError if the satellite never sets at a station, such as a geostationary satellite. Raises
+        UsageError also if the elements are too old to predict the revolution of a pass.
         """
         self.check_age()
         found = [one for station in stations for one in self._over(station)]
@@ -245,7 +245,7 @@ class OrbitPrediction:
         for time, event in zip(times, events, strict=True):
             at = time.utc_datetime()
             own = [at] if event == _RISE else [*own, at]
-            if event != _SET or len(own) < 3:  # the pass began before the search interval
+            if event != _SET or len(own) < 3:  # shorter if the pass began before the search interval
                 continue
             if own[-1] > self.begin and own[0] < self.end:
                 yield self._described(station, place, own)

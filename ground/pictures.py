@@ -175,7 +175,7 @@ def _draw_compass(
 
 
 _EDGE_RADIUS = 5.0
-_DOT = 0.0  # radius (px) that draws a single pixel instead of a ring
+_DOT = 0.0  # radius (px) of a ring that is a single pixel
 
 
 def draw_horizon(

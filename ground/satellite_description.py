@@ -92,7 +92,7 @@ class Derived:
         dipole: dipole of the coils in a typical direction, A m^2.
         field: root mean square of the magnetic field along the orbit, T.
         coil_torque: product of `dipole` and `field`, N m.
-        disturbance: aerodynamic and solar torque on the largest face, if the centre of mass is 2 cm off, N m.
+        disturbance: aerodynamic and solar torque on the largest face, with the centre of mass 2 cm off, N m.
         momentum_time: time (s) in which `coil_torque` removes the angular momentum at release.
         period: orbital period, s.
         slow_within: estimated upper limit of the detumbling time, s.

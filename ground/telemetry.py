@@ -88,7 +88,7 @@ def scan(data: bytes, whole: bool = False) -> ScanResult:
     If `whole` is true, the data are those from the start of a flight, where the sequence counts begin at
     zero, so packets that are missing before the first found packet are counted too.
     """
-    found = {name: bytearray() for name in LAYOUTS}  # a list of packets would need twice as much memory
+    found = {name: bytearray() for name in LAYOUTS}  # lists of packets would need twice as much memory
     claimed = other_versions = last = 0
     for layout, begin, end in walk(data):
         if data[begin + HEADER_BYTES] == layout.packet.version:

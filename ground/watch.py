@@ -201,7 +201,7 @@ class PingAnswer:
 def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAnswer]:
     """Yield the answers to pings until no answer has been received for `patience` s. Raises UsageError."""
     packer, answered = CommandPacker(), time.monotonic()
-    shown: frozenset[bytes] = frozenset()  # events of the previous answer
+    shown: frozenset[bytes] = frozenset()  # events in the previous answer
     while not ended.is_set():
         asked = time.monotonic()
         ping = packer.pack(Ping(int(asked * 1e3) & 0xFFFFFFFF), utc_ns())
@@ -245,8 +245,8 @@ class FlightState:
         mode: label of the flight's mode, or an empty text until the mode is known.
         ended: reason for the end of the flight, or an empty text before the end.
         events: newest events.
-        faults: number of received events whose severity is fault, including the unrecorded events that they
-            count as `suppressed`.
+        faults: number of faults: received events of this severity, and the unrecorded events that these
+            count.
         since: mission time of the first packet, s, or None before the first packet. No packet contains the
             number of faults since the start, so faults before this time are not counted.
         newest: newest packets by name.

@@ -72,7 +72,7 @@ _SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"  # Yamcs's name for the sequenc
 
 
 def epoch_of(text: str) -> str:
-    """Return date and time of a UTC without time zone, from any text in ISO 8601. Raises UsageError."""
+    """Return a UTC as a text without time zone, from any text in ISO 8601. Raises UsageError."""
     try:
         time = datetime.fromisoformat(text)
         utc = time if time.tzinfo is None else time.astimezone(UTC).replace(tzinfo=None)

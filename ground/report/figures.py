@@ -604,7 +604,7 @@ def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) 
     for name, axis, colour in axes[: 1 if np.allclose(order.axes.pointing, order.camera) else 2]:
         path = axis @ turned
         east, north = np.arctan2(path[:, 1], path[:, 0]), np.arcsin(np.clip(path[:, 2], -1.0, 1.0))
-        # a gap in the line where the path crosses the edge of the map
+        # The drawn line has a gap where the path crosses the edge of the map.
         jumps = np.flatnonzero(np.abs(np.diff(east)) > np.pi) + 1
         ax.plot(*(np.insert(values, jumps, np.nan) for values in (east, north)), color=colour, linewidth=1.8)
         ax.plot(east[0], north[0], "o", color=colour, markersize=8, markerfacecolor="white")

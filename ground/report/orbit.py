@@ -70,7 +70,7 @@ def magnetometer_rates(run: Run) -> PacketArray:
 
 
 def detumbling(run: Run) -> Object | None:
-    """Return the periods of detumbling and the error of the rate from the magnetometer alone.
+    """Return the periods of detumbling, and the error of the rate that the magnetometer alone gives.
 
     Returns None for a body without spin packets. The error is NaN without a truth log.
     """
@@ -367,8 +367,8 @@ def requirements(
     """Return the comparisons of the results with the limits in the configuration's section `requirements`.
 
     The arguments `detumbled`, `known`, `pointed` and `seen` are the report's results on detumbling, attitude
-    knowledge, pointing and the star camera. If the log ended, at `end_s`, before an event and before the time
-    limit of this event, the verdict is "unknown".
+    knowledge, pointing and the star camera. The log ends at `end_s`. If the log ends before an event and
+    before the time limit of this event, the verdict is "unknown".
     """
     limits = config.requirements
 
@@ -410,8 +410,8 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     while the attitude is fine and the body rotates slowly. An instant is unobstructed if the true body rate
     is below `camera.max_rate` and the true boresight is outside `pointing.cones` of Sun and Earth. An instant
     is measured if a frame exposed between this instant and the next gives an attitude or a rate. The longest
-    gap is the longest time without a measurement, in which obstructed instants do not count. Returns None
-    without a star camera or a truth log.
+    gap is the longest time without a measurement, not counting obstructed instants. Returns None without a
+    star camera or a truth log.
     """
     camera = config.camera
     if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):

@@ -206,7 +206,7 @@ def power(ax: Axes, signals: RunSignals) -> None:
         averages.insert(1, (measured_at, average, PURPLE, "average at the bus"))
     for times, average, colour, name in averages:
         ax.plot(times, average, color=colour, linewidth=1.6, label=f"{name}, {1e3 * average[-1]:.1f} mW")
-    if not len(signals.run["spin"]):  # the limit applies only to the testbed
+    if not len(signals.run["spin"]):  # the thesis limits only the testbed
         level(ax, limits.AVERAGE_SUPPLY_POWER_LIMIT_W, "thesis, 100 mW")
     ax.set_ylim(bottom=0.0)
     style(ax, "power, W", "Coil power")

@@ -34,8 +34,7 @@ OVERSHOOT_LIMIT_PERCENT = 20.0
 RISE_LIMIT_S = 8.0
 SETTLING_LIMIT_S = 30.0
 AVERAGE_SUPPLY_POWER_LIMIT_W = 0.10
-"""Average power consumption (W) in the thesis (chapter 5, Hardware Results), compared with V |I| at the
-coils."""
+"""Average power (W) in the thesis (chapter 5, Hardware Results), a limit for V |I| at the coils."""
 CURRENT_LIMIT_A = 0.148
 
 
