@@ -519,7 +519,7 @@ def _wait_for(arrived: Callable[[], bool], rig: Rig, gps: Gps, what: str) -> str
 
 
 def open_nmea(rig: Rig, gps: Gps) -> GpsReceiver:
-    """Return the driver of a receiver that sends NMEA 0183 sentences by itself."""
+    """Return the driver of a receiver that sends NMEA 0183 sentences without requests."""
     port = rig.wires.serial(gps.device, gps.baud_rate)
     return NmeaReceiver(port, rig.clock, max(EARLIEST_NS, rig.earliest_utc_ns))
 

@@ -668,9 +668,9 @@ def _begin_folder(
 
     Return the request with this folder as `out`, and the folders of the newest earlier runs.
 
-    Raises UsageError for a folder that already contains a run or that another flight uses, and for a folder
-    that cannot be written, which is removed if it is `new`. A flight computer with an archive flies despite
-    disk errors, and its logs wait until the disk works.
+    Raises UsageError for a folder that already contains a run, is used by another flight or cannot be
+    written. A folder that cannot be written is removed if it is `new`. A flight computer with an archive
+    flies despite disk errors, and its logs wait until the disk works.
     """
     earlier: list[Path] = []
     if request.archive is not None:

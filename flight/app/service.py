@@ -13,13 +13,13 @@ reads its configuration file once, verifies the bytes against the checksum, and 
 flipped bit on the disk can turn 1.05e-3 into 1.05e-7, which validation would not detect. A file without a
 checksum is used unchecked, unless an accepted configuration is stored, which shows that a checksum has
 existed. A service stores the three newest accepted and flown configurations in its state folder. Each stored
-configuration is one file, created by a single rename, whose name contains a number and the SHA-256 checksum,
-so that no configuration can be stored without its checksum.
+configuration is one file, created by a single rename. The file name contains a number and the SHA-256
+checksum, so that no configuration can be stored without its checksum.
 
 The signals that end a flight are SIGINT (Ctrl-C), SIGTERM, and SIGHUP when a terminal closes.
 
-Before the flight, the script `deploy/releases.py` chooses the software release, counts the starts of this
-release in a file of the state folder, and passes the name of the release and the reasons of the choice in
+Before the flight, the script `deploy/releases.py` chooses the software release and counts its starts in a
+file of the state folder. The script passes the name of the release and the reasons for the choice in
 environment variables. After a minute of flight, the release is recorded as proven, and the flight reports why
 another release was abandoned.
 

@@ -344,8 +344,9 @@ class _Witness:
             self._replaced[spi].add(_id_of(known.key))
             overwrite(self._folder / f"replaced-{spi}", b"".join(sorted(self._replaced[spi])))
         self.known[spi] = association
-        # If only the counter is new, the older copy is written, so that a crash damages only one. If the
-        # folder of keys is lost, the reserve SPI continues with one of the copies, so both are written.
+        # If only the counter is new, only the older copy is overwritten, so that a crash damages at most one
+        # copy. If the folder of keys is lost, the reserve SPI continues with one of the copies, so both are
+        # written.
         older = self._older.get(spi, COPIES[0])
         for copy in COPIES if new or spi == COMMAND_SPIS[1] else (older,):
             overwrite(self._folder / f"spi-{spi}.{copy}", encode(association))
@@ -539,7 +540,7 @@ class Sealer:
         """Protect frames with the association `name`, and reserve `block` counters at a time.
 
         Counters that were reserved but not used before a crash are skipped. If several processes share the
-        association, `shared` must be true: the rest of a block is skipped as soon as another process has
+        association, `shared` must be true. The rest of a block is then skipped as soon as another process has
         reserved counters, because the receiver refuses counters below the highest one it has received.
         """
         self._vault, self._name = vault, name

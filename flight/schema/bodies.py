@@ -431,8 +431,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def torque_sizes(self) -> tuple[float, float]:
         """Return the amplitude (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.
 
-        The default amplitude is the torque of air drag and solar radiation pressure on the largest face, with
-        the sum of the configured and the unknown offset of the centre of mass as lever arm. The default
+        The default amplitude is the torque of air drag and solar radiation pressure on the largest face. The
+        lever arm is the sum of the configured and the unknown offset of the centre of mass. The default
         random walk is the amplitude times 2e-3 per sqrt(s), because plans extrapolate an estimated torque
         along the field for an hour.
         """
@@ -449,8 +449,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def dipole_weight(self) -> float:
         """Return the dipole (A m^2) that costs as much as an attitude error of `pointing.turn`.
 
-        The default is proportional to the square root of the mean moment of inertia, tuned for a 1U and a 3U
-        CubeSat, and at most a fiftieth of the mean dipole limit.
+        The default is proportional to the square root of the mean moment of inertia, with a factor tuned for
+        a 1U and a 3U CubeSat, but at most a fiftieth of the mean dipole limit.
         """
         if self.pointing.dipole is not None:
             return self.pointing.dipole

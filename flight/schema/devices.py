@@ -121,11 +121,11 @@ class Sensor(Section, frozen=True, kw_only=True):
 
     The value `part` is `icm20948`, `lis3mdl`, `adis16470`, or `module:class` of a CircuitPython driver. The
     sensor has the I2C `address` on the bus `bus`, by default the bus of the coils, or it is the SPI device
-    `spi`. The mapping `measures` names the quantities that are read from the sensor, and for each quantity
-    the sensor's axis along the axes x, y and z of the unit, such as `gyro: [y, -x, z]`. The mapping `set`
-    names attributes of the CircuitPython driver, for example a data rate, and the values that these
-    attributes receive after each start. If the simulator has no emulator of the sensor, the value `emulator`
-    names one as `module:function`.
+    `spi`. The mapping `measures` gives, for each quantity that is read from the sensor, the sensor axes along
+    the axes x, y and z of the unit, such as `gyro: [y, -x, z]`. The mapping `set` names attributes of the
+    CircuitPython driver, for example a data rate, and the values that these attributes receive after each
+    start. If the simulator has no emulator of the sensor, the value `emulator` names one as
+    `module:function`.
     """
 
     part: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -230,7 +230,7 @@ class Coils(Section, frozen=True, kw_only=True):
 
     @property
     def slots(self) -> tuple[Winding, ...]:
-        """The coils in the order of the flight application; the last coil may be fictitious.
+        """The coils in the order that the flight application uses; the last coil may be fictitious.
 
         If the coils lie in a plane, a fictitious coil along the normal of the plane is appended. The
         fictitious coil has two unused PWM channels. The dipole moment of the fictitious coil is half the
@@ -281,8 +281,8 @@ class Coils(Section, frozen=True, kw_only=True):
     def map(self) -> CoilMap:
         """Return the map from dipole moments to currents.
 
-        Raises ConfigError unless each coil has one dipole moment per ampere, and UsageError if the coils
-        cannot produce a dipole moment in every direction.
+        Raises ConfigError if the dipole moment per ampere of a coil is missing or given twice, and UsageError
+        if the coils cannot produce a dipole moment in every direction.
         """
         strength = np.array([coil.strength() for coil in self.slots])
         dipoles = np.array([coil.direction() for coil in self.slots]).T * strength

@@ -133,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may contain bytes that are not text
     words = list(sys.argv[1:] if arguments is None else arguments)
-    # The option may be abbreviated, as all options of argparse.
+    # The option may be abbreviated, like all options of argparse.
     _Answer.wanted = any(len(word) > 2 and "--json".startswith(word) for word in words)
     _Answer.made = False
     try:

@@ -29,8 +29,8 @@ LONGEST_COMMAND = 96
 """Maximum length (bytes) of a command in words, including the terminating zero byte."""
 _LONGEST_UTC = 32
 _PORTION_BYTES, _MOST_PORTIONS = 72, 8
-"""Bytes of a packet in one segment (class `Portion`), which fits into a frame of 128 bytes, and maximum
-number of segments."""
+"""Bytes of a packet in one segment (class `Portion`), so that the segment fits into a frame of 128 bytes, and
+maximum number of segments."""
 LONGEST_IN_PORTIONS = _PORTION_BYTES * _MOST_PORTIONS
 """Length (bytes) of the longest packet that can be sent in segments."""
 

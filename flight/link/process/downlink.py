@@ -65,7 +65,7 @@ class _PacketStream:
 
 
 class LogFollower:
-    """Reader of new packets in the log of the run in folder `place`, or of the newest run of an archive."""
+    """Reader of new log packets; `place` is the folder of a run, or an archive, whose newest run is read."""
 
     def __init__(self, place: Path) -> None:
         """Begin near the end of the newest run in the folder `place`. The run may also be created later."""

@@ -86,7 +86,7 @@ class SegmentStore:
 
     Attributes:
         packets: number of completely written packets.
-        doubtful: number of written packets that may be lost because a sync to disk failed.
+        doubtful: number of written packets that are possibly lost because a sync to disk failed.
         dropped: number of segment files deleted because of the budget or of little free space.
     """
 
@@ -114,8 +114,7 @@ class SegmentStore:
         """Write packets and begin a new segment file whenever the current file is full.
 
         Raises OSError if a write fails. After a failed write, the attribute `packets` counts the completely
-        written packets, the file is truncated after the last complete packet, and `append` may be called
-        again.
+        written packets, and the file is truncated after the last of them. Then `append` may be called again.
         """
         chunk: list[bytes] = []
         size = self._size
