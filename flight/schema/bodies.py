@@ -236,7 +236,10 @@ class Craft(Section, frozen=True, kw_only=True):
     accuracy: CraftAccuracy = CraftAccuracy()
 
     def inertia_matrix(self) -> FloatArray:
-        """Return the inertia tensor (3, 3), kg m^2. Raises ValueError for mixed or missing values."""
+        """Return the inertia tensor (3, 3), kg m^2.
+
+        Raises ValueError if `inertia` mixes moments with matrix rows, or if `inertia` and `mass` are missing.
+        """
         if self.inertia is not None:
             return inertia_matrix(self.inertia)
         if self.mass is None:

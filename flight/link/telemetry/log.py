@@ -209,7 +209,7 @@ class SegmentStore:
         return size
 
     def _drop_run(self) -> bool:
-        """Delete the oldest earlier run, but not the newest one. Return whether a run was deleted."""
+        """Delete the oldest earlier run unless it is the only one. Return whether a run was deleted."""
         runs: list[Path] = []
         with suppress(OSError):
             runs = find_runs(self._folder.parent)
