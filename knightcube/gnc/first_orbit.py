@@ -94,8 +94,7 @@ def _derivative(state: FloatArray) -> FloatArray:
 
 MINIMUM_SIGHTINGS = 6
 RATIO = 1.5
-"""Largest ratio of the upper to the lower end of the distance's confidence interval for which an orbit is
-returned."""
+"""Largest accepted ratio of the upper to the lower end of the confidence interval of the distance."""
 GROUND_CLEARANCE = 80e3
 """Smallest perigee height (m) of an orbit that does not hit the Earth."""
 _NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90

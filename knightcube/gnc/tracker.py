@@ -21,11 +21,11 @@ the observer by v^2 times the range. The spectral density of the process noise a
 therefore increased by (`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
 
 Each sighting is assigned to at most one track, first to confirmed and then to tentative tracks, in order of
-increasing cost: the chi-square of direction and brightness plus the logarithm of the determinant of the
-innovation's covariance. The assignment is the greedy nearest neighbour method (Blackman and Popoli 1999,
-Design and Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A
-track is confirmed after m sightings in n frames if its angular rate differs from the rate of the stars. A
-confirmed track is propagated without measurements while the object is not detected.
+increasing cost. The cost is the chi-square of direction and brightness plus the logarithm of the determinant
+of the innovation's covariance. The assignment is the greedy nearest neighbour method (Blackman and Popoli
+1999, Design and Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative
+tracks. A track is confirmed after m sightings in n frames if its angular rate differs from the rate of the
+stars. A confirmed track is propagated without measurements while the object is not detected.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ FIELD_EVERY = 60.0
 FIELDS = 10
 """Number of collected field measurements, which span ten minutes or a tenth of an orbit."""
 WORST_SIGMA = math.radians(20.0)
-"""Standard deviation (rad) about the least certain axis above which an attitude is not used."""
+"""Largest standard deviation (rad), about the least certain axis, with which an attitude is used."""
 _NANOSECOND = 1e-9
 
 

@@ -30,12 +30,13 @@ attitude of identified stars by image matching.
   propagated by the body rate. Without a previous attitude, the pyramid method identifies the remaining
   points.
 
-- Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
-  one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
-  Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because guide stars in dense
-  regions of the sky would otherwise get the most votes at noise above 0.3 px. In a second vote, two
-  assignments with many votes vote for each other if the angle between their guide stars agrees with the angle
-  between their observed stars. The largest group of consistent assignments is the candidate.
+- Geometric voting: For each pair of observed stars, each guide star that forms the same angle with another
+  guide star gets one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin,
+  Pollak, Shimshoni & Lindenbaum, IEEE TAES 44, 2008). The number of matching partners is ignored, because
+  guide stars in dense regions of the sky would otherwise get the most votes at noise above 0.3 px. In a
+  second vote, two assignments with many votes vote for each other if the angle between their guide stars
+  agrees with the angle between their observed stars. The largest group of consistent assignments is the
+  candidate.
 
 - Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting
   the cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33,

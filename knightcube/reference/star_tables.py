@@ -120,7 +120,7 @@ def build_k_vector(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
 
 
 def members(start: IntArray, stop: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the concatenated indices (k,) of m ranges, and the range (k,) to which each index belongs."""
+    """Return the concatenated indices (k,) of m ranges, and for each index the number (k,) of its range."""
     length = stop - start
     owner = np.repeat(np.arange(len(start)), length)
     begin = np.cumsum(length) - length

@@ -41,7 +41,7 @@ _CONVERGED = 1e-11
 The error after the last Newton step is smaller, because each step is at most a tenth of the previous step.
 """
 _ROUNDING = 3e-15
-"""Several times the rounding error of the residuals, below which a Newton step is not meaningful."""
+"""Residual below which a Newton step is not meaningful: several times the rounding error of the residuals."""
 _CLOSE_FIT = 1e-2
 """Largest squared convergence ratio for which Gauss-Newton steps are used instead of Newton steps."""
 Rows = list[list[float]]

@@ -109,7 +109,7 @@ class Ephemeris:
 
 
 def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris:
-    """Return the ephemeris for `duration` s after an orbit state in steps of `step` s, including the term J2.
+    """Return the ephemeris from an orbit state to `duration` s later in steps of `step` s, with the term J2.
 
     The neglected drag and higher gravity terms shift a satellite by one kilometre in two revolutions, which
     changes the field by 15 nT. The field is extrapolated outside the years of its model.

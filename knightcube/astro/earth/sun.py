@@ -50,7 +50,7 @@ FIRST_YEAR, LAST_YEAR = 1900, 2100
 
 
 def ephemeris_date(name: str, utc: datetime) -> float:
-    """Return the Julian date UTC, days, of the argument `name`, at which the Sun's position is known.
+    """Return the Julian date UTC, days, of the time in the argument `name`.
 
     Raises ArgumentError if the argument is not a `datetime`, and for a time before 1900 or after 2099.
     """

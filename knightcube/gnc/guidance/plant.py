@@ -303,7 +303,7 @@ class CubicPrey:
 
 
 FARTHEST = angle_of(Q2_LIMIT)
-"""Largest angle (rad) up to which the commanded motion continues at the end rate after the end of a path."""
+"""Largest angle (rad) that the commanded motion reaches at the end rate after the end of a path."""
 
 
 class PathSample(NamedTuple):

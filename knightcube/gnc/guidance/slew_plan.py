@@ -142,7 +142,7 @@ def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> t
 
 
 _DENSE = 16
-"""Number of times, between a node and the next midpoint of a path, at which cones are checked."""
+"""Number of checks of the cones between a node and the next midpoint of a path."""
 _ROOM = math.radians(0.005)
 """Minimum angle (rad) between camera axis and exclusion cone at the checked times. Between two checked times,
 the camera axis approaches a cone by less than this angle, and therefore does not enter the cone."""
@@ -154,10 +154,10 @@ fewer paths must be corrected, but paths keep a larger distance from the cones a
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
 _ASTRAY = 1.05
-"""Ratio of the dipole to the dipole limit that is assumed for a path whose integration fails."""
+"""Assumed ratio of the dipole to the dipole limit for a path whose integration fails."""
 
 _ENDS = 9
-"""Number of durations of a failed slew for which its end is checked, to name a cone in the error message."""
+"""Number of durations for which the end of a failed slew is checked, to name a cone in the error message."""
 
 
 _LONGEST_INTERVAL = 250.0

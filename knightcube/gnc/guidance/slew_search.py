@@ -62,7 +62,7 @@ _STEPS_FREE = 25
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
 """Stages of an iteration with all limits: the number of Newton steps of each stage, and the constraint
 violation above which the iteration is abandoned after the stage. After the first stage, half of the
-iterations that would fail are abandoned, but only one in twenty of the iterations that would succeed."""
+iterations that would fail are abandoned, and one in twenty of the iterations that would succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ class SlewSolver:
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: SolvedPath) -> bool:
-        """Return whether a path planned without dipole limit satisfies the dipole limit and the cones."""
+        """Return whether a path planned without the dipole limit satisfies the dipole limit and the cones."""
         kept = self.kept(found.equations).values(found.at.states[1:, :4])
         return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
@@ -571,15 +571,15 @@ best path so far."""
 _MAXIMUM_TRIED = 16
 """Largest number of initial guesses that are tried for one duration."""
 _LOOK = 8
-"""Number of Newton steps from a guess after which the constraint violation is checked for the first time."""
+"""Number of Newton steps from a guess to the first check of the constraint violation."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
 """Further stages of the iteration from a guess: the number of Newton steps of each stage, and the upper limit
 of the constraint violation at the start of the stage. If the violation is larger, the guess is deferred.
 After eight steps, the violation is below 1.5 for four of five successful guesses, and above 1.5 for three of
 four unsuccessful guesses (320 guesses, seed 41 of the bench `orbit_slews`)."""
 _STEPS_WITHOUT_PATH = 120
-"""Number of Newton steps after which, if no path was found, the remaining guesses for the same slew duration
-are deferred."""
+"""Number of Newton steps without a path after which the remaining guesses for the same slew duration are
+deferred."""
 _WIDENED = 4
 """Maximum number of corrections of one path by widening cones or reducing dipoles."""
 
@@ -658,7 +658,7 @@ class SlewSearch:
         yield self._late(deferred)
 
     def _relaxed(self, horizon: float, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield batches of paths without dipole limit, and append slowly converging guesses to `deferred`."""
+        """Yield batches of paths without the dipole limit. Append slowly converging guesses to `deferred`."""
         batch: list[SolvedPath] = []
         solver, patience = self.solver, self.solver.steps + _STEPS_WITHOUT_PATH
         equations = solver.equations(horizon, self._coarse)

@@ -79,7 +79,7 @@ _TRIED = 3
 """Number of guesses of `slew_search` that serve as initial guesses for one duration."""
 _AXES = np.arange(3)
 _STEP = 1e-30
-"""Imaginary step of the complex-step derivatives, in which no nearly equal numbers are subtracted."""
+"""Imaginary step of derivatives by the complex-step method, which has no cancellation."""
 _NEAR, _LOST, _EASED = 0.9, 1.1, 4
 """The limit of the dipole is imposed at points where the dipole exceeds the first value times the usable
 limit. A path is abandoned if, after integration, its dipole exceeds the second value times the limit. The
@@ -88,7 +88,7 @@ _BESIDE = math.radians(0.1)
 """Angle (rad) by which exclusion cones are widened, because cones are not imposed between quadrature
 points."""
 _HOPELESS = 1.5
-"""Excess over a limit above which a path is not used to search for a path within the limits."""
+"""Largest excess over a limit of a path from which a path within the limits is sought."""
 _EXCHANGES, _EVALUATIONS = 6, 150
 """Largest number of updates of the imposed limits, and of evaluations of the heat per run of NLopt."""
 _TOLERANCE, _MET, _KEPT = 1e-6, 1e-6, 1e-5

@@ -67,7 +67,7 @@ _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
 ALONG_LIMIT = 0.99
-"""Ratio of the current or of |q2| to its limit, above which a path counts as reaching the limit."""
+"""Ratio of the current or of |q2| to its limit above which a path counts as reaching the limit."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
