@@ -282,7 +282,10 @@ class BodyTargets(Protocol):
         """Return the configured target that is in force at a mission time."""
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError for an unreachable target."""
+        """Return the target `wanted` of the command with the number `number`.
+
+        Raises UsageError for an unreachable target.
+        """
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
         """Return a target that holds the present attitude, or the nearest attitude that can be held."""
@@ -374,7 +377,7 @@ class BodyEstimation(Protocol):
         del change, deviations
 
     def coils_used(self, used: BoolArray) -> None:
-        """Adapt to the coils that are `used` (n,) and not isolated; by default, do nothing."""
+        """Adapt to the flags `used` (n,) of the coils in use; by default, do nothing."""
         del used
 
     def magnetometer_changed(self) -> None:

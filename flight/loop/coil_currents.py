@@ -133,7 +133,7 @@ class Predicted:
 def predict(
     current: float, commands: Commands, bounds: Bounds, sampling: Sampling, clipped: bool = False
 ) -> Predicted:
-    """Predict the current of each variant for the commands (k, n), A, in the time window of a reading."""
+    """Predict the current of each axis and variant for the commands (k, n), A, in a reading's time window."""
     full = np.array(bounds.full_current)[:, None]
     drawn = supply_currents(np.asarray(commands).T, full)
     count = len(commands)
@@ -144,7 +144,7 @@ def predict(
 
 
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
-    """Return the supply currents (n, v, k), A, of n bridges in v fault variants for commands (n, k), A.
+    """Return the supply currents (n, v, k), A, of n bridges in v fault variants for k commands (n, k), A.
 
     The current of each coil at a duty cycle of one is `full` (n, 1), A. Short circuits are not modelled: for
     the variant of a shorted coil, the current of a healthy coil is returned.

@@ -35,11 +35,11 @@ every few seconds as a check, even if no fault is suspected.
 A reversed coil draws the same supply current as a healthy coil, so only the motion of the body can reveal it.
 A coil that rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil
 whose torque is too small is used with its estimated gain. The class `CoilCorrection` contains sign and gain
-of each coil, and converts between the actual coil currents, which determine the supply current, and the
-effective currents, with which healthy coils would cause the same torque. A correction made in a tumble is
-reviewed when the body is slower than `tumble_rate`. In the review, the motion confirms the coil's sign, or
-the sign is changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current
-until the body is slow, but at most for ten minutes.
+of each coil, and converts actual coil currents to effective currents and back. The actual currents determine
+the supply current. Healthy coils with the effective currents would cause the same torque. A correction made
+in a tumble is reviewed when the body is slower than `tumble_rate`. In the review, the motion confirms the
+coil's sign, or the sign is changed again. A coil whose sign changes more than twice in ten minutes is kept at
+zero current until the body is slow, but at most for ten minutes.
 
 The diagnosis of a broken coil is not final. While the body is slow, a broken coil is used again for a trial
 ten minutes after its diagnosis, and at most three times. If the fault persists, the coil is diagnosed as
@@ -299,10 +299,10 @@ _WINDOW_NS = 1_100_000_000
 """Averaging time (ns) of the current monitor. After a longer gap between readings, the evidence is
 discarded."""
 _SETTLE = 2
-"""Number of readings after a fault until the averaging window excludes the time before it."""
+"""Number of readings after a fault until the averaging window excludes the time before the fault."""
 _SETTLE_NS = _SETTLE * _READING_NS
 _PERSISTENCE = 3
-"""Number of consecutive contradictions to a healthy circuit after which a fault is suspected."""
+"""Number of consecutive readings that contradict a healthy circuit after which a fault is suspected."""
 _EVIDENCE = 3
 """Number of readings that are needed for a diagnosis."""
 _PROBE_CURRENT, _PROBE_HALF_NS = 0.04, 800_000_000

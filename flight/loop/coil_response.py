@@ -207,9 +207,10 @@ _STEADY = 2.0
 gain from all bins, in standard deviations of the gain from the newest half."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
 """Thresholds for differences of cost between hypotheses. The cost of a hypothesis is the weighted sum of the
-squared residuals of its fit. A fault of one coil is accepted if its cost is lower by `_CLEARLY` than the cost
-of a fault of any other coil, and exceeds the cost of a fit of all gains by less than `_WORSE`. A reversed
-coil is accepted if its cost is also lower by `_CERTAINLY` than the cost of healthy coils."""
+squared residuals of its fit. A fault of one coil is accepted under two conditions: its cost is lower by
+`_CLEARLY` than the cost of a fault of any other coil, and it exceeds the cost of a fit of all gains by less
+than `_WORSE`. A reversed coil is accepted if its cost is also lower by `_CERTAINLY` than the cost of healthy
+coils."""
 
 
 class CoilResponse:
@@ -673,8 +674,8 @@ class MotionFit(NamedTuple):
 def _judged(costs: list[float]) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
     """Return for each of n coils whether only its fault explains the motion, and whether it is reversed.
 
-    The 2 n + 2 `costs` belong to the hypotheses that all gains are free, that one is free, that none is free,
-    and that one coil is reversed.
+    The 2 n + 2 `costs` belong to these hypotheses: all gains are free (1), one gain is free (n), no gain is
+    free (1), one coil is reversed (n).
     """
     coils = len(costs) // 2 - 1
     free, sound = costs[0], costs[coils + 1]

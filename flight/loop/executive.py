@@ -10,13 +10,13 @@ one runs first. The executive's task runner is one of the documented containment
 task is reported, and the loop continues.
 
 The control thread submits a job and later collects its result; it never waits for a job. In a lock-step
-simulation, `LockStepRunner` runs a job at once when it is submitted, and delivers its result after the
-modelled latency in simulated time, so that the result of a flight does not depend on the speed of the
-machine. In a real-time flight, `ProcessRunner` runs jobs in separate processes, which a thread starts,
-supervises, restarts and reaps. The control thread and the supervising thread exchange values through queues
-that never wait, so that starts and unexpected exits of workers do not delay the control thread. Each worker
-process has a socket for messages, and a memory file for arrays that both processes map, so that frames of
-several megabytes are not sent through a pipe. Each unexpected exit is reported as `WorkerNews`.
+simulation, `LockStepRunner` runs a job when it is submitted, and delivers its result after the modelled
+latency in simulated time. The result of a flight therefore does not depend on the speed of the machine. In a
+real-time flight, `ProcessRunner` runs jobs in separate processes, which a thread starts, supervises, restarts
+and reaps. The control thread and the supervising thread exchange values through queues that never wait, so
+that starts and unexpected exits of workers do not delay the control thread. Each worker process has a socket
+for messages, and a memory file for arrays that both processes map, so that frames of several megabytes are
+not sent through a pipe. Each unexpected exit is reported as `WorkerNews`.
 
 A worker that exits or exceeds its time limit is restarted, unless its budget of restarts is used up. The
 first restart is immediate, the second is delayed by half a second, and each later delay is twice as long as
@@ -85,7 +85,7 @@ class JobResult:
 
 
 class WorkerChange(Enum):
-    """State change of a worker: its process ended, was restarted, or ended so often that restarts pause."""
+    """State change of a worker: its process ended, runs again, or ended so often that restarts pause."""
 
     DIED = "died"
     READY = "ready"
@@ -394,8 +394,8 @@ class WorkerProcess:
     def send(self, argument: Any) -> None:
         """Submit a job.
 
-        Raises KnightCubeError if the job is too large, EOFError if the process has ended, and OSError if only
-        a part of the job was sent, so that the process cannot receive another job.
+        Raises KnightCubeError if the job is too large, and EOFError if the process has ended. Raises OSError
+        if only a part of the job was sent; then the process cannot receive another job.
         """
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:

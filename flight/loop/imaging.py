@@ -255,7 +255,7 @@ _NAMED_ELSEWHERE = {
     StreakStatus.SATURATED,
     StreakStatus.FROZEN,
 }
-"""Streak results that are not reported, because the body is at rest or another event is reported."""
+"""Streak results that are not reported: the body is at rest, or another event reports the cause."""
 
 
 class FrameReport:
@@ -409,7 +409,7 @@ _STEP_PX = 2.0
 class ObjectTracks:
     """Tracks objects from frame to frame, and reports and records their tracks.
 
-    In frames without identified stars, the tracks refer to the star field of the earlier frames
+    In frames without identified stars, tracks are measured relative to the star field of the earlier frames
     (`knightcube.vision.objects.star_field`). Control and telemetry receive the tracks in the axes of the
     attitude estimate. The error of the attitude estimate is part of the recorded covariances of the
     directions.

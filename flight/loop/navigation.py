@@ -104,7 +104,7 @@ class CoilKnowledge:
         self._looked_ns: int | None = None
 
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
-        """Return which currents are known, from the driver's state and the time since the last call.
+        """Determine which currents are known from the driver's state and the time since the last call.
 
         If the supply current contradicts a healthy coil circuit (`suspected`), a coil may carry any current.
         """
@@ -299,7 +299,7 @@ class Navigation:
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of a frame over the next cycles.
+        """Apply measurements of a frame, at once or over the next cycles.
 
         The function `report` receives one flag for each measurement: whether the measurement was accepted.
         """

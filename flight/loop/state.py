@@ -18,8 +18,8 @@ file, sync it, rename it over the old file, sync the folder. All calls go throug
 can simulate a power loss before any call.
 
 The number of each boot is also written to files in the folder of the state and in the folder of the run.
-After the repair of a file system or the restore of a backup, an intact copy of the state may be outdated. An
-outdated copy is recognised by a boot count that is smaller than the boot number in the files of the two
+After the repair of a file system or the restoration of a backup, an intact copy of the state may be outdated.
+An outdated copy is recognised by a boot count that is smaller than the boot number in the files of the two
 folders.
 
 The control thread sets values in memory, and a ticker thread writes them to disk. The state is also written
@@ -434,7 +434,7 @@ class StateStore:
         read = [self._read(name) for name in COPIES]
         whole = [r for r in read if r.copy is not None]
         newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)
-        # A missing copy is written first, because only an interrupted first write leaves a single copy.
+        # A missing copy is written first, so that an interrupted write leaves the existing copy intact.
         self._order = tuple(r.name for r in sorted(read, key=lambda r: r.copy is not None or bool(r.problem)))
         first = newest is None or newest.copy is None or newest.copy.generation == 1
         problems = (

@@ -165,7 +165,7 @@ FIELD_SIGMA = 0.03
 
 Sight = VectorObservation | None
 Compare = Callable[[int, Sight, Sight, Sight], None]
-"""Callback that compares other methods; its arguments are a time (ns) and the Sun, nadir and field
+"""Callback that runs the compared methods; its arguments are a time (ns) and the Sun, nadir and field
 directions."""
 
 
@@ -355,7 +355,7 @@ def horizon_camera_feed(
 def _spread(
     sight: VectorObservation, turn: FloatArray, claim: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the deviation (2,) of a direction from its prediction, and the covariances (2, 2) of both."""
+    """Return the deviation (2,) of a direction from its prediction, and the two covariances (2, 2)."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
     # A small rotation e changes a direction d by the cross product d x e.

@@ -40,8 +40,8 @@ GATE, ELEMENTS_GATE = 5.0 * math.sqrt(3.0), 4.0
 """Gates (standard deviations) for a GPS fix: the first for the distance from earlier fixes, the second for
 the distance from the elements."""
 LEAST_GATE, FIX_GATE = 5e3, 500.0
-"""Deviations (m) up to which a GPS fix is always accepted: the first from the elements, the second from
-earlier fixes."""
+"""Position errors (m) up to which a GPS fix is always accepted: the first relative to the elements, the
+second relative to earlier fixes."""
 SPEED_GATE, ORBITAL_RATE = 20.0, 1.2e-3
 """Deviation (m/s) up to which a fix's velocity is always accepted, and orbital rate (rad/s) of the lowest
 orbit."""

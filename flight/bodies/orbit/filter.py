@@ -4,7 +4,7 @@ A step contains the coil commands and the measurements between two times. A step
 switched on or off, so that the dipole is nearly constant during a step. When a step has ended, the filter
 processes it with the mean commanded dipole and the mean of the gyro samples. Magnetometer samples are used
 only while the coils are off and their field has decayed. Within an incomplete step, the estimate is
-propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time: the
+propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time. The
 filter returns to the beginning of the step that contains this time, and repeats all steps since then.
 
 The learned states are stored for the next boot in three parts, without the cross-covariance of different
@@ -14,8 +14,8 @@ sunlight and the torques. The part `body` contains the inertia and the matrix of
 coils applies to dipoles that were computed with the signs and gains from the coil monitor. The signs and
 gains from the coil monitor are therefore stored too, in the entry `coil-factors`. Another entry,
 `learned-at`, is the time (UTC, s) for which the learned states were estimated. At the next boot, the
-covariance of each state grows by its random walk over the elapsed time, and by a fraction of its initial
-covariance, because switching a sensor off and on changes its bias.
+covariance of each state grows by its random walk over the elapsed time. It also grows by a fraction of its
+initial covariance, because switching a sensor off and on changes its bias.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradiction by the gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
 _KNOWN_RATE = 0.01
-"""Largest standard deviation (rad/s) of a rate from the magnetometer that is used to propagate a
+"""Largest standard deviation (rad/s) with which a rate from the magnetometer is used to propagate a
 direction."""
 _MEASURED_SIGMA = 0.7
 """Standard deviation (rad) of the attitude below which a measured attitude updates the estimate linearly

@@ -238,7 +238,7 @@ class PointingTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`.
+        """Return the target `wanted` of the command with the number `number`.
 
         Raises UsageError for a q2, which only the testbed accepts.
         """
@@ -463,7 +463,10 @@ class PointingPlanner:
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """Start without a plan; `learned` returns body properties, and `usable` the flags of coils in use."""
+        """Start without a plan.
+
+        `learned` returns body properties, `usable` returns the flags of coils in use.
+        """
         self._craft, self._paths, self._environment = craft, paths, environment
         self._learned, self._usable, self._objects = learned, usable, objects
         self._areas = box_areas(craft.inertia)

@@ -1,25 +1,25 @@
 """Guidance and control of the testbed: targets, path planning, and control of the rotation about its thread.
 
-Paths are planned by one of three strategies. The strategy GOAL plans the whole step when a target is set, and
-every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
-continuation of the step. Near the goal time, the last path is followed to its end. After the end of this
-path, each plan holds the target for one replanning period. If the body is displaced from its path, a new path
-is planned. The strategy RECEDING is described in the thesis: each plan reaches the target one full planning
-horizon after the time of planning (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan:
-the controller tracks the target itself.
+Paths are planned by one of three strategies. The strategy GOAL plans the whole step when a target is set.
+Every few seconds, it plans the remaining part again from the newest estimate, so that each new plan is the
+optimal continuation of the step. Near the goal time, the last path is followed to its end. After the end of
+this path, each plan holds the target for one replanning period. If the body is displaced from its path, a new
+path is planned. The strategy RECEDING is described in the thesis: each plan reaches the target one full
+planning horizon after the time of planning (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes
+no plan: the controller tracks the target itself.
 
 The control laws are B-dot detumbling and a controller of the rotation about the suspension thread. A
 Helmholtz cage reproduces the magnetic field along an orbit. The cage produces the field that a satellite
-would measure in its local orbital frame: x along the flight direction, z down, and y, the axis of the thread,
-opposite to the orbit normal. The rotation about the thread is therefore the pitch of an Earth-pointing
-satellite, in a field that rotates once per revolution and varies in strength. The cage produces only the two
-field components normal to the thread, multiplied by `scale`. The component along the thread would cause no
-torque about the thread.
+would measure in its local orbital frame. The axis x is along the flight direction, z points down, and y, the
+axis of the thread, is opposite to the orbit normal. The rotation about the thread is therefore the pitch of
+an Earth-pointing satellite, in a field that rotates once per revolution and varies in strength. The cage
+produces only the two field components normal to the thread, multiplied by `scale`. The component along the
+thread would cause no torque about the thread.
 
 Both the cage's control computer and the flight software predict the field as a function of UTC, by the World
 Magnetic Model along the orbit of the two-line elements. The coil on body x has no torque while the field is
-parallel to its axis, so the torque about the thread is distributed over the coils on x and z with the least
-current.
+parallel to its axis. The torque about the thread is therefore distributed over the coils on x and z, so that
+their current is minimal.
 """
 
 from __future__ import annotations
@@ -468,7 +468,10 @@ class ThreadTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError for a goal or a too large q2."""
+        """Return the target `wanted` of the command with the number `number`.
+
+        Raises UsageError for a pointing goal, or if q2 is too large.
+        """
         if isinstance(wanted, PointingTarget):
             raise UsageError("the testbed accepts only a target q2, not a pointing goal")
         if not abs(wanted) <= Q2_LIMIT:  # NaN compares false
@@ -578,7 +581,7 @@ class ThreadTracker:
 AHEAD = 20.0
 """Span (s) of one field prediction, which takes about two milliseconds."""
 _ROUND = 6_000.0, 60.0
-"""Span (s), about one revolution, and step (s) of the search for the weakest field."""
+"""Span (s) and step (s) of the search for the weakest field. The span is about one revolution."""
 _ACROSS: FloatArray = np.array([1.0, 0.0, 1.0])
 """Mask of the field components that the cage produces."""
 
