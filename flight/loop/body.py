@@ -136,8 +136,7 @@ class ReadingAgreement(NamedTuple):
     Attributes:
         holds: whether at least one quantity of the reading agrees with the estimate; if so, the estimate
             counts as measured.
-        objection: name of a quantity of the reading that contradicts the estimate; empty if all quantities
-            agree.
+        objection: name of a quantity that contradicts the estimate; empty if all quantities agree.
     """
 
     holds: bool

@@ -126,8 +126,8 @@ class SelfTest:
 
     While a satellite points, its coil currents of a few mA reveal neither an open nor a reversed coil. A coil
     that the motion has not confirmed for `interval_ns` is therefore driven alone by a known current with the
-    signs +, -, -, + in four equal quarters. After the four quarters of a test, neither the rate nor the
-    attitude has changed. Duration and current of a test follow from the gyro's noise, so that a test measures
+    signs +, -, -, + in four equal quarters. After the four quarters of a test, rate and attitude are the same
+    as before the test. Duration and current of a test follow from the gyro's noise, so that a test measures
     the gain of a healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a
     test is the angular acceleration times the square of the duration of one quarter. `CoilResponse` evaluates
     the response, with the errors of the inertia as nuisance parameters. The supply current is compared with
@@ -142,7 +142,7 @@ class SelfTest:
         self._shown_ns: list[int | None] = [None] * len(settings.limits)
         self._running: tuple[int, int, int, float] | None = None
         self._loud_ns = self._called_ns = 0
-        self._tested: dict[int, int] = {}  # end (ns) of each test without a report, by axis
+        self._tested: dict[int, int] = {}  # end (ns) of each unreported test, by axis
 
     def request(self) -> None:
         """Test all coils as soon as possible, because the body does not move as commanded."""

@@ -418,7 +418,7 @@ class CoilResponse:
         return True
 
     def _fit(self, span: float) -> None:
-        """Fit the gains over all bins, and look for a reversed coil over the newest bins as well.
+        """Fit the gains over all bins, and look for a reversed coil in the newest bins too.
 
         In a fit over all bins, the bins before a fault would hide the fault.
         """

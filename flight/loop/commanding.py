@@ -283,7 +283,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command of a step of the time line. Raises CommandError unless it has exactly one."""
+    """Return the command of a step of the time line. Raises CommandError unless the step has exactly one."""
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

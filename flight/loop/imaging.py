@@ -635,7 +635,7 @@ class Imaging:
         """Set how much work is done: the search for objects, and the fraction of exposures that are made.
 
         Frames are searched for objects only if `search` is true, and only every n-th exposure is made, where
-        n is `frame_every`. n is at most `ImagingSettings.most_every`.
+        n is `frame_every`, but at most `ImagingSettings.most_every`.
         """
         self._searches = search
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
@@ -654,10 +654,10 @@ class Imaging:
     def trigger(self, cycle: Cycle) -> None:
         """Schedule the next exposure of the star camera, if an exposure is permitted now.
 
-        No exposure is made while the body rotates faster than permitted, or too soon while the battery is
-        low. Exposures are less frequent while the attitude estimate is accurate and the body rotates slowly.
-        An exposure starts when no coil will be switched until its end, so that the body rate is nearly
-        constant.
+        No exposure is made while the body rotates faster than permitted, or too soon after the last exposure
+        while the battery is low. Exposures are less frequent while the attitude estimate is accurate and the
+        body rotates slowly. An exposure starts when no coil will be switched until its end, so that the body
+        rate is nearly constant.
         """
         speed, rested_ns = self._navigation.speed, cycle.start_ns - self._triggered_ns
         if speed > self._settings.max_rate or rested_ns < self._rest_ns:

@@ -1,7 +1,7 @@
 """Modes: the state machine of the flight, and the task that turns commands and reactions into mode changes.
 
 The transition table contains the result of every trigger in every mode. The result `TriggerAnswer.STAY` means
-that the trigger has no effect in a mode, `TriggerAnswer.REFUSE` that a command is refused.
+that the trigger has no effect in a mode. `TriggerAnswer.REFUSE` means that a command is refused.
 
 The class `AttitudeWatch` monitors attitude knowledge and spin of a body that must acquire its attitude. The
 class `PointingWatch` monitors rate and pointing error of a steered body. The class `HoldTimer` measures how

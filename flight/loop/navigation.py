@@ -104,7 +104,7 @@ class CoilKnowledge:
         self._looked_ns: int | None = None
 
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
-        """Determine which currents are known from the driver's state and the time since the last call.
+        """Derive from the driver's state and the time since the last call which currents are known.
 
         If the supply current contradicts a healthy coil circuit (`suspected`), a coil may carry any current.
         """

@@ -101,8 +101,8 @@ class MonitorWatch:
 class Sheddable:
     """Loads that are reduced while the battery is low.
 
-    The functions set the fraction of the current limits that the coils may use, and the minimum time (s)
-    between two frames of the star camera.
+    `limit_coils` sets the fraction of the current limits that the coils may use. `rest_camera` sets the
+    minimum time (s) between two frames of the star camera.
     """
 
     limit_coils: Callable[[float], None]

@@ -277,8 +277,8 @@ def start_from(
 ) -> tuple[SlowPrior, list[str]]:
     """Return the filter's prior, and the reasons why learned parameters were rejected.
 
-    If nothing was learned, the prior is `configured`. Each learned value may have changed by `changed`
-    times its standard deviation in `configured`.
+    If nothing was learned, the prior is `configured`. Each learned value is assumed to have changed since the
+    last boot by `changed` times its standard deviation in `configured`.
     """
     problems: list[str] = []
 

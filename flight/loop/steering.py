@@ -218,9 +218,9 @@ class Steering:
 
     Control is lost when no recent reading agrees with the estimate, when the estimate becomes too inaccurate
     without a gyro or, in detumbling, when there is no recent reading. The estimate is propagated by the model
-    during a silence of the inertial unit, so that control returns smoothly. The currents are zero at the
-    latest a tenth of a second after the last reading. If the planner fails, the body follows its last path
-    and is held at the end of the path (event `holding`). If there is no path, the currents are zero.
+    during a silence of the inertial unit, so that control returns smoothly. The currents become zero within a
+    tenth of a second after the last reading. If the planner fails, the body follows its last path and is held
+    at the end of the path (event `holding`). If there is no path, the currents are zero.
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:

@@ -605,7 +605,7 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
     per_torque = np.linalg.norm(np.linalg.inv(inertia), axis=1)
 
     def disturbance(time_ns: int) -> FloatArray:
-        """Return the largest accelerations (3,), rad/s^2, without drag if the orbit is unknown."""
+        """Return the largest accelerations (3,), rad/s^2; drag is omitted if the orbit is unknown."""
         state = environment.state(time_ns)
         density = 0.0 if state is None else mean_density(float(np.linalg.norm(state.position)))
         return np.asarray((dipole + air * density) * per_torque)

@@ -230,7 +230,7 @@ class EstimatedEnvironment:
         return UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
 
     def fix(self, reading: GpsReading, witness: Witness | None = None) -> bool:
-        """Accept a GPS fix that the `witness` does not contradict, and return whether it is used."""
+        """Use a GPS fix unless it is implausible or `witness` contradicts it; return whether it is used."""
         self.refusal = ""
         if not reading.valid:
             return False
@@ -462,8 +462,8 @@ class EstimatedEnvironment:
 
 
 STUCK, FIELDS_CONTRADICTED = 20, 4
-"""Number of consecutive equal fields, and number of consecutive fields that contradict the estimate, that
-indicate a fault."""
+"""Numbers of consecutive fields that indicate a fault: of equal fields, and of fields that contradict the
+estimate."""
 
 
 class StuckFieldCheck:

@@ -354,7 +354,7 @@ class StepReplay:
         return None
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the mean gyro rate (3,), rad/s, of its step, or None if there is none.
+        """Return the newest field and the mean gyro rate (3,), rad/s, of the same step; None without a field.
 
         The field's covariance includes the unknown magnetometer bias.
         """

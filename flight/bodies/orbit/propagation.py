@@ -230,7 +230,7 @@ class _Beginning:
         inertia, inverse: rows of the inertia tensor, kg m^2, and of its inverse.
         coils: rows of the matrix from the commanded to the estimated dipole of the coils.
         quaternion, rate: attitude, and body rate, rad/s.
-        field, residual: magnetic field, T, and satellite's residual dipole, A m^2, in body axes.
+        field, residual: magnetic field, T, and the satellite's residual dipole, A m^2, in body axes.
     """
 
     around: FilterEnvironment

@@ -265,7 +265,7 @@ class Planning:
         return self._accepted, self._refused
 
     def busy_since_ns(self) -> int | None:
-        """Return when the worker began its plan (ns), or None while it is idle."""
+        """Return the time (ns) at which the worker began its plan, or None while the worker is idle."""
         return None if self._job is None else self._asked_ns
 
     def aim(self, target: Target, now_ns: int) -> None:
@@ -521,7 +521,7 @@ class BdotLaw:
         self._detumbler.sample(time_ns, field)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now."""
+        """Return the present command."""
         currents = self._detumbler.current(now_ns)
         return CoilCommand(currents * self._dipole_per_ampere, currents)
 
