@@ -61,8 +61,8 @@ class PlanningError(UsageError):
     """Error raised if a planner finds no path, or if one of its arguments is out of range.
 
     The message states the reason and the remedy. If the arguments are valid and no path is found, a command
-    ends with status 1. The attribute `is_hopeless` states whether a slew needs so much more than the dipole
-    limit that no other start time would be feasible.
+    ends with status 1. The attribute `is_hopeless` states whether a slew exceeds the dipole limit by so much
+    that no other start time would be feasible.
     """
 
     is_hopeless = False

@@ -1,4 +1,4 @@
-"""Orbit determination of an object from directions alone, sighted from a satellite in a known orbit.
+"""Orbit determination of an object from directions alone, measured on a satellite in a known orbit.
 
 The six unknowns at the middle of the arc are two angles of the direction, the relative velocity divided by
 the distance, and the logarithm of the distance. The sightings of one pass determine the distance poorly and

@@ -182,7 +182,7 @@ def predict(
 
 
 def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> DirectionInnovation:
-    """Return the residual of a direction (3,), with covariance (3, 3), rad^2, from its prediction."""
+    """Return the residual of a measured direction (3,) of covariance (3, 3), rad^2, from `state`."""
     basis = tangent_basis(state.direction)
     residual = basis @ direction / max(float(direction @ state.direction), 1e-3)
     observation = np.hstack([basis, np.zeros((2, 3))])

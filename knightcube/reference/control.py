@@ -186,7 +186,7 @@ class AdaptiveController:
         return made
 
     def reset(self) -> None:
-        """Restart the reference model from the body's state at the next command. The parameters are kept."""
+        """At the next command, restart the reference model from the body's state. The parameters are kept."""
         self._model = None
 
     def _follow(self, wanted: PathSample, angle: float, rate: float) -> PathSample:

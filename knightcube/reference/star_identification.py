@@ -25,10 +25,10 @@ attitude of identified stars by image matching.
 
 - Rate matching: Two frames, or the ends of streaks, give the velocity of each observed point (Michalski,
   section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification algorithms, IEEE TAES 41,
-  2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars, unlike satellites,
-  aircraft and hot pixels. The position of each star is predicted from a previous attitude, which is
-  propagated by the body rate. Without a previous attitude, the pyramid method identifies the remaining
-  points.
+  2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars. Satellites,
+  aircraft and hot pixels do not move with this rate. The position of each star is predicted from a previous
+  attitude, which is propagated by the body rate. Without a previous attitude, the pyramid method identifies
+  the remaining points.
 
 - Geometric voting: For each pair of observed stars, each guide star that forms the same angle with another
   guide star gets one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin,
@@ -732,7 +732,7 @@ def match_images(
     The method AIM (attitude estimation using image matching: Delabie, De Schutter & Vandenbussche, Journal of
     Guidance, Control, and Dynamics 36, 2013) is mentioned in Michalski, section 3.4. The method projects the
     reference stars into an image with a prior attitude. The rotation and translation that move the projected
-    image onto the observed image with the least squared distances have a closed form, derived here
+    image onto the observed image with the smallest sum of squared distances have a closed form, derived here
     independently. The rotation in the image is a rotation about the boresight, and the translation is a tilt
     of the boresight.
 

@@ -356,7 +356,7 @@ MeasuredShape = Callable[[FloatArray, FloatArray], TriangleShape]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleTable:
-    """Guide stars at the corners (t, 3) of triangles, sorted by area, and their polar moments (t,)."""
+    """Triangles of guide stars, sorted by area: indices of the corners (t, 3), and polar moments (t,)."""
 
     corner: npt.NDArray[np.unsignedinteger[npt.NBitBase]]
     area: KVector

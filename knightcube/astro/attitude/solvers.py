@@ -346,11 +346,12 @@ def gain(solution: OlaeSolution, weights: FloatArray) -> FloatArray:
 def olae(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
     """Return the OLAE attitude, with the covariance of the OLAE estimate.
 
-    The reference frame is first rotated by 180 deg about an axis chosen from the TRIAD attitude, which limits
-    the remaining rotation angle to 120 deg and |g| to 1.74. An error e of the observed direction b enters the
-    equation as (1 + [g x]) e, which is larger than e by a factor of up to sqrt(1 + g^2) and anisotropic. The
-    weights 1/sigma^2 are therefore not optimal, and the OLAE attitude differs from the solution of Wahba's
-    problem by an angle of the order of the noise. The arguments and exceptions are those of `Solver`.
+    The reference frame is first rotated by 180 deg. The axis is chosen from the TRIAD attitude so that the
+    remaining rotation angle is at most 120 deg and |g| at most 1.74. An error e of the observed direction b
+    enters the equation as (1 + [g x]) e, which is larger than e by a factor of up to sqrt(1 + g^2) and
+    anisotropic. The weights 1/sigma^2 are therefore not optimal, and the OLAE attitude differs from the
+    solution of Wahba's problem by an angle of the order of the noise. The arguments and exceptions are those
+    of `Solver`.
     """
     seen = sightings(observed, reference, sigma)
     rough = attitude_of_pair(seen, *best_pair(seen, sigma))

@@ -1,13 +1,13 @@
 """Predictions of position, velocity, geomagnetic field and Sun along an orbit.
 
-The function `predict` computes an `Ephemeris`, which takes 0.1 ms per time step, outside the control loop.
-Positions are interpolated by cubic Hermite polynomials, and the field and the Sun linearly. With steps of 10
-s, the interpolation errors are 1 mm and 3 nT.
+The function `predict` computes an `Ephemeris` outside the control loop, in 0.1 ms per time step. Positions
+are interpolated by cubic Hermite polynomials, and the field and the Sun linearly. With steps of 10 s, the
+interpolation errors are 1 mm and 3 nT.
 
-The class `FieldAhead` predicts the geomagnetic field up to an hour ahead within the control loop. Because the
-full model takes 0.2 ms for a single time, each call adds only a few nodes at intervals of one minute, between
-which the field is interpolated linearly. For times after the last node a dipole model is used, whose field
-direction has an RMS error of 9 deg.
+The class `FieldAhead` runs in the control loop and predicts the geomagnetic field up to an hour ahead.
+Because the full model takes 0.2 ms for a single time, each call adds only a few nodes at intervals of one
+minute, between which the field is interpolated linearly. For times after the last node a dipole model is
+used, whose field direction has an RMS error of 9 deg.
 """
 
 from __future__ import annotations

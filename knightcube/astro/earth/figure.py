@@ -21,7 +21,7 @@ SEMI_MINOR_AXIS = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
 
 
 def semi_axes(height: float = 0.0) -> FloatArray:
-    """Return the semi-axes (3,), m, of an ellipsoid at a height (m) above the WGS 84 ellipsoid, pole last.
+    """Return the semi-axes (3,), m, of an ellipsoid at a height (m) above WGS 84, the polar semi-axis last.
 
     The height is added to all semi-axes. At a height of 20 km, this ellipsoid differs from the true surface
     of constant height by centimetres.

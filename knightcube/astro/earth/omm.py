@@ -65,7 +65,7 @@ _YEARS = 1957, 2056
 
 @dataclass(frozen=True, slots=True)
 class NamedElements:
-    """Satellite number and two-line elements of a satellite with a name, which may be empty."""
+    """Name, satellite number and two-line elements of a satellite. The name may be empty."""
 
     name: str
     number: int

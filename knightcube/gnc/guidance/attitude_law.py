@@ -1,8 +1,8 @@
 """Attitude laws: the commanded attitude as a function of time, from two directions or a pointing target.
 
 An attitude law aligns one body axis exactly with a first direction, and a second body axis with a second
-direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, be nadir, the
-velocity or the orbit normal, or point to the Sun or to a point on the ground.
+direction as closely as possible (TRIAD: Black 1964). Possible directions are a direction fixed in inertial
+axes, nadir, the velocity, the orbit normal, and the directions to the Sun and to a point on the ground.
 
 The law of a pointing target aligns the pointing axis with the direction of the target, and the body axis
 `across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
@@ -225,7 +225,7 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that points `axis` (3,) to a `passing` object, without a rotation about `axis`.
 
-    The law starts with the given attitude (4,) after the smallest rotation that aligns `axis`.
+    The law starts with the given attitude (4,), rotated by the smallest rotation that aligns `axis`.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)

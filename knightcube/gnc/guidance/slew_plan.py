@@ -91,7 +91,7 @@ end, and largest error with which the path is accepted after the corrections."""
 def closed(
     craft: SlewCraft, unit: float, along: EnvironmentAt, program: SlewProgram, point: Iterate
 ) -> Trajectory:
-    """Return the trajectory near an iterate `point` that agrees with the integrated motion at all nodes.
+    """Return the trajectory, near an iterate `point`, that agrees with the integrated motion at all nodes.
 
     The unit of dipoles is `unit` A m^2, and the function `along` returns the environment at given times.
     Raises PlanningError if the Newton matrix is singular or the corrections do not converge.
@@ -471,7 +471,8 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
                 raise
             failed = error
         else:
-            # Plans rank by their duration if it was extended, and then by their cost.
+            # Plans of the requested duration rank before extended plans. Extended plans rank by their
+            # duration, and plans of the same duration by their cost.
             if order.time_cost is None:
                 value = (plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0, plan.energy)
             elif math.isinf(order.time_cost):

@@ -526,7 +526,7 @@ class SlewProgram:
         return NewtonStep(change, toward - stiff * limits.along(at, change) - point.dual, off, factors)
 
     def _searched(self, point: Iterate, step: NewtonStep, barrier: float, error: float) -> Iterate | None:
-        """Return an iterate along a Newton step that reduces the error or the merit function, or None."""
+        """Return an iterate, along a Newton step, that reduces the error or the merit function, or None."""
         equal, missed, layout = self._equal, point.slope[self._equal], self.equations.layout
         size = _share(point.slack, self._limits.along(point.at, step.change) + step.off)
         dual = point.dual + _share(point.dual, step.dual) * step.dual

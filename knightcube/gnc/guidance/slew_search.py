@@ -593,7 +593,7 @@ class SlewSearch:
     """
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
-        """Create a search with guesses on `coarse` intervals that ends when the work exceeds `budget`."""
+        """Create a search that starts on `coarse` intervals and ends when the work exceeds `budget`."""
         self._task, self._budget = task, budget
         self.solver = SlewSolver(task)
         self._walker = HorizonContinuation(task, self.solver, _WALKS * budget)

@@ -6,8 +6,8 @@ If no path of the requested duration satisfies the limits, the duration is exten
 duration, and the plan has the status STRETCHED. If the duration has a cost, the duration is optimised as
 well. Energy is the integral of R I^2 in J, without the factor 1/2 of Sease, eq. (5.1).
 
-Every search for a duration (`horizon`) minimises energy plus time cost times duration, between a shortest and
-a longest duration. With a time cost far above the power of the coil, and the requested duration as lower
+Every search for a duration (`horizon`) between a shortest and a longest duration minimises energy plus time
+cost times duration. With a time cost far above the power of the coil, and the requested duration as lower
 bound, the search returns the requested duration if this duration is feasible, and otherwise the shortest
 feasible duration. The planner therefore never has to solve an infeasible nonlinear program.
 
