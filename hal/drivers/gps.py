@@ -64,7 +64,7 @@ PORT_KEYS = {
     UART2: (0x10750001, 0x10760001, 0x10760002, 0x20910008),
     USB: (0x10770001, 0x10780001, 0x10780002, 0x20910009),
 }
-"""Keys of each port for input of UBX, output of UBX, output of NMEA, and the rate of NAV-PVT."""
+"""CFG-VALSET keys of each port: input of UBX, output of UBX, output of NMEA, and rate of NAV-PVT."""
 RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, DYNAMIC_MODEL = 0x30210001, 0x30210002, 0x20210003, 0x20110021
 """Configuration keys of CFG-VALSET; the first hexadecimal digit of a key determines the size of its value."""
 AIRBORNE_4G = 8
@@ -647,7 +647,7 @@ class NmeaReceiver:
         """
         self._port, self._clock, self._earliest_ns = port, clock, earliest_ns
         self._buffer = b""
-        self._halves: dict[str, tuple[int, list[str]]] = {}  # by name: time (ns) of the first byte, fields
+        self._halves: dict[str, tuple[int, list[str]]] = {}  # by sentence: time (ns) of first byte, fields
         self._height: tuple[float, float] | None = None  # seconds of the day and altitude (m) of the last fix
         self._bytes = self._sentences = self._bad = self._discarded = 0
         self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0

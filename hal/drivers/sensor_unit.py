@@ -39,7 +39,7 @@ _ALIKE = 10
 _STUCK_S, _AGAIN_S = 3, 60
 """Time (s) of equal values after which the sensors are started again, and interval of further starts."""
 LARGEST_RATE = math.radians(2000.0)
-"""Default of the largest accepted body rate per axis, rad/s: the range of common gyros."""
+"""Default of the largest accepted body rate (rad/s) per axis, which is the range of common gyros."""
 _NORM_TOLERANCE = 1e-2
 """Largest accepted deviation of a quaternion's norm from 1."""
 _RANGED = "gyro", "magnetic"
@@ -112,9 +112,9 @@ class UnitSettings:
 
     Attributes:
         mounting: (3, 3) rotation matrix from unit axes into body axes.
-        gyro_matrix: (3, 3) matrix from the rate to the rate that the gyro measures, body axes.
-        field_matrix: (3, 3) matrix from the magnetic field to the field that the magnetometer measures,
-            without its bias, body axes.
+        gyro_matrix: (3, 3) matrix from the true to the measured rate, body axes.
+        field_matrix: (3, 3) matrix from the true to the measured magnetic field, body axes, without the
+            magnetometer's bias.
         field_bias: (3,) bias of the magnetometer, T, body axes.
         rate_hz: samples per second.
         rate_range: largest accepted body rate per axis, rad/s.
@@ -130,10 +130,10 @@ class UnitSettings:
     field_range: float
 
     def body_maps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the maps (3, 3) of measured to true rate and field, and an offset (3,) of the field, T.
+        """Return matrices (3, 3) that correct measured rate and field, and an offset of the field (3,), T.
 
-        The true rate and field are in body axes. The offset is caused by the magnetometer's bias, and is
-        subtracted from the mapped field.
+        The corrected rate and field are in body axes. The offset is caused by the magnetometer's bias, and is
+        subtracted from the corrected field.
         """
         gyro, magnetometer = (
             np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in (self.gyro_matrix, self.field_matrix)

@@ -248,8 +248,8 @@ class Recovery:
     ) -> None:
         """Advance the recovery by one poll, which received `sentences` and the given number of `readings`.
 
-        `received` and `packets` are the numbers of bytes and of valid packets, including those with unknown
-        fields, since the start of the driver. Raises NotResponding if the port is lost.
+        `received` is the number of bytes since the start of the driver, and `packets` the number of valid
+        packets, including those with unknown fields. Raises NotResponding if the port is lost.
         """
         if self._reading_ns is None:
             self._reading_ns = now_ns
