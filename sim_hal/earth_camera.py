@@ -56,8 +56,7 @@ class EarthScene:
         position: geocentric position (3,) of the camera, m, ICRS.
         attitude: quaternion (4,) of the camera, ICRS into camera axes.
         sun: geocentric position (3,) of the Sun, m, ICRS.
-        pole: unit vector (3,) to the Earth's pole, ICRS, whose default is 0.15 deg from the true pole in
-            2026.
+        pole: unit vector (3,) to the Earth's pole, ICRS. The default is 0.15 deg from the true pole in 2026.
         rotation: rotation angle of the Earth about its pole, rad.
         texture: random seed of the map of land, sea and cloud.
         atmosphere: the air.
@@ -172,7 +171,7 @@ def visible_share(scene: EarthScene) -> float:
 
 
 def darkening(share: FloatArray) -> FloatArray:
-    """Return the brightness (...) of the Sun's disc at squared radii (limb: 1), relative to its mean."""
+    """Return the Sun's brightness (...) relative to the disc's mean, at squared radii from 0 to 1 (limb)."""
     rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
     return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
 

@@ -144,7 +144,7 @@ def albedo(directions: Float32Array, noise: npt.NDArray[np.int64]) -> Float32Arr
 
 
 def _covered(heights: Float32Array, share: float) -> Float32Array:
-    """Return the fraction (n,), with the mean `share`, that land or cloud covers at noise values (n,)."""
+    """Return the fraction (n,) covered by land or cloud at noise values (n,); its mean is `share`."""
     above = (heights - np.float32(ndtri(1.0 - share))) / np.float32(_SOFT) + np.float32(0.5)
     return np.asarray(np.clip(above, 0.0, 1.0))
 

@@ -1,4 +1,4 @@
-"""Interface of the simulator to the flight application, which opens emulated devices with their faults.
+"""Interface by which the flight application opens emulated devices with their faults.
 
 In lock-step the devices run in the flight process and advance while the flight loop sleeps. The clock jumps
 from event to event, and repeated runs are identical. In real time the devices run in a server process

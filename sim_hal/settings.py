@@ -124,8 +124,8 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
     Otherwise the body is the satellite of the flight configuration, with the true values that `craft`
     contains.
 
-    `errors` is the largest error of the configured description of body, coils and sensors, as a multiple of
-    the configured accuracies (`sim_hal.description_errors`).
+    `errors` is the ratio of the largest errors of the configured properties of body, coils and sensors to
+    their configured accuracies (`sim_hal.description_errors`).
     """
 
     craft: Literal["knightcube", "cubesat_3u"] | CraftSection | None = None

@@ -5,8 +5,8 @@ duration of a transaction (0.6 ms for 24 bytes at 400 kHz) is not modelled, exce
 the transaction until the timeout.
 
 SMBus transfers are emulated by I2C messages, as in a Linux adapter without SMBus hardware. The transfer codes
-and the data layout are those of linux/i2c.h (union i2c_smbus_data), with little-endian words. Block reads
-whose length is sent by the chip, packet error checking and ten-bit addresses are not supported.
+and the data layout are those of linux/i2c.h (union i2c_smbus_data), with little-endian words. Packet error
+checking, ten-bit addresses, and block reads whose length is sent by the chip are not supported.
 """
 
 from __future__ import annotations

@@ -326,11 +326,11 @@ def _used(cosine: float, grazing: float) -> float:
 
 @lru_cache(maxsize=8)
 def _ground_in_view(steps: int) -> tuple[FloatArray, FloatArray, float]:
-    """Return directions (m, 3) to ground points, unit verticals (m, 3) at these points, and a solid angle.
+    """Return directions (m, 3) to ground points, unit verticals (m, 3) there, and each point's solid angle.
 
     The distance from the centre of the Earth is `steps` times `_DISTANCE_STEP`. The third axis of the vectors
     points to the centre of the Earth. The directions sample the visible disc of the Earth in rings of equal
-    solid angle. The returned solid angle (sr) is the part of the disc that each direction represents.
+    solid angle. The returned solid angle (sr) is that part of the disc which each direction represents.
     """
     distance = steps * _DISTANCE_STEP
     widest = math.sqrt(1.0 - (EARTH_RADIUS / distance) ** 2)

@@ -89,7 +89,7 @@ class Vn100Sample:
     """One sample of the unit, in sensor axes and the unit's own units.
 
     Attributes:
-        quaternion: attitude (4,), NED into sensor, which the unit calls q0 to q3.
+        quaternion: attitude (4,), NED into sensor, with the elements that the unit calls q0 to q3.
         rate: rotation rate (3,), rad/s.
         mag: magnetic field (3,), gauss.
         accel: specific force (3,), m/s^2.
@@ -212,7 +212,8 @@ class MessageData(NamedTuple):
         device_ns: time of the unit's clock since the unit's start, ns.
         sample: measured sample.
         status: status word of the attitude filter (VPE).
-        interval: time since the previous output of the same kind, s, over which changes are integrated.
+        interval: time since the previous output of the same kind, s, the integration time of delta angles and
+            delta velocities.
         temperature: reported temperature, degrees C.
         pressure: reported pressure, kPa.
     """

@@ -424,7 +424,7 @@ class AlteredPart:
         write: Callable[[int, bytes], None] | None = None,
         read: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        """Use `write` instead of the method `write` of the chip, and alter the data of the chip by `read`."""
+        """Use `write` instead of the chip's own method, and alter the data that the chip sends by `read`."""
         self._part = part
         self._write = write or part.write
         self._read = read or (lambda data: data)

@@ -587,7 +587,7 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""Largest ratio of charge (e-) to background noise variance (e-^2) in pixels with Gaussian noise only."""
+"""Largest ratio of charge (e-) to background noise variance (e-^2) for drawing all noise as one Gaussian."""
 GREATEST_SKEWNESS = 0.05
 """Largest skewness of noise that is drawn as Gaussian.
 
@@ -655,7 +655,7 @@ def standard_normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32
     words = rng.integers(0, 2**64, size=(count + 3) // 4, dtype=np.uint64)
     slices = words.view(np.uint16)[:count]
     normal = _slice_middles().take(slices)
-    # The 16-bit sum wraps around, so that it is below 2 * OUTER_SLICES for the slices of both tails only.
+    # The 16-bit sum wraps around, so that only the slices of both tails give sums below 2 * OUTER_SLICES.
     outer = np.flatnonzero(slices + np.uint16(OUTER_SLICES) < 2 * OUTER_SLICES)
     chance = (slices[outer] + rng.uniform(2.0**-32, 1.0, size=len(outer))) / SLICES
     normal[outer] = ndtri(chance)
@@ -842,7 +842,7 @@ def _alone(own: OwnTimes, times: FloatArray) -> FloatArray:
 
 
 def _near_the_field(camera: Pinhole, directions: FloatArray, boresights: FloatArray, margin: int) -> IntArray:
-    """Return the indices of the stars that the field of view may cross along `boresights` (j, 3)."""
+    """Return the indices of the stars that are possibly in view along the path of the `boresights` (j, 3)."""
     middle = boresights.sum(axis=0)
     length = float(np.linalg.norm(middle))
     if length < 0.5 * len(boresights):

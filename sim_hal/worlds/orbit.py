@@ -250,7 +250,7 @@ def misfit(
     distance between the orbits in this revolution is limited. The tolerances also hold for an orbit that is
     described by mean elements instead of osculating ones: J2 varies the semi-major axis by the fraction k =
     3/2 J2 (R/p)^2 and the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid
-    elements, and OrbitError if SGP4 cannot propagate them to the first revolution.
+    elements, and OrbitError if SGP4 cannot propagate them over the first revolution.
     """
     date = julian_date(utc)
     start, known = elements(orbit, date, key), TwoLineElements(*lines)
