@@ -84,7 +84,7 @@ def _line(device: str, root: Path) -> list[str]:
 
 
 def plain(path: str) -> str:
-    """Return a path of the configuration, which root writes to a unit file.
+    """Check a path of the configuration for use in a unit file, and return the path.
 
     Raises UsageError for a relative path, and for a path that could change the meaning of the unit file.
     """

@@ -138,8 +138,8 @@ def unpack(bundle: Path, kind: str, folder: Path) -> None:
 def unpack_sources(archive: Path, folder: Path) -> None:
     """Unpack the regular files and folders of a release, a tar archive without compression.
 
-    The unpacked files are at most as large as the archive, because sparse files are refused. Raises Refused
-    for sparse files, members of any other type, and too many members, and OSError.
+    The unpacked files are at most as large as the archive, because sparse files are refused. Raises OSError,
+    and Refused for too many members, sparse files, and members that are neither file nor folder.
     """
     folder.mkdir()
     try:

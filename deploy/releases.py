@@ -37,7 +37,7 @@ _OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|kn
 
 
 def files_of(release: Path) -> Iterator[Path]:
-    """Yield the files of a release, except its manifest and a virtual environment behind a symbolic link."""
+    """Yield the files of a release, except its manifest and the files in folders that are symbolic links."""
     for folder, folders, names in os.walk(release):
         folders.sort()
         yield from (Path(folder, name) for name in sorted(names) if Path(folder, name) != release / MANIFEST)

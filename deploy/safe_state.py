@@ -71,7 +71,7 @@ class Tries:
     def keep(self, now: float) -> None:
         """Store the number and the time `now` (s) of this attempt to start the flight.
 
-        Nothing is stored if there is no folder or writing fails.
+        Nothing is stored without a folder, or if writing fails.
         """
         if not self._path:
             return
