@@ -316,12 +316,11 @@ def chip_at(bus: I2cBus, address: int) -> str | None:
 def talker(
     rig: Rig, device: str, rates: tuple[int, ...], period_ns: int = _LISTEN_NS
 ) -> tuple[str, int, float]:
-    """Return which kind of device sends on a serial line, its baud rate, and its longest sending pause, s.
+    """Return the kind of the device that sends on a serial line, its baud rate, and its longest pause, s.
 
     The kind is `vn100` or `gps`, or "" if none is recognised. The pause is 0 for a device that sends
     regularly. The baud rates `rates` are tried first, and then all baud rates of a VN-100. The first rate is
-    tried for at least `period_ns`, because the last flight may have set the device to this interval between
-    messages.
+    tried for at least `period_ns`, because the last flight may have set this interval between messages.
     """
     listened_ns = max(_LISTEN_NS, period_ns)
     for rate in dict.fromkeys((*rates, *BAUD_RATES)):

@@ -152,7 +152,7 @@ def step_light(session: Session) -> Outcome:
 
 
 def _size_changes(camera: Camera, pixels: Image) -> dict[str, Any]:
-    """Return changes of the configured columns and rows, or no changes if the frame has these already."""
+    """Return the changes of the configured columns and rows that a frame's size requires, if any."""
     if pixels.shape == (camera.rows, camera.columns):
         return {}
     return {"camera": {"columns": pixels.shape[1], "rows": pixels.shape[0]}}
@@ -316,7 +316,7 @@ def step_wide(session: Session) -> Outcome:
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
-    """Return the cameras whose covering darkens a frame.
+    """Return the cameras that darken the frame of one camera when they are covered.
 
     The frame is `pixels` if no camera is covered, and `covered[key]` if camera `key` is covered.
     """

@@ -36,7 +36,7 @@ RECOGNISED = math.radians(25.0)
 ASKEW = math.radians(15.0)
 """Largest accepted angle (rad) between a coil's expected and measured field if the sensor axes are exact."""
 FEWEST = 20
-"""Smallest number of samples that determines the noise."""
+"""Smallest number of samples from which the noise is determined."""
 ALIKE = math.radians(15.0)
 """Largest angle (rad) between the axes of two sensors that count as equally mounted."""
 SCALE = 0.1
