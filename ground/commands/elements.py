@@ -45,7 +45,7 @@ _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
 _WANTED = f"{', '.join(_COLUMNS)} and, if known, {', '.join(_VELOCITY)}"
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")
 _LONGEST_DAYS = 30.0
-"""Longest span (days) of a prediction, because the times of later passes are too uncertain."""
+"""Longest span (days) of a prediction. Times of later passes would be too uncertain."""
 _UNCERTAIN_S = 10.0  # standard deviation of the predicted times (s) above which a warning is printed
 _LEAD_S = 120.0
 """Default time (s) before the satellite's rise at which it is commanded to slew to the station."""

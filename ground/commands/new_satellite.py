@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _written(answers: Answers, force: bool) -> tuple[dict[str, Any], str]:
-    """Write the file, and return the result for the option `--json` and as text. Raises UsageError."""
+    """Write the file, and return the result as values for `--json` and as text. Raises UsageError."""
     path, satellite = answers.path(), satellite_of(answers.values)
     date = julian_date(satellite.utc)
     values, made = description.derived(satellite, date), elements_of(satellite.orbit, date)

@@ -436,7 +436,7 @@ def _write_signed(path: Path, signed: T, signers: Iterable[CryptoSigner]) -> Pat
 
 
 def _signed_bytes(signed: T, signers: Iterable[CryptoSigner]) -> bytes:
-    """Return the content of a file of metadata with their signatures."""
+    """Return the content of a file with metadata and their signatures."""
     metadata = Metadata(signed)
     for signer in signers:
         metadata.sign(signer, append=True)

@@ -242,7 +242,7 @@ def _command_by_link(options: argparse.Namespace) -> int:
 
 
 def _hint(options: argparse.Namespace) -> str:
-    """Return a hint on where the mode that a command starts is shown; empty if it changes no mode."""
+    """Return a hint on how to see the mode that a command starts; empty if the command changes no mode."""
     if options.what not in commands.LAYOUTS:
         return ""
     mode = final_mode(_command_of(options))
@@ -609,7 +609,7 @@ class _FileWork:
                 sys.stderr.write(f"knightcube: {error}; tried again\n")
 
     def _turn(self, name: str) -> None:
-        """Receive and send what is due. Raises KnightCubeError after a signal or a long silence."""
+        """Receive packets, and send due packets. Raises KnightCubeError after a signal or a long silence."""
         if select.select([self._terminal], [], [], _TURN_S)[0]:
             self._try(lambda: self._session.take(self._terminal.take(), time.monotonic_ns()))
         now_ns = time.monotonic_ns()

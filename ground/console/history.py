@@ -225,7 +225,7 @@ class PageState:
         self._shown: dict[str, int] = {}
 
     def reset(self) -> None:
-        """Make the next state complete instead of limited to the changes since the previous state."""
+        """Make the next state complete, so that it does not depend on earlier states."""
         self._shown.clear()
 
     def at(self, time_ns: int, names: Mapping[str, Any]) -> Object:

@@ -148,7 +148,7 @@ class Console:
                 f"restarts of the flight: {self.restarts}; the page shows the packets since the last restart"
             )
         self.trouble = "; ".join(doubts)
-        # Packets of one time may arrive in two reads, so the page omits the times of the newest read.
+        # Packets of the same time may arrive in two reads, so the page omits the times of the newest read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):

@@ -150,7 +150,7 @@ class FrameFolder:
             return None
 
     def picture(self, sequence: int) -> bytes | None:
-        """Return a frame as PNG, binned to the size of the page and stretched, or None if it was not kept."""
+        """Return a frame as PNG, binned for the page, with stretched contrast, or None if it was not kept."""
         data = self._read(sequence)
         try:
             return None if data is None else png(stretched(binned(pixels_of(data))))

@@ -471,7 +471,7 @@ class FileSession:
         return self.ended(name) or completed
 
     def close(self, now_ns: int) -> None:
-        """Store the received data, and the beginnings of incomplete logs as received logs.
+        """Store the received data; the beginning of an incomplete log is stored as a received log.
 
         A flight log is readable up to its last whole packet, so that its beginning can be evaluated before
         the transfer is complete. Raises FileError if the disk cannot be written.

@@ -209,7 +209,7 @@ class Gateway:
     def __init__(
         self, terminal: Terminal, address: str, token: str, complain: Callable[[str], object]
     ) -> None:
-        """Listen on HOST:PORT of loopback, and pass each refusal to `complain`. Raises UsageError."""
+        """Listen on the loopback address HOST:PORT, and report refusals by `complain`. Raises UsageError."""
         self._terminal = terminal
         self._token = token
         self._reported = -_REPORT_S

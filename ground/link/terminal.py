@@ -424,7 +424,7 @@ class StreamGround:
 
 
 def _nothing() -> None:
-    """Do nothing: the function to close a stream while no stream is open."""
+    """Close nothing, because no stream is open."""
 
 
 def _serial_port(place: str) -> Opened:
