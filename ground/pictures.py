@@ -163,7 +163,7 @@ def _draw_compass(
     origin = np.array([1.6 * size, shape[0] - 1.6 * size])
     assert solution.fix is not None
     roll = Pointing.of(solution.fix.quaternion).roll
-    # Up in the picture has the position angle `roll`, counted from north to east. East is left of north.
+    # The picture's upward direction has the position angle `roll`, from north to east. East is left of north.
     north = np.array([np.sin(roll), -np.cos(roll)])
     east = np.array([north[1], -north[0]])
     if solution.mirrored:

@@ -3,7 +3,7 @@
 The reader counts every byte, inside or outside packets. The packets of a run are exported to CSV files,
 Parquet files, or one SQLite database, with the same columns: the first column is the mission time `time_s`,
 and an array has one column per element, such as quaternion_1 to quaternion_4. Numbers are written with full
-precision. The table of events also has their UTC.
+precision. The table of events also contains the UTC of each event.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def with_sorted_events(packets: Mapping[str, PacketArray]) -> dict[str, PacketAr
 
 @dataclass(frozen=True)
 class Run:
-    """The packets of the logs in the folder of a run, with the events in the order of their times.
+    """Packets of the logs in the folder of a run. The events are in the order of their times.
 
     `truth` and `performance` are empty if the run has no such log.
     """

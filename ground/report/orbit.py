@@ -186,7 +186,7 @@ def camera_errors(run: Run) -> AttitudeErrors:
     errors, packets, true = attitude_errors(run), run["description"], run["true_description"]
     if not len(packets) or not len(true) or not len(errors.times):
         return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    # The estimated misalignment changes slowly, so the attitude error of the same control cycle is used.
+    # The attitude error is that of the same control cycle; the estimated misalignment changes slowly.
     at = np.minimum(np.searchsorted(errors.times, seconds(packets)), len(errors.times) - 1)
     inside = np.abs(errors.times[at] - seconds(packets)) < _SAME_CYCLE_S
     packets, at = packets[inside], at[inside]

@@ -289,7 +289,7 @@ def _error_bars(ax: Axes, time: FloatArray, rate: FloatArray, sigma: FloatArray,
 
 
 def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
-    """Draw, for each named set of times (s), the fraction longer than x over x, and a line at `bound`, s.
+    """Draw for each named set the fraction of times (s) above x as a function of x, and a line at `bound`.
 
     Both axes are logarithmic, so that one late cycle in thousands is as visible as the median. Times of zero,
     such as the lateness in lock-step, cannot be drawn on logarithmic axes and are stated in the legend.

@@ -326,7 +326,10 @@ def _rms(values: FloatArray) -> float:
 
 
 def _error_figures(error: FloatArray, packed: FloatArray) -> Object:
-    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3 over positive definite P."""
+    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3.
+
+    The mean is over the positive definite covariances P in `packed`.
+    """
     found: Object = {"compared": len(error), "rms_error": None, "normalised": None}
     if len(error):
         found["rms_error"] = np.sqrt(np.mean(error**2, axis=0)).tolist()

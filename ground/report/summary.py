@@ -318,7 +318,7 @@ def _battery(run: Run) -> Object:
         errors = judged["charge"] - at
         errors = errors[np.isfinite(errors)]
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
-        # The power (W) in a packet applies since the previous packet; before the first packet, for 1 s.
+        # A packet's power (W) applies to the time since the previous packet, or to 1 s in the first packet.
         spans = np.diff(signals.seconds(true), prepend=signals.seconds(true)[0] - _TRUE_POWER_S)
         sums = [float(spans @ true[f"{name}_power"].astype(float)) for name in ("solar", "load", "coil")]
         values = [rms, float(true["charge"].min()), float(true["charge"][-1]), *sums]

@@ -13,7 +13,7 @@ from ground.telemetry import date_of
 
 Object = dict[str, Any]
 Column = tuple[str, int, float] | Callable[[Object], str]
-"""Column of a table: key of the rows' number, its decimals and its scale, or a function of the row."""
+"""Column of a table: key, decimals and scale of a number in a row, or a function that formats a row."""
 
 ARCSECONDS = 648_000.0 / math.pi
 DEGREES = 180.0 / math.pi
