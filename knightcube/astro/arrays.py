@@ -66,7 +66,7 @@ def real_number(value: object) -> float:
 
 
 def check_numbers(**given: object) -> None:
-    """Raise ArgumentError, with the name of the argument, unless all arguments are numbers."""
+    """Raise ArgumentError with the name of the argument if an argument is not a number."""
     for name, value in given.items():
         if not _is_number(value):
             raise ArgumentError(name, f"{brief(value)}: give a number")

@@ -337,7 +337,7 @@ def matching_triangles(
 
 
 def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the indices (k,) in `right` and (k,) in `left` of the values of all pairs of equal values."""
+    """Return the indices (k,) in `right` and the indices (k,) in `left` of all pairs of equal values."""
     order = np.argsort(right, kind="stable")
     ranked = right[order]
     place, of = members(np.searchsorted(ranked, left), np.searchsorted(ranked, left, side="right"))

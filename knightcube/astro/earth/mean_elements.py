@@ -142,7 +142,7 @@ class _Fit:
         return _first_guess(np.array([first, second]))
 
     def solve(self, parameters: FloatArray, used: BoolArray) -> Any:
-        """Return the least-squares solution for the states selected by `used`, from first `parameters`."""
+        """Return the least-squares solution for the states selected by `used`, started at `parameters`."""
 
         def residuals(values: FloatArray) -> FloatArray:
             made = _satellite(values, self.epoch)

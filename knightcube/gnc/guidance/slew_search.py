@@ -392,7 +392,7 @@ _CROSSED = 1.3
 """Widening of a cone that a path crosses between two points, divided by the depth of the path inside the
 cone."""
 _BEYOND = math.radians(0.02)
-"""Angle (rad) that is added to this widening of a cone."""
+"""Angle (rad) that is added to the widening of a crossed cone."""
 _BETWEEN = 16
 """Number of intervals of an intermediate grid, used if a path from the coarse grid does not converge directly
 on the fine grid."""
@@ -415,7 +415,7 @@ class HorizonContinuation:
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return a path within the limits on the fine grid, found from a coarse path without dipole limit."""
+        """Return a path within the limits on the fine grid, found from a coarse path without the limits."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
