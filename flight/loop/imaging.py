@@ -611,6 +611,7 @@ class Imaging:
         self._spare = True  # whether there was time to search the last frame for objects
         self._searches, self._frame_every, self._turn = True, 1, 0
         self._shed = self._late = 0
+        self._pause_ns = 0  # time between the exposures of the last two frames
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and the number of rates from streaks that the filter accepted."""
@@ -643,7 +644,8 @@ class Imaging:
     def workload(self) -> tuple[int, int]:
         """Return the number of omitted exposures, and the number of frames that were late.
 
-        A frame is late if it arrives while the worker is busy, or if its processing takes too long.
+        A frame is late if it arrives while the worker is busy, or if its processing takes longer than
+        `slow_ns` and than half the time since the preceding frame.
         """
         return self._shed, self._late
 
@@ -716,8 +718,9 @@ class Imaging:
             return
         self._due_ns = None
         # The age of a frame is measured from the end of its exposure, not from its arrival.
-        self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
-        age_ns = now_ns - self._last_frame_ns
+        end_ns = frame.exposure_start_ns + frame.exposure_ns
+        self._pause_ns, self._last_frame_ns = end_ns - self._last_frame_ns, end_ns
+        age_ns = now_ns - end_ns
         late = age_ns > self._settings.max_age_ns
         text = f"frame {frame.sequence} arrives {age_ns * 1e-9:.1f} s after its exposure"
         self._facts.update(facts.CAMERA_LOST, late, now_ns, text)
@@ -760,7 +763,7 @@ class Imaging:
         frame, self._frame = self._frame, None
         if frame is None:
             return
-        self._late += now_ns - self._busy_since_ns > self._settings.slow_ns
+        self._late += now_ns - self._busy_since_ns > max(self._settings.slow_ns, self._pause_ns // 2)
         self._judge_speed(now_ns)
         if result.outcome != "done":
             self._events.report(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")

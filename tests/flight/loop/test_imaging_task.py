@@ -674,6 +674,12 @@ def test_late_frames_are_those_that_meet_a_busy_worker_or_take_too_long() -> Non
     bench.take(4, 5 * S, 5300 * MS)
     bench.finish(FrameFound(motion(), None), 7300 * MS + 1)
     assert bench.task.workload() == (0, 2)
+    bench.take(5, 15 * S, 15300 * MS)
+    bench.finish(FrameFound(motion(), None), 20300 * MS)
+    assert bench.task.workload() == (0, 2), "the worker is busy half of the time between two frames"
+    bench.take(6, 25 * S, 25300 * MS)
+    bench.finish(FrameFound(motion(), None), 30300 * MS + 1)
+    assert bench.task.workload() == (0, 3)
 
 
 def test_a_problem_of_the_worker_is_reported() -> None:
