@@ -415,7 +415,7 @@ class HorizonContinuation:
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return a path within the limits on the fine grid, found from a coarse path without the limits."""
+        """Return a path within the limits on the fine grid, from a coarse path without the dipole limit."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
