@@ -476,7 +476,7 @@ FIX = _packet("fix", 0x119, "0.1 Hz", "Fix of the GPS receiver of a satellite in
     _real("velocity", "m/s", "velocity with respect to the ground, ITRS", 3),
     Field("sigma", "f4", "m", "standard deviation of the position per axis; NaN if unknown"),
     _sigma("velocity_sigma", "m/s", "standard deviation of the velocity per axis; NaN if unknown"),
-    Field("satellites", "u1", "-", "number of GPS satellites"),
+    Field("satellites", "u1", "-", "number of navigation satellites in use"),
     flag("used", "whether the orbit was updated"),
     _real("clock_off", "s", "host's UTC minus the UTC of the newest used fix; NaN before a fix"),
 )
