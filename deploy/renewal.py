@@ -46,7 +46,7 @@ LONGEST_TEXT = 120
 READS = 3
 """Number of attempts to read a stored file, because a single failed disk access does not mean damage."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
-"""Numbers of stored reports, and of stored names of executed requests."""
+"""Maximum number of stored reports, and of stored names of executed requests."""
 MOST_HOURS, MOST_DIGITS = 2400.0, 11
 """Longest trial (h), and maximum number of digits of the mission time (s since 1970) in a request."""
 KINDS = ("configuration", "elements", "catalogue", "release")

@@ -16,7 +16,7 @@ A word in a title weighs 1,000 times as much as a word in the text.
 
 
 def on_startup(*, command: str, **_: Any) -> None:
-    """Build without garbage collection, which would take a tenth of the time and free little memory."""
+    """Build without garbage collection, which takes a tenth of the build time and frees little memory."""
     if command == "build":
         gc.disable()
 

@@ -72,7 +72,7 @@ class ScanResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of packets of each packet type that was found, by name."""
+        """Number of packets of each packet type in the data, by name."""
         return {name: len(array) for name, array in self.packets.items() if len(array)}
 
     @property

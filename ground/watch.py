@@ -57,7 +57,7 @@ _KEPT_EVENTS = 200
 _MAX_TIME = 1e15  # mission time (s) above which a packet is assumed to be damaged
 _TIMEOUT_S = 2.0  # longest time (s) to wait for the answer to a ping
 _FROM_START_S = 0.1  # latest mission time (s) of the first packet of a complete log
-_REPEATED = frozenset({"run", "parameters"})  # packets that a flight sends at its start and again later
+_REPEATED = frozenset({"run", "parameters"})  # packets that a flight sends at its start and repeats later
 _OF_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name, "run"})
 """Packets that the link process sends even if no flight runs."""
 _OF_EACH_FLIGHT = frozenset({ATTITUDE.name, HEALTH.name})

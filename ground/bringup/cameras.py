@@ -316,7 +316,7 @@ def step_wide(session: Session) -> Outcome:
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
-    """Return the cameras that darken the frame of one camera when they are covered.
+    """Return the cameras whose cover darkens the frame of a given camera.
 
     The frame is `pixels` if no camera is covered, and `covered[key]` if camera `key` is covered.
     """

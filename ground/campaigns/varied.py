@@ -46,7 +46,7 @@ Draw = Callable[[np.random.Generator, float], Any]
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """Configuration value that is drawn for each flight.
+    """Configuration value that is drawn at random for each flight.
 
     Attributes:
         key: dotted key of the configuration, such as `craft.inertia` or `targets[0].at`.

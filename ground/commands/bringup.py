@@ -80,7 +80,8 @@ def run(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     kept = {} if options.again else _kept(options.out / REPORT, key)
-    # A device that was missing may be connected now. Steps that were skipped without it are not stored.
+    # A device that was missing may be connected now. Steps that were skipped without the device are not
+    # stored.
     if "find" in kept and kept["find"].findings:
         del kept["find"]
     wanted = options.only or [name for name in steps_of(config) if name not in kept]

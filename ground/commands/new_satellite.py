@@ -32,7 +32,7 @@ _WEAK = 3.0
 """Smallest ratio of the coils' torque to the worst disturbance torque for which no warning is printed."""
 
 _LOW_INCLINATION = 10.0
-"""Smallest inclination (deg) without a warning. At 0 deg, a 3U pointed to nadir within 19 deg rms."""
+"""Smallest inclination (deg) without a warning. At 0 deg, a simulated 3U held nadir within 19 deg rms."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -201,7 +201,7 @@ def _number(name: str, field: Field, given: Any) -> float | int:
 class LinkFeed:
     """Live telemetry and commands over a link. One thread calls `new`, and other threads may call `send`.
 
-    Packets of playback are not shown, because they are older than the live packets. The attribute `lock`
+    Played-back packets are not shown, because they are older than the live packets. The attribute `lock`
     protects the terminal and an open file session.
 
     Attributes:

@@ -276,9 +276,9 @@ def change_key(
     """Change the key of SPI `changed` by a command that is protected with the key of `spi`.
 
     The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
-    confirmed it. If the result of an earlier change is unknown, a ping protected with that change's new key
-    is sent first. Raises UsageError if the satellite would refuse the change, and KnightCubeError if the new
-    key cannot be stored or no answer arrives.
+    confirmed it. If the result of an earlier change is unknown, a ping with the new key of that change is
+    sent first. Raises UsageError if the satellite would refuse the change, and KnightCubeError if the new key
+    cannot be stored or no answer arrives.
     """
     if not may_change(spi, changed):
         raise UsageError(

@@ -140,7 +140,7 @@ def legend(ax: Axes) -> None:
 
 
 def plain_ticks(ax: Axes) -> None:
-    """Label the logarithmic y axis with plain numbers, at 1, 2 and 5 times powers of ten if it is short."""
+    """Label the logarithmic y axis with plain numbers, at 1, 2 and 5 times powers of ten on a short axis."""
     low, high = ax.get_ylim()
     subs = (1.0, 2.0, 5.0) if high < MAX_SHORT * low else (1.0,)
     ax.yaxis.set_major_locator(LogLocator(subs=subs))
