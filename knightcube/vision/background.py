@@ -108,7 +108,7 @@ def _place(pixel: float, pixels: int, blocks: int) -> tuple[int, int, float]:
 
 @loop_helper
 def _fill_row(signal: Image, pixels: Image, above: Image, below: Image, share: np.float32) -> None:
-    """Write the `pixels` of a row minus the level, interpolated between the values `above` and `below`."""
+    """Write the `pixels` of a row minus their level, interpolated from `above` and `below`, to `signal`."""
     for column in range(len(signal)):
         level = above[column] + share * (below[column] - above[column])
         signal[column] = np.float32(pixels[column]) - level
@@ -116,7 +116,7 @@ def _fill_row(signal: Image, pixels: Image, above: Image, below: Image, share: n
 
 @loop_helper
 def _interpolate(out: Image, above: Image, below: Image, share: np.float32) -> None:
-    """Write the values of a row, interpolated between the values `above` and `below`."""
+    """Write the values of a row, interpolated between the rows `above` and `below`, to `out`."""
     for column in range(len(out)):
         out[column] = above[column] + share * (below[column] - above[column])
 
@@ -263,7 +263,7 @@ def _median_of_neighbours_numpy(grid: FloatArray) -> FloatArray:
 def _sorted_three(
     one: FloatArray, two: FloatArray, three: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return minimum, median and maximum of the elements of three arrays of the same shape."""
+    """Return the elementwise minimum, median and maximum of three arrays of the same shape."""
     less, more = np.minimum(one, two), np.maximum(one, two)
     return np.minimum(less, three), np.maximum(less, np.minimum(more, three)), np.maximum(more, three)
 
@@ -407,7 +407,7 @@ def _sorted_moments(ordered: Float32Array) -> tuple[FloatArray, FloatArray]:
 
 @loop_helper
 def _ranked(ordered: Float32Array, middle: np.float32, rank: int) -> np.float32:
-    """Return the deviation from `middle` of given rank, counted from 0, among ascending values (k,)."""
+    """Return the deviation of the given `rank` (0: smallest) from `middle`, of ascending values (k,)."""
     # The `rank` + 1 smallest deviations belong to the values from `low` to `low` + `rank`.
     low, high = 0, len(ordered) - 1 - rank
     while low < high:

@@ -322,7 +322,7 @@ def find_hot_pixels(signal: Image, variance: Image, least: float) -> tuple[IntAr
 
 @loop_helper
 def _any_above(values: Image, threshold: np.float32) -> bool:
-    """Return whether any of `values` (k,) exceeds the `threshold`; the count permits vector instructions."""
+    """Return whether any of `values` (k,) exceeds the `threshold`, by counting with vector instructions."""
     above = np.int32(0)
     for k in range(len(values)):
         above += np.int32(values[k] > threshold)
@@ -351,8 +351,8 @@ def _is_hot(signal: Image, row: int, column: int, noise: float, level: float) ->
 def _are_hot_numpy(light: FloatArray, noise: FloatArray) -> BoolArray:
     """Return whether each of n windows of nine pixels contains one or two hot pixels, but no point of light.
 
-    The array `light` (9, n) contains the counts above the background of the pixels of each window, and
-    `noise` (n,) the standard deviation of the noise of one pixel.
+    The columns of `light` (9, n) are the windows, in counts above the background, and `noise` (n,) is the
+    standard deviation of the noise of a pixel in each window.
     """
     third, second, highest = np.partition(light, (6, 7, 8), axis=0)[6:]
     alone = second < np.minimum(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
@@ -417,10 +417,10 @@ _PLATEAU = 6
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
 """Limits for the recognition of saturation in a frame of point stars.
 
-In a saturated frame, at least `_LEAST_PLATEAU` pixels have the highest count, and more than `_PILED_UP` times
-as many pixels have the highest count as have slightly smaller counts. A count is slightly smaller if it
-differs from the highest count by at most `_PLATEAU_REACH` times the difference between the highest count and
-the median.
+In a saturated frame, at least `_LEAST_PLATEAU` pixels have the highest count, and their number is more than
+`_PILED_UP` times the number of pixels with slightly smaller counts. Slightly smaller counts are below the
+highest count by at most `_PLATEAU_REACH` times the difference between the highest count and the median, or by
+at most one count if this is more.
 """
 
 
@@ -432,7 +432,7 @@ LEAST_SIDE = 16
 """Minimum number of rows and of columns of an image."""
 # Noise (counts) to which an image of floating-point numbers is scaled.
 _FLOATING_NOISE = 16.0
-# Minimum noise (electrons) of a pixel of any camera, also of the mean of many images.
+# Minimum noise (electrons) of a pixel of any camera, even in the mean of many images.
 _LEAST_NOISE = 0.1
 # Count above which a float32, the data type of processed frames, cannot represent every integer.
 _INEXACT = 1 << 24
@@ -612,8 +612,8 @@ def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None)
 
     The result is `given` if it is not None, otherwise the highest of the `counts` (m,) if it is frequent,
     otherwise the maximum of the pixels' type. In a dim frame, the highest counts are due to noise, and the
-    higher a count, the fewer pixels have it. In a saturated frame, more pixels have the highest count than
-    the counts just below.
+    higher a count, the fewer pixels have it. In a saturated frame, the highest count is more frequent than
+    the counts just below it.
     """
     top = saturation_level(pixels, given)
     highest = counts.max(initial=-np.inf)
@@ -675,8 +675,8 @@ class Bins:
     def centred(cls, shape: tuple[int, ...], size: int) -> Bins | None:
         """Return the bins of an image (rows, columns), with equal margins at opposite sides of the image.
 
-        The optical axis stays in the image centre. Bins of odd `size` are always possible; None is returned
-        if bins of even `size` would have different margins.
+        The optical axis stays in the image centre. Returns None if the image is smaller than a bin, or if
+        bins of even `size` would leave unequal margins.
         """
         rows, columns = (_centred_count(length, size) for length in shape)
         down, across = shape[0] - size * rows, shape[1] - size * columns

@@ -79,7 +79,7 @@ _SCALE_TOLERANCE = 0.01
 _POINT_PX = 1.0
 # Predicted streak length (px) below which stars are measured as points if no motion can be fitted.
 _SHORT_PX = 4.0
-# Largest uncertainty (px) of the predicted motion of a star that is included in the model of its image.
+# Uncertainty (px) of the predicted motion above which the models of star images do not include the motion.
 _KNOWN_PX = 0.3
 # Scatter (px, per axis) of identified points about their predicted positions above which the stars may be
 # defocused. Without defocus, the scatter is below 0.2 px (campaign `resting`).
@@ -152,8 +152,8 @@ class FrameJob:
         motion_first: whether the motion is always estimated, instead of only if a survey shows streaks.
         objects: settings of the measurement of objects. If `objects` is None, objects are not measured.
         kept: folder in which the frame is saved on disk, or None if the frame is not saved.
-        lens: estimated lens parameters from earlier frames, with which the frame is solved, and the time
-            since the last frame, s. If `lens` is None, the lens parameters are not estimated.
+        lens: lens parameters estimated from earlier frames, with which this frame is solved, together with
+            the time since the last frame, s. If `lens` is None, the lens parameters are not estimated.
         detection: settings of the detection of points if no stars are identified.
     """
 
@@ -440,9 +440,9 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
 def _is_better(one: FrameSolution, other: FrameSolution) -> bool:
     """Return whether the attitude of `one`, after binning, is more credible than that of `other`.
 
-    It is more credible if the points of `one` scatter less than half as much, if its attitude is more
-    certain, or if the two attitudes contradict each other, because the parts of defocused stars, unlike whole
-    stars, may all be displaced in the same direction.
+    The attitude of `one` is more credible if the points of `one` scatter less than half as much, or if the
+    attitude is more certain. It is also more credible if the two attitudes contradict each other, because the
+    parts of defocused stars, unlike whole stars, can all be displaced in the same direction.
     """
     assert one.fix is not None
     assert other.fix is not None
@@ -465,7 +465,7 @@ def _scatter(solution: FrameSolution) -> float:
 
 
 def _may_be_defocused(solution: FrameSolution, motion: FrameMotion, tracker: TrackerSettings) -> bool:
-    """Return whether the points of a frame of a calibrated camera may be parts of defocused stars."""
+    """Return whether the points of a frame of a calibrated camera are possibly parts of defocused stars."""
     lowest, highest = tracker.scale
     if solution.kind is not FrameKind.POINTS or lowest != highest or tracker.solve.method is not None:
         return False

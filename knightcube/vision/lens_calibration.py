@@ -6,7 +6,7 @@ the robust steps, matches with residuals above five standard deviations are reje
 parameters of each frame are eliminated frame by frame with the Schur complement. After this elimination, the
 normal equations have five unknowns for any number of frames.
 
-The frames may not determine all lens parameters. In a narrow field, a shift of the optical axis has nearly
+Frames do not always determine all lens parameters. In a narrow field, a shift of the optical axis has nearly
 the same effect as a rotation of the camera, so that a single frame hardly separates the two. Each lens
 parameter therefore has a prior around an ideal lens with the initial focal length, the optical axis in the
 image centre and no distortion. Parameters whose standard deviation exceeds half the prior standard deviation
@@ -72,7 +72,7 @@ _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 Lens terms are omitted in the order k2, k1, centre.
 """
 _USUAL_SHAPE = 0.02
-"""Prior standard deviation of aspect, shear and, as a fraction at image corners, tangential distortion."""
+"""Prior standard deviation of aspect, shear and the tangential distortion of image corners, as fractions."""
 _SHOWN = 18.4
 """Chi-square (2 degrees of freedom, probability 1e-4) above which a pair of lens terms is significant."""
 _SIXTH_POWER = 0.1
@@ -306,10 +306,10 @@ def _rms(frames: Sequence[MatchedFrame], lens: Lens, used: Sequence[BoolArray]) 
 
 @dataclass(frozen=True, slots=True)
 class OmittedTerm:
-    """A lens term that the stars do not determine: last fitted values and their standard deviations.
+    """A lens term that the stars do not determine, with its last fitted `values` and their `sigmas`.
 
-    The calibrated lens has the values `assumed` instead: one value for k1 or k2, and two values (x and y) for
-    the centre.
+    In the calibrated lens, the term has the values `assumed`: one value for k1 or k2, and two values (x and
+    y) for the centre.
     """
 
     values: tuple[float, ...]
@@ -364,10 +364,10 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
 
 
 def _sixth_power(frames: Sequence[MatchedFrame], found: Calibration, prior: LensPrior) -> FloatArray:
-    """Return the changes (10,) of PARAMETERS and sixth-power distortion in a fit that includes the latter.
+    """Return the changes (10,) of PARAMETERS and sixth-power distortion if the fit includes this distortion.
 
     The sixth-power distortion is the displacement of an image corner, as a fraction of its distance from the
-    image centre. The changes are zero unless the stars show this distortion.
+    image centre. The changes are zero unless the stars show a significant sixth-power distortion.
     """
     lens = found.lens
     corner = math.hypot(*lens.ideal.centre) / lens.focal_length
@@ -424,11 +424,11 @@ def lens_accuracy(
     """Return the standard deviations of lens parameters by the keys of `camera.accuracy` in a configuration.
 
     The standard deviations of focal length and centre are taken from the fit `found`, which does not include
-    the omitted terms. The standard deviation of the focal length includes its difference from the fit
-    `whole`, which includes all terms. The distortion is expressed as the displacement of an image corner, as
-    a fraction of the distance of the corner from the image centre. The standard deviation of the distortion
-    includes the uncertainty of the fit with all terms, the difference between the two fits, and the changes
-    `beyond` (10,) of `_sixth_power`.
+    the omitted terms. The standard deviation of the focal length includes the difference from the focal
+    length of the fit `whole`, which includes all terms. The distortion is expressed as the displacement of an
+    image corner, as a fraction of the distance of the corner from the image centre. The standard deviation of
+    the distortion includes the uncertainty of the fit with all terms, the difference between the two fits,
+    and the changes `beyond` (10,) of `_sixth_power`.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -451,13 +451,13 @@ def calibrate_one_lens(
 ) -> tuple[DeterminedLens, dict[int, str]]:
     """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    The arguments `focal_lengths` (m,) and `sigmas` (m,), px, are the focal length from each frame alone and
-    its standard deviation. A frame is excluded if it was taken with another focus or zoom, or if its solution
-    is wrong: if its focal length differs from the median by more than 5 standard deviations and by more than
-    1 %, or if a fit rejects more than half of its matches. Raises CalibrationError for the same reasons as
-    `calibrate`.
+    The arrays `focal_lengths` (m,) and `sigmas` (m,), px, contain the focal length determined from each frame
+    alone, and its standard deviation. A frame is excluded if it was taken with another focus or zoom, or if
+    its solution is wrong: if its focal length differs from the median by more than 5 standard deviations and
+    by more than 1 %, or if a fit rejects more than half of its matches. Raises CalibrationError for the same
+    reasons as `calibrate`.
     """
-    # The median (of an even number, the upper middle value), so that at least one frame is kept.
+    # For an even number of frames, the median is the upper middle value, so that at least one frame is kept.
     usual = float(np.sort(focal_lengths)[len(focal_lengths) // 2])
     different = np.abs(focal_lengths - usual) > np.maximum(5.0 * sigmas, 0.01 * usual)
     excluded = {
@@ -594,7 +594,10 @@ def calibrate_lens(
 
 
 def _grey_images(images: Sequence[Image]) -> list[Image]:
-    """Return grey images of one shape. Raises UsageError, which states the number of the image, from 1."""
+    """Return the images as grey images.
+
+    Raises ArgumentError, with the number of the image from 1, for an unsuitable image or another shape.
+    """
     if not np.iterable(images):
         raise ArgumentError("images", f"{brief(images)}: give a sequence of images")
     found: list[Image] = []
@@ -626,7 +629,7 @@ def _repeated(images: Sequence[Image]) -> dict[int, str]:
 
 
 def _mirrored_back(found: LensCalibration) -> LensCalibration:
-    """Return the calibration of mirrored images from the calibration `found` of images with reversed rows."""
+    """Return the calibration of mirrored images, given that of the images with reversed rows (`found`)."""
     if found.determined is None:
         return replace(found, mirrored=True)
     determined = found.determined

@@ -2,7 +2,7 @@
 
 The lens has the parameters of `knightcube calibrate`: focal length, optical axis, and distortion. The line
 time of the shutter and the width of the point spread function are estimated together with the lens
-parameters. The prior of all parameters is their configured values and standard deviations. Each solved frame
+parameters. All parameters have priors with their configured values and standard deviations. Each solved frame
 improves the parameters by a weighted least-squares fit in pixels, in which the attitude of the frame is
 unknown. The three attitude parameters of a frame are eliminated with the Schur complement, as in the
 calibration on the ground. The estimate after one frame is the prior of the fit to the next frame. Between
@@ -175,10 +175,10 @@ def step(
 ) -> FitStep:
     """Return lens parameters and attitudes after one Gauss-Newton step of the calibration.
 
-    The squared residuals of the stars of each frame have the `weights` (n,). The prior means `expected` (9,)
-    of the lens parameters have the inverse variances `prior` (9,), or an information matrix. Raises
-    UndeterminedAttitudeError if a frame does not determine its attitude, and CalibrationError if the data do
-    not determine the lens.
+    The squared residuals of the stars of each frame have the `weights` (n,). The lens parameters have the
+    prior means `expected` (9,). Their prior information `prior` is either inverse variances (9,) or a matrix
+    (9, 9). Raises UndeterminedAttitudeError if a frame does not determine its attitude, and CalibrationError
+    if the data do not determine the lens.
     """
     information, gradient = np.zeros((len(fit.parameters),) * 2), np.zeros(len(fit.parameters))
     prior = np.diag(prior) if prior.ndim == 1 else prior
@@ -217,7 +217,7 @@ def step(
 def _linearised(
     frame: MatchedFrame, fit: LensFit, number: int, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted derivatives (2n, p) and (2n, 3) of n star positions, and weighted residuals (2n,).
+    """Return the weighted Jacobians (2n, p) and (2n, 3) of n star positions, and weighted residuals (2n,).
 
     The derivatives are with respect to p lens parameters (9 or 10) and to a small rotation. The first nine
     lens parameters are the parameters of `Lens` in the order of PARAMETERS. A small rotation moves a
@@ -264,7 +264,7 @@ def _linearised(
 
 
 def residual_lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[FloatArray]:
-    """Return the lengths (n,) of the residuals of each frame, in standard deviations."""
+    """Return, for each frame, the lengths (n,) of its stars' residuals, in standard deviations."""
     return [np.linalg.norm(residuals(frame, fit, number), axis=1) for number, frame in enumerate(frames)]
 
 
@@ -280,13 +280,13 @@ def residual_spread(lengths: Sequence[FloatArray]) -> float:
 
 
 def cauchy_weights(lengths: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the Cauchy weights (n,) of each frame's stars from the `lengths` (n,) of their residuals."""
+    """Return, for each frame, the Cauchy weights (n,) of stars with residuals of the `lengths` (n,)."""
     scale = _CAUCHY * residual_spread(lengths)
     return [1.0 / (1.0 + (length / scale) ** 2) for length in lengths]
 
 
 def accepted_matches(lengths: Sequence[FloatArray]) -> tuple[BoolArray, ...]:
-    """Return the mask (n,) of each frame's stars with acceptable `lengths` (n,) of their residuals."""
+    """Return, for each frame, the mask (n,) of the stars with residuals of acceptable `lengths` (n,)."""
     cut = _CUT * residual_spread(lengths)
     return tuple(length <= cut for length in lengths)
 
@@ -322,7 +322,7 @@ LEARNED = (*PARAMETERS[:5], "line_time", "psf_sigma")
 """Names of the parameters estimated from frames, in the units px, px, px, none, none, s and px."""
 _LINE_TIME, _PSF = 9, 10
 _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
-"""Indices of the parameters in `LEARNED`, in an array of `PARAMETERS`, line time and point-spread width."""
+"""Indices of the LEARNED parameters in an array of PARAMETERS, line time and point-spread width."""
 _SECOND_TERM = 1.0 / 3.0
 """Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
 _FOURTH_AS = -0.3, 1.2
@@ -342,7 +342,7 @@ _LEAST_MATCHED = 6
 _PLAUSIBLE = 5.0
 """Largest deviation of stored values from the configuration, in configured standard deviations."""
 _ROBUST_ROUNDS, _MOST_ROUNDS, _SETTLED = 5, 8, 1e-4
-"""Number of robust fit steps, maximum number of unweighted fit steps, and final decrease of chi-square."""
+"""Number of robust steps, maximum number of unweighted steps, and decrease of chi-square at convergence."""
 
 
 def axes_turn(configured: CameraModel, learned: CameraModel) -> FloatArray:
@@ -576,7 +576,7 @@ class _FrameFit:
     """Fit of lens and attitude to one frame and a prior.
 
     Attributes:
-        parameters: fitted lens parameters (10,) with the line time.
+        parameters: fitted lens parameters (10,), including the line time.
         covariance: covariance (10, 10) of the parameters.
         objective: chi-square of residuals and prior.
         used: mask (n,) of the stars that agree with the fit.

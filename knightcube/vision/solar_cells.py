@@ -147,7 +147,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     direction, basis, inverse = _fitted_direction(total / length, readings, normals, information)
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # Correct currents exceed this limit of chi-square (Wilson and Hilferty 1931) with a probability of 0.001.
+    # The chi-square of correct currents exceeds this limit with probability 0.001 (Wilson, Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
@@ -216,10 +216,11 @@ def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[Fl
 
 @lru_cache(maxsize=8)
 def _constants(strings: SolarStringModel) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return earthlight (n,) and information (n, n) for an unknown nadir, and a matrix (3, n) for the guess.
+    """Return earthlight (n,), information (n, n) without a nadir, and the matrix (3, n) of the first guess.
 
-    The earthlight is a fraction of the peak currents; the information is the inverse of the covariance. The
-    product of the matrix and the sunlight (n,) is the initial guess of the Sun direction, not normalised.
+    The earthlight is a fraction of the peak currents; the information is the inverse of the covariance of the
+    readings. The product of the matrix and the sunlight (n,) is the initial guess of the Sun direction, not
+    normalised.
     """
     earth, covariance = _earthlight(strings, None)
     normals = strings.normals

@@ -108,8 +108,9 @@ class StarSolution:
         declination: declination of the boresight, ICRS, rad.
         roll: position angle of the image's upward direction (-y), north through east, 0 to 2 pi, rad.
         quaternion: attitude (4,) at mid-exposure, scalar last. The quaternion rotates ICRS into camera axes:
-            z along the boresight, x to the right along the pixel rows, y down. With `learn`, the boresight is
-            the pixel of the optical axis of the given camera, so that all images have the same axes.
+            z along the boresight, x to the right along the pixel rows, y down. If `learn` is true, the
+            boresight is the pixel of the optical axis of the given camera, so that all images have the same
+            axes.
         covariance: covariance (3, 3) of the attitude error as a small rotation in camera axes, rad^2.
         stars: identified catalogue stars.
         field_of_view: angle between the outer edges of the first and last column, without distortion, rad.
@@ -126,7 +127,8 @@ class StarSolution:
         sky_map: conversion between pixels of the image and ICRS directions, or None if the image was not
             solved.
         frame: all results of the star tracker, including the points that are not catalogue stars. Attitude
-            and rate of `frame` are in the axes of `frame.camera`, which is the estimated lens with `learn`.
+            and rate of `frame` are in the axes of `frame.camera`, which is the estimated lens if `learn` is
+            true.
         index: sky index (catalogue of guide stars) at the epoch of the image. The star indices in
             `frame.star` refer to `index`.
     """
@@ -248,7 +250,7 @@ class StarTracker:
             self._index = index if isinstance(index, SkyIndex) else load_once(Path(index))
 
     def __repr__(self) -> str:
-        """Return the field of view or the camera, and whether the lens parameters are estimated."""
+        """Return one line of text: field of view or camera, and whether the lens parameters are estimated."""
         fov = f"{self._fov_deg:g} deg" if self._fov_deg is not None else "unknown"
         lens = f"field of view {fov}" if self._camera is None else repr(self._camera)
         error = "" if self._fov_error_deg is None else f" +- {self._fov_error_deg:g} deg"
@@ -426,7 +428,7 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
 
 
 def _turned(solution: StarSolution, back: FloatArray) -> StarSolution:
-    """Return a solution in the axes of the given camera, into which `back` (4,) rotates the used lens's axes.
+    """Return a solution after rotation by `back` (4,) from the estimated lens's axes to the given camera's.
 
     The axes of the estimated lens change from image to image, whereas those of the given camera are fixed.
     """

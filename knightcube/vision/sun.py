@@ -38,10 +38,11 @@ class SunSettings:
     At a given exposure, the bright disc of the Sun, including its glare, has a fixed radius. The radius
     limits should differ from the radius of the disc with its glare by about a fifth. If the radius limits are
     wider, a cloud may be mistaken for the Sun. The default values fit a logarithmic 8-bit camera like the
-    Fuga 15d: 200 of 255 counts, and a disc of 0.35 to 0.6 deg. `LINEAR` fits a linear 8-bit camera in which
-    white clouds are close to saturation: 200 of 255 counts, and a disc of 1.3 to 2.0 deg. The settings of
-    another linear camera are `replace(LINEAR, level=...)`, because `SunSettings(level=...)` has the radius
-    limits of a logarithmic camera.
+    Fuga 15d, with a threshold of 200 of 255 counts and a disc radius of 0.35 to 0.6 deg. `LINEAR` fits a
+    linear 8-bit camera in which white clouds are close to saturation, with a threshold of 200 of 255 counts
+    and a disc radius of 1.3 to 2.0 deg. For another linear camera, use
+    `replace(LINEAR, level=...)`, because `SunSettings(level=...)` has the radius limits of a logarithmic
+    camera.
 
     Attributes:
         level: threshold of the Sun's image, in the unit of the pixel values. For a logarithmic camera, the
@@ -211,7 +212,8 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
 
     Args:
         image: pixel values (rows, columns) of any integer or floating type. Larger values are brighter.
-        camera: camera model (`Pinhole` or `Lens` of `knightcube.vision.camera.lens`) of the image's size.
+        camera: camera model (`Pinhole` or `Lens` of `knightcube.vision.camera.lens`) with the size of the
+            image.
         settings: settings of the search. If `settings` is None, `LINEAR` for a linear camera of 0 to 255
             counts is used. For another range of pixel values, give `replace(LINEAR, level=...)` with a level
             slightly below saturation.
@@ -255,7 +257,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
 
 
 def _chosen(found: list[SunMeasurement], read: int) -> SunSolution:
-    """Return the solution from the `found` discs of the size of the Sun, after `read` pixels were read."""
+    """Return the solution for the discs `found` of the size of the Sun, after `read` pixels were read."""
     sun = max(found, key=lambda one: one.radius)
     # Dark pixels can divide one disc into several patches, whose circles coincide.
     others = [one for one in found if float(one.direction @ sun.direction) < math.cos(sun.radius)]
@@ -397,7 +399,7 @@ def _disc(
 def _trace(
     strip: Image, first_row: int, camera: CameraModel, axis: FloatArray, level: float, reach: float
 ) -> _Rim:
-    """Return the rim within `reach` rad around `axis` (3,); `strip` has the image rows from `first_row`."""
+    """Return the rim within `reach` rad around `axis` (3,); `strip` contains the rows from `first_row` on."""
     basis = tangent_basis(axis)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
     ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -549,7 +551,7 @@ class Circle:
 
 
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
-    """Return the circle through `points` (n, 2) in order along a rim, or None if no circle fits the points.
+    """Return the circle through `points` (n, 2), which are in order along a rim, or None if no circle fits.
 
     The argument `scale` is the standard deviation of a point that is not an outlier.
     """
@@ -701,10 +703,10 @@ def sun_of_cameras(
 ) -> SunOfCameras:
     """Return the Sun direction in body axes from the first camera that finds it, or from the solar strings.
 
-    The images (rows, columns), by camera index, were taken at one instant. A camera is not read if, according
-    to the solar strings, the Sun cannot be in its field of view. A Sun direction that contradicts the
-    currents of the solar strings is rejected. If an image is ambiguous, the solar strings decide between its
-    discs. Raises ValueError for another image size or non-finite pixels.
+    The `images` (rows, columns), whose keys are camera indices, were taken at the same time. A camera is not
+    read if, according to the solar strings, the Sun cannot be in its field of view. A Sun direction that
+    contradicts the currents of the solar strings is rejected. If an image is ambiguous, the solar strings
+    decide between its discs. Raises ValueError for another image size or non-finite pixels.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}

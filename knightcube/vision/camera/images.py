@@ -264,8 +264,9 @@ def grey_map_image(content: bytes, name: str) -> Image:
 def read_raw(path: Path, columns: int, rows: int, bits: int, header: int | None = 0) -> Image:
     """Return the image (rows, columns) of a file of raw pixels, of 8 bits or of 16 bits little-endian.
 
-    The pixels are stored row by row at the end of the file, after `header` bytes, or after any number of
-    bytes if `header` is None. Raises UsageError if the file is missing or has another size.
+    The pixels are stored row by row after `header` bytes, up to the end of the file. If `header` is None,
+    the number of bytes before the pixels is arbitrary. Raises UsageError if the file is missing or has
+    another size.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
     try:
@@ -300,7 +301,7 @@ def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDAr
 
 
 _EXIF_FOLDER, _EXPOSURE_TIME = 0x8769, 0x829A
-"""Numbers of the folder of EXIF tags and of its tag ExposureTime (s) (EXIF 2.3, section 4.6)."""
+"""Numbers of the EXIF tags Exif IFD Pointer and ExposureTime (s) (EXIF 2.3, section 4.6)."""
 
 
 def stated_exposure(path: Path) -> float | None:
@@ -426,7 +427,7 @@ def _check_kept(path: Path, picture: Picture) -> None:
 
 
 def _raw_mode(args: object) -> str:
-    """Return the raw mode of a Pillow image tile, the first of the arguments `args` of the tile's decoder."""
+    """Return the raw mode of an image tile: the first argument in `args`, those of its Pillow decoder."""
     return str(args[0]) if isinstance(args, tuple) and args else str(args)
 
 
@@ -437,7 +438,7 @@ def _is_deep(picture: Picture) -> bool:
 
 
 def _low_bytes(args: Any) -> Any:
-    """Return the arguments of a Pillow decoder for the swapped byte order, which keeps the low bytes."""
+    """Return the arguments of a Pillow decoder with swapped byte order, so that it keeps the low bytes."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
 
@@ -470,7 +471,7 @@ KEPT_FRAMES_FOLDER = "frames"
 class KeptFrames:
     """Folder and maximum number of the frames that the vision worker keeps on disk.
 
-    The file of the next frame has the name `name`, without suffix.
+    The attribute `name` is the file name of the next frame, without suffix.
     """
 
     folder: Path

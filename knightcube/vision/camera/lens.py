@@ -62,7 +62,7 @@ def _check_detector(columns: int, rows: int, focal_length: float) -> None:
 
 
 def _is_count(value: object) -> bool:
-    """Return whether a value is an integer of a size that floats can represent."""
+    """Return whether a value is an integer that floats represent exactly."""
     return isinstance(value, int) and abs(value) < 1 << 53
 
 
@@ -215,7 +215,8 @@ class Lens:
         focal_length: focal length on the axis, px.
         centre: pixel (x, y) of the optical axis.
         k1, k2: radial distortion coefficients of the second and the fourth power of the undistorted tangent.
-        aspect, shear: half the relative difference of the image scale between x and y, and pixel shear.
+        aspect, shear: half the relative difference between the image scales along x and y, and shear of the
+            pixels.
         p1, p2: tangential distortion coefficients along y and along x.
         reach: largest undistorted tangent that is imaged; infinite if the distortion never folds back.
 
@@ -390,7 +391,7 @@ class Lens:
 
 
 def _undistorted_numpy(stretched: FloatArray, k1: float, k2: float, limit: float) -> FloatArray:
-    """Return the undistorted tangents of distorted tangents (n,), or NaN from `limit` on.
+    """Return the undistorted tangents of distorted tangents (n,); tangents of at least `limit` give NaN.
 
     Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
     that is nearer to the axis. From both initial values, Newton's method overshoots the root at most once and
@@ -463,11 +464,11 @@ class DistortedPinhole(Pinhole):
     """A pinhole camera with the image errors of a lens, which moves a point u of the ideal image to A d(u).
 
     Unlike a `Lens`, the camera has derivatives of the distortion, and images all directions in front of it.
-    The distorted point is d(u) = u (1 + scale + cubic s + fourth s^2) + t(u), where u is the distance from
-    the image centre and s is the square of |u| relative to the distance of the corner. The matrix A and the
-    tangential distortion t are those of `Lens`. Beyond the fold, at which the distorted distance has a
-    maximum, the radial distortion is that of the fold, so that stars far outside the image do not appear in
-    the image.
+    The distorted point is d(u) = u (1 + scale + cubic s + fourth s^2) + t(u), where u is the position
+    relative to the image centre and s is the square of the ratio of |u| to the distance of the image corners.
+    The matrix A and the tangential distortion t are those of `Lens`. Beyond the fold, at which the distorted
+    distance has a maximum, the radial distortion is that of the fold, so that stars far outside the image do
+    not appear in the image.
 
     Attributes:
         shift: displacement (x, y) of the image centre, px.
@@ -497,7 +498,7 @@ class DistortedPinhole(Pinhole):
 
     @classmethod
     def of(cls, camera: Pinhole | Lens) -> DistortedPinhole:
-        """Return the pinhole camera that has the same image as `camera`."""
+        """Return the `DistortedPinhole` that forms the same image as `camera`."""
         if isinstance(camera, DistortedPinhole):
             return camera
         if isinstance(camera, Pinhole):
@@ -567,9 +568,10 @@ def _rows(points: FloatArray) -> FloatArray:
 
 
 def _radial_numpy(away: FloatArray, terms: _Terms) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the relative radial displacement (m, 1) at distances (m, 2), px, and two derivatives of it.
+    """Return relative radial displacements (m, 1) at points (m, 2), px, and two derivatives of them.
 
-    The derivatives are with respect to the square of the distance.
+    The points are relative to the image centre. The derivatives are the first and second with respect to the
+    square of the distance from the centre.
     """
     scale, cubic, fourth, fold = terms[4:8]
     whole = np.einsum("ij,ij->i", away, away)[:, None]
@@ -812,9 +814,9 @@ class CameraKnowledge:
         distortion: standard deviation of the distortion at an image corner, relative to half the diagonal.
         line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
             of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
-        covariance: covariance (5, 5) of relative focal length, optical axis along x and y, distortion and
-            line time, in the units of the other attributes, if the lens parameters were estimated from
-            frames. If the covariance is None, the errors are independent.
+        covariance: covariance (5, 5) of the lens parameters if they were estimated from frames: relative
+            focal length, optical axis along x and y, distortion, and line time, in the units of the other
+            attributes. If the covariance is None, the errors are independent.
         psf_sigma: standard deviation of the width of the point spread function, px.
     """
 
