@@ -150,8 +150,8 @@ class HorizonCameraJob:
         frames: images (rows, columns) by the index of their camera.
         cameras: all cameras.
         knowledge: prior knowledge, with directions and attitude in body axes.
-        strings: model of the solar strings and the currents (n,), A, of the strings. If there is no recent
-            reading of the currents of the solar strings, `strings` is None.
+        strings: model of the solar strings, and their currents (n,), A; None if there is no recent reading of
+            the currents.
         response: response of the cameras' detectors to light intensity, or None for linear detectors.
         structure: maps of the spacecraft's own structure in the images, by the index of the camera.
         earth_only: indices of the cameras in whose images the Sun is not searched.
@@ -195,7 +195,7 @@ class HorizonCameraResult:
 
     Attributes:
         sun, nadir: measured directions of Sun and nadir in body axes, each None if it was not found.
-        false: reasons, by camera index, why an image contradicts an accurately known attitude, or None if the
+        false: reasons why images contradict the known attitude, by the index of the camera; None if the
             attitude is not known accurately enough to check the images.
         structure: maps of the spacecraft's own structure, updated with these images, by camera index.
     """

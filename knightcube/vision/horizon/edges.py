@@ -41,14 +41,12 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Standard deviations (px) of the Gaussians that smooth the brightness along a scan line, ascending."""
 _REACH = 3.0
-"""Largest distance of an edge from the change from dark to bright, in standard deviations of the Gaussian."""
+"""Half-width of the search for an edge around a change of brightness, in standard deviations of the Gaussian.
+"""
 _TAIL = 3.5
 """Distance from the centre at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
-"""Minimum ratio of the step heights of an edge at which the wider of two Gaussians is used.
-
-The ratio is the step height for the wider Gaussian divided by the step height for the narrower Gaussian.
-"""
+"""Minimum step height for the use of a wider Gaussian, relative to the step height with a narrower one."""
 _MARGIN = 4.0
 """Distance from the image border (px) within which edges are ignored. Some detectors have a black border."""
 _FLOOR, _SHARE = 0.1, 0.05
@@ -123,7 +121,7 @@ class ScanEdges:
         points: positions of the edges (n, 2), px.
         towards: unit vectors along the scan line towards the bright side (n, 2).
         scale: standard deviation of the smoothing Gaussian with which each edge was found (n,), px.
-        sigma: standard deviation of each edge position along the scan line before a fit of the limb (n,), px.
+        sigma: prior standard deviation of each edge's position along the scan line (n,), px.
         background: brightness of the dark side (n,), low at limb and terminator, higher at coasts and clouds.
         profile: brightness samples along the scan line, from dark to bright (n, m); NaN outside the image.
     """
@@ -255,8 +253,8 @@ def _line_edges(
 ) -> ScanEdges:
     """Return the edges on columns and rows whose step height exceeds `contrast`.
 
-    Each argument except `contrast` has two elements, for columns and for rows: the brightness `light` (n, m),
-    the mask `bright` of bright pixels (n, m) and the indices `places` (n,).
+    Each other argument has two elements, one for the n columns and one for the n rows: their brightness
+    `light` (n, m), masks `bright` of bright pixels (n, m) and indices in the image, `places` (n,).
     """
     parts, read = [], 0
     for direction, binary in enumerate(bright):
@@ -464,7 +462,7 @@ def _span(levels: Levels) -> float:
 
 
 def _sample_levels(light: FloatArray, levels: Levels) -> FloatArray:
-    """Return `Samples.level` and `Samples.mottle`, as (2, k), of the sampled pixels of scan lines (n, m)."""
+    """Return `Samples.level` and `Samples.mottle` of k samples of scan lines (n, m), as an array (2, k)."""
     size, half = light.shape[1], _AVERAGED + _AVERAGED // 2
     index = _sample_places(size)[:, None] + np.arange(-half, half + 1)
     around = light.take(np.minimum(np.maximum(index, 0), size - 1), axis=1)
@@ -485,7 +483,7 @@ def _hidden_samples(masked: BoolArray) -> BoolArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return unit vectors (m, 3) to the sampled pixels that the lens images, and their mask (k,)."""
+    """Return unit vectors (m, 3) to the sampled pixels in the field of the lens, and their mask (k,)."""
     x, y = np.meshgrid(columns, _sample_places(camera.rows), indexing="ij")
     other_y, other_x = np.meshgrid(rows, _sample_places(camera.columns), indexing="ij")
     points = np.stack(

@@ -2,8 +2,8 @@
 
 The significance of a horizon is an upper bound on the expected number of equally good horizons that other
 edges, such as coasts and the borders of clouds, form by chance. The density of chance edges is estimated from
-the number of edges beside the limb. A coast or the border of a cloud with the radius of curvature R, tangent
-to the limb, stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the
+the number of edges beside the limb. A coast or cloud border that is tangent to the limb and has the radius of
+curvature R stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the
 same segment of a coast or cloud are not independent. The test therefore counts limb segments of the length 2
 sqrt(2 g R) instead of scan lines.
 """
@@ -103,7 +103,7 @@ def _limb_points(
         day = sun_elevation(view, rays, sun) > _LOWEST_SUN
         chosen, rays = chosen[day], rays[day]
     residuals, gradients = limb_gradients(view, rays)
-    # A small change s of a unit vector u changes the residual as much as the rotation u x s of the camera.
+    # A small change s of a unit vector u changes the residual as much as the rotation s x u of the view.
     # The array `slopes` (n, 2) is the change of the residual per pixel to the right and per pixel downwards.
     turns = np.cross(gradients[:, :3], rays)
     steps = observation.across[chosen], observation.down[chosen]
@@ -146,9 +146,9 @@ _ROUND = 0.1
 """Assumed radius of curvature of coasts and other lines that are not a limb, as a fraction of the image size.
 """
 _BESIDE = 0.05
-"""Distance from the limb within which other edges are counted, as a fraction of the image size.
+"""Distance from the limb, as a fraction of the image size, within which edges that are not on it are counted.
 
-The number of other edges determines the density of chance edges.
+Their number determines the density of chance edges.
 """
 
 
@@ -240,8 +240,8 @@ class Hypothesis:
     Attributes:
         fit: the fitted limb.
         members: mask of the image's edges that lie on the fitted horizon (n,).
-        squares: squared distance of each edge from the fitted horizon in standard deviations (n,), infinite
-            away from the horizon, and NaN for an edge near the horizon that the fit does not use.
+        squares: squared distance of each edge from the fitted horizon (n,), relative to its variance. The
+            value is infinite far from the horizon, and NaN for an edge nearby that is not a limb point.
         limb: limb points from the edges on the fitted horizon.
         residual: rms distance of the fitted edges from the limb, px.
         guess: initial guess from which the fit started.
@@ -253,9 +253,9 @@ class Hypothesis:
         breadth: ratio of the median width of the edges on the horizon to the width expected from the
             brightness profile of the atmosphere.
         not_space: why the image beyond the horizon is not space, or an empty string if it may be space.
-        altitude_off: distance of the altitude that the edges imply from the known altitude, or from the range
-            `HorizonSettings.altitudes` if the altitude is unknown, in standard deviations.
-        implied_altitude: altitude that the edges imply, m; NaN if they do not determine it.
+        altitude_off: difference, in standard deviations, between `implied_altitude` and the known altitude.
+            If the altitude is unknown, the distance to the range `HorizonSettings.altitudes` is used.
+        implied_altitude: altitude that the edges imply, m; NaN if the edges do not determine an altitude.
     """
 
     fit: FittedLimb
@@ -278,9 +278,9 @@ class Hypothesis:
     def covariance(self) -> FloatArray:
         """The covariance (3, 3) of the nadir, rad^2, including the allowance for unmodelled effects.
 
-        If the edges contradict a known altitude by more than one standard deviation, the limb has another
-        height or the focal length is wrong, which also displaces the nadir. The covariance is then multiplied
-        by the square of `altitude_off`.
+        If the edges contradict a known altitude by more than one standard deviation, the limb height or the
+        focal length is wrong. This error also displaces the nadir, so that the covariance is multiplied by
+        the square of `altitude_off`.
         """
         nadir = self.fit.view.nadir
         across = np.eye(3) - np.outer(nadir, nadir)

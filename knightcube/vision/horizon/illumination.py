@@ -97,7 +97,7 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
 
 
 _LEAST_GLARE, _IN_GLARE = 4, 0.8
-"""Minimum number of bright sky samples, and minimum fraction around their mean, that indicate the Sun."""
+"""Minimum number of bright sky samples, and minimum fraction near their mean direction, that show the Sun."""
 _ROUND_GLARE = 0.85
 """Minimum bright fraction of the samples nearest to the assumed Sun, for the glare to count as round."""
 
@@ -131,10 +131,11 @@ _LEAST_SKY = 8
 _DIM_AIR = 30e3
 """Height (m) above the limb at which the atmosphere has 3 % of its maximum brightness.
 
-The height of 30 km is used for images that do not show enough sky above `_ATMOSPHERE`.
+This height replaces `_ATMOSPHERE` if the image has too few samples above `_ATMOSPHERE`.
 """
 _CLEAR = 24.0
-"""Distance from the limb (px) beyond which the pixels averaged in a sample do not image the Earth."""
+"""Minimum distance (px) of a sample from the atmosphere, so that none of its averaged pixels shows the Earth.
+"""
 _DARKEST = 0.15
 """Largest median brightness of space, as a fraction of the range from the dark to the bright level."""
 _BLACKEST = 0.35
@@ -149,10 +150,10 @@ The limit is the larger of `_SMOOTHEST` and `_NOISES` times the noise of a sampl
 def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixel: float) -> str:
     """Return why the image beyond an assumed limb does not look like space, or an empty string if it does.
 
-    Space is dark and has no texture beyond the noise of the detector. Stray light is smooth. Clouds have
-    texture, and so has ground in front of a bright sky. The test compares medians, so that stars and
-    spacecraft structure have no effect if they cover less than half of the sky. The Sun direction (3,) is in
-    inertial axes, or None, and `pixel` is the angular size of a pixel, rad.
+    Space is dark and has no texture beyond the noise of the detector. Stray light is smooth, whereas clouds
+    and ground have texture. The test compares medians, so that stars and spacecraft structure have no effect
+    if they cover less than half of the sky. The Sun direction `sun` (3,) is in inertial axes, and None if
+    unknown. The argument `pixel` is the angular size of a pixel, rad.
     """
     outside = limb_residuals(view, samples.rays)
     away = np.ones(len(outside), dtype=bool)
@@ -223,8 +224,8 @@ class ImageBrightness:
 class CoarseNadir:
     """An estimated nadir (3,) in body axes, with an uncertainty of several degrees.
 
-    The covariance (3, 3), rad^2, is zero along the nadir direction. The mean probability of the samples'
-    brightness for the most likely nadir is `explained`.
+    The covariance (3, 3), rad^2, is zero along the nadir direction. The attribute `explained` is the mean
+    probability that the most likely nadir gives the samples their brightness.
     """
 
     direction: FloatArray
@@ -262,8 +263,8 @@ def coarse_nadir(
 ) -> CoarseNadir | None:
     """Return the nadir that explains the brightness of all images, or None if the nadir is too uncertain.
 
-    The altitude is above the Earth's mean radius, m. The Sun direction (3,) in body axes, accurate to ten
-    degrees, may be unknown.
+    The altitude is above the Earth's mean radius, m. The argument `sun` is the direction of the Sun (3,) in
+    body axes, accurate to ten degrees, or None if the direction is unknown.
     """
     rays = np.concatenate([look.rays for look in looks])
     bright = np.concatenate([look.bright for look in looks])
@@ -322,7 +323,7 @@ def _sample_indices(size: int) -> IntArray:
 
 @lru_cache(maxsize=8)
 def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
-    """Return unit vectors (m, 3) to the samples that the lens images, and the mask (64,) of these samples."""
+    """Return unit vectors (m, 3) to the samples in the field of the lens, and their mask (64,)."""
     x, y = np.meshgrid(_sample_indices(lens.columns), _sample_indices(lens.rows), indexing="ij")
     rays = lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
     imaged = np.isfinite(rays[:, 0])

@@ -9,10 +9,11 @@ and its bright side is towards nadir. The edges of the best cone are removed and
 that the terminator, a coast or a band of clouds gives a separate cone. The search is a sample consensus
 (Fischler & Bolles 1981) without random selection.
 
-A horizon does not determine the rotation about nadir, which is needed because the Earth's flattening depends
-on the direction of the pole, and the illumination on the direction of the Sun. The rotation is derived from a
-rough attitude, the coarse direction of the Sun or the magnetic field. The angle between nadir and each known
-direction is also known, so that a nadir at a different angle is rejected.
+A horizon does not determine the rotation about nadir. This rotation is needed to predict the flattening of
+the limb, which depends on the direction of the pole, and the illumination, which depends on the direction of
+the Sun. The rotation is derived from a rough attitude, the coarse direction of the Sun or the magnetic field.
+The angle between nadir and each known direction is also known, so that a nadir at a different angle is
+rejected.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def nadirs_of_triples(
     size = np.linalg.norm(normal, axis=1)
     directions = normal / np.where(size > _PARALLEL, size, np.nan)[:, None]
     cosines = np.einsum("ij,ij->i", directions, first)
-    # Nadir is the normal within 90 deg of the rays, because the limb lies within 90 deg of nadir.
+    # Of the two normals, nadir is the one within 90 deg of the rays: the limb is within 90 deg of nadir.
     sign = np.where(cosines < 0.0, -1.0, 1.0)
     return directions * sign[:, None], cosines * sign
 
@@ -138,10 +139,10 @@ def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
 
 
 def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of up to `tries` triples of `count` items, both close together and far apart."""
+    """Return the indices of up to `tries` triples of `count` items, with small and large differences."""
     number = np.arange(tries)
     first = number % count
-    # Fractional parts of multiples of the golden ratio and sqrt(2) spread the index differences evenly.
+    # The fractional parts of multiples of the golden ratio, and of sqrt(2), cover 0 to 1 evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -155,7 +156,7 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
     cones are given by their axes `directions` (k, 3) and the cosines (k,) of their half-angles.
     """
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
-    # A ray at angle a from the axis lies (cos a - cos rho) / sin rho inside the cone of half-angle rho.
+    # A ray at the angle a from the axis is about (cos a - cos rho) / sin rho, rad, from the cone.
     off = directions @ edges.rays.T
     off -= cosines[:, None]
     near = np.abs(off, out=off) <= sines[:, None] * (tolerance * edges.pixel)

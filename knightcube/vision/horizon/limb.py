@@ -9,10 +9,10 @@ direction of the centre, minus the half-angle of the limb cone. The residual of 
 positive outside of the Earth. The gradient of the residuals is analytic.
 
 The limb cone is fitted by a Gauss-Newton iteration. Huber's weights, with zero weight beyond five standard
-deviations, exclude clouds, glare and the ends of the terminator. The standard deviation of the residuals is
-estimated from the median of the residuals if this estimate exceeds the stated standard deviation. The limb
-height, the rotation about nadir and the altitude have a prior, because the limb does not determine them. The
-covariance therefore includes the uncertainty of limb height, rotation and altitude.
+deviations, exclude clouds, glare and the ends of the terminator. If the median residual shows a larger spread
+than the stated standard deviations, the standard deviations are scaled up. The limb height, the rotation
+about nadir and the altitude have a prior, because the limb does not determine them. The covariance therefore
+includes the uncertainty of limb height, rotation and altitude.
 
 Along a line of sight with the tangent height h, the optical depth of the atmosphere is t(h) = t0 exp(-h/H)
 with t0 = t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's
@@ -54,7 +54,7 @@ class Ellipsoid:
     polar: float
 
     def stretching(self, height: float = 0.0) -> FloatArray:
-        """Return a symmetric matrix L (3, 3): |L x| = 1 for x on the ellipsoid enlarged by `height`, m."""
+        """Return the symmetric matrix L (3, 3), 1/m: |L x| = 1 on the ellipsoid enlarged by `height`, m."""
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:
@@ -172,17 +172,17 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     lengths = np.sqrt(np.einsum("ij,ij->i", stretched, stretched))
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
-    # The derivative with respect to the scaled ray is transformed into camera axes.
-    # The matrix product also gives the permuted components that the cross product with the ray needs.
+    # The matrix product transforms the derivative with respect to the scaled ray into camera axes.
+    # It contains the components twice, in the orders that the cross product with the ray needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
         [back[:, _AFTER], back[:, _BEFORE], (view.rotation @ by_height).T], axis=1
     )
     gradients = np.empty((len(rays), PARAMETERS))
-    # A small rotation d of the camera displaces a fixed direction u by -d x u.
+    # A small rotation d of the view displaces a ray u by -d x u relative to the Earth.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # The variable `by_size` is minus the derivative of the cone's half-angle, arcsin(1 / size).
+    # The derivative of the cone's half-angle, arcsin(1 / size), with respect to `size` is -by_size.
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -197,7 +197,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
 
 _MOST_STEPS = 10
 _LAST_STEP = 3e-5
-"""Rotation step (rad) below which the limb fit ends; for a focal length of 400 px, 0.012 px."""
+"""Rotation step (rad) below which the limb fit ends; it is 0.012 px at a focal length of 400 px."""
 _SAME_GRADIENTS = 3e-3
 """Rotation step (rad) below which the gradients of the residuals are not computed again.
 
@@ -208,7 +208,7 @@ _HUBER, _BEYOND = 1.5, 5.0
 _MOST_CORRELATED = 0.8
 """Largest assumed correlation between neighbouring residuals."""
 UNKNOWN = 1e9
-"""Standard deviation (m) of an unknown altitude or height."""
+"""Standard deviation (m) of an unknown altitude."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -282,8 +282,8 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
             return None
         last = float(np.max(np.abs(step[:3])))
     factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
-    # The weights include the spread estimated from the median residual.
-    # The factor `excess` also takes a few large residuals into account.
+    # The weights include the spread of the median residual. A few large residuals can still exceed this
+    # spread, so that the covariance is multiplied by their chi-square per degree of freedom, `excess`.
     fitted = weights[used] * residuals[used] ** 2
     excess = max(1.0, float(np.sum(fitted)) / max(len(fitted) - 3, 1))
     covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))
@@ -329,7 +329,7 @@ def shared_error(
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
     inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
-    assert inverse is not None  # the fit has solved the same equations, so they are not singular
+    assert inverse is not None  # `fit_limb` has solved the same equations, so they are not singular
     moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
     return np.asarray((moved * (error**2)[:, None]).T @ moved)
 
@@ -369,7 +369,7 @@ def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, Bool
 
 
 def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray) -> float:
-    """Return the factor by which the correlation of neighbouring residuals increases their mean's variance.
+    """Return the factor by which correlated neighbouring residuals increase the variance of their mean.
 
     Clouds and coasts behind the limb displace neighbouring points in the same direction. If neighbours around
     the limb have the correlation r (first-order process), the factor is (1 + r)/(1 - r). The residuals
@@ -430,10 +430,10 @@ _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
     """Return the brightness of air and ground at tangent heights, and their derivatives, 1/m, as (4, n, k).
 
-    The brightness of air is relative to sunlit air of infinite optical depth, and that of ground to ground
-    without air. The k heights along each of n scan lines are (n, k), m, and the Gaussian blur of each scan
-    line is (n,), m. The blur is rounded to the nearest blur of the table; neighbouring blurs of the table
-    differ by 8 %.
+    The unit of the brightness is sunlit air of infinite optical depth for air, and ground without an
+    atmosphere for ground. The k heights along each of n scan lines are (n, k), m, and the Gaussian blur of
+    each scan line is (n,), m. The blur is rounded to the nearest blur of the table; neighbouring blurs of the
+    table differ by 8 %.
     """
     table = _limb_table()
     width = np.log(np.clip(blur, _SHARPEST, _BROADEST) / _SHARPEST) / math.log(_BROADEST / _SHARPEST)
@@ -555,9 +555,9 @@ def fit_profiles(
 
 
 _WIDER, _WIDEST = 2.0**0.5, 10.0
-"""Ratio of successive trial blurs, and largest trial blur, relative to the stated blur."""
+"""Ratio of each trial blur to the previous trial blur, and of the largest trial blur to the stated blur."""
 _BETTER = 0.7
-"""Largest ratio of the misfits with the fitted and with the stated blur at which the fitted blur is used."""
+"""Largest misfit of a fitted blur that is used, as a fraction of the misfit of the stated blur."""
 _BLUR_LINES = 32
 """Number of scan lines whose profiles determine the blur."""
 

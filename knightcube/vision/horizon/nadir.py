@@ -158,7 +158,7 @@ class HorizonSolution:
 _WIDER = 2.0
 """Factor that widens the altitude range in the search for cones. A cone through three edges is inaccurate."""
 _MOST_ALTITUDE = 3.0
-"""Largest distance (standard deviations) of the altitude that the edges imply from prior knowledge."""
+"""Largest difference (standard deviations) between the altitude that the edges imply and prior knowledge."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 """Thresholds of three tests that a horizon must pass.
 
@@ -240,7 +240,7 @@ def _find(
 ) -> HorizonSolution:
     """Return the result of `find_nadir`.
 
-    If the search is not the last one in this image, it does not search for the reason of a refusal.
+    The reason of a refusal is determined only if this search is the last search of the image (`is_last`).
     """
     search = _search(image, knowledge, settings, is_last=False)
     found = search.solution()
@@ -293,7 +293,11 @@ class _FreeCone:
 _FIELD_STEPS: FloatArray = np.linspace(-2.5, 2.5, 11)
 """Trial focal lengths, as deviations from the most probable focal length in standard deviations."""
 _FIELD_ROUNDS, _RESOLVED = 4, 0.3
-"""Maximum number of searches with refined trial focal lengths, and relative spread above which they end."""
+"""Maximum number of rounds of trial focal lengths, and spread, as a fraction of `width`, that ends them.
+
+The deviations of the trial focal lengths are `_FIELD_STEPS` times `width`. Another round with a smaller
+`width` follows, unless the weighted spread of the trials exceeds the given fraction.
+"""
 _MOST_REFUSED = 0.5
 """Largest accepted total probability of the trial focal lengths whose horizons are refused."""
 
@@ -390,7 +394,7 @@ def _by_field(
         # Only edges whose distance from the horizon is known for all focal lengths are compared.
         squares = np.minimum(squares[:, ~np.isnan(squares).any(axis=0)], _OFF)
         loss = squares.sum(axis=1)
-        # The misfit and the correlation of the best fit, due to ground and clouds, scale all misfits.
+        # Ground and clouds raise the misfit and the correlation of the best fit, which divide all misfits.
         best_fit = int(np.argmin(loss))
         on = squares[best_fit] < _OFF
         mean = float(squares[best_fit][on].sum()) / max(int(np.count_nonzero(on)), 1)
@@ -492,7 +496,7 @@ def _hypotheses(
 
     A horizon is fitted to the edges that agree with each of the best cones. Accepted horizons come before
     refused horizons, and horizons with more edges before horizons with fewer edges. The list `cones` contains
-    the best cones known from an earlier search, and is extended by the cones that are needed.
+    the best cones of earlier searches. Cones that this search adds are appended to the list.
     """
     place = place_of(knowledge, settings)
     free = np.ones(len(observation.edges), dtype=bool)
@@ -608,8 +612,8 @@ def _measurement(
     sigma = fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA if free else 0.0)
     if free:
         mean, share = limited_normal(altitude, sigma, altitudes)
-        # The error of the altitude is correlated with the rotation error d (3,) of the camera.
-        # A rotation d displaces nadir n by d x n.
+        # The error of the altitude is correlated with the error d (3,) of the view's rotation.
+        # A rotation d of the view displaces nadir n by d x n.
         gain = np.cross(fit.covariance[:3, ALTITUDE] / sigma**2, nadir)
         nadir = nadir + (mean - altitude) * gain
         nadir = nadir / np.linalg.norm(nadir)
@@ -638,8 +642,8 @@ _IMPROBABLE = 1e-6
 _COMMON = 2.0
 """Assumed ratio of the variance of the difference of two nadirs to the sum of their variances.
 
-The ratio of variances is above 1, because an unknown limb height displaces the nadirs measured on opposite
-sides of the Earth in opposite directions.
+The ratio is above 1, because an unknown limb height displaces two nadirs in opposite directions if they are
+measured on opposite sides of the Earth.
 """
 _OWN_AIR = 400.0
 """Standard deviation (m) of the difference between the limb heights in the images of two cameras."""
@@ -653,7 +657,7 @@ class JointNadir:
         status, reason: outcome of the search, and reason why no nadir was found.
         nadir: the measured nadir in body axes, or None unless the status is FOUND.
         cameras: indices of the cameras whose limb points were used in the fit.
-        each: result of the search in each image, by the index of the camera, in camera axes.
+        each: result of the search in each image, in camera axes, by the index of the camera.
         limb_height: fitted height of the limb above the ellipsoid, m, or NaN if no nadir was found.
     """
 
@@ -667,7 +671,7 @@ class JointNadir:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """A nadir (3,), with its covariance (3, 3), rad^2, body axes, from a horizon with `edges` edges."""
+    """A nadir (3,) in body axes and its covariance (3, 3), rad^2, measured from `edges` edges."""
 
     camera: int
     nadir: FloatArray
@@ -713,7 +717,7 @@ def nadir_of_cameras(
     votes = [vote for number, solution in each.items() for vote in _votes(number, solution, cameras[number])]
     group, rival = _agreed(votes)
     if rival or not group:
-        # The reasons of refusals are searched only now, because further searches usually replace them.
+        # The reasons of refusals are determined only here, because they are needed only without a nadir.
         each = {n: found if found.nadir is not None else searched(n, knowledge) for n, found in each.items()}
         status, reason = (HorizonStatus.AMBIGUOUS, rival) if rival else _why_none(each)
         return JointNadir(status, reason, None, (), each)

@@ -1,7 +1,7 @@
 """Settings of the horizon search, the response of the detector, and prior knowledge for one image.
 
 A horizon does not determine the rotation about nadir. Prior knowledge (position, Sun, rough attitude,
-directions from other sensors) determines this rotation, and tests a fitted horizon.
+directions from other sensors) determines this rotation and is compared with a fitted horizon.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ class HorizonSettings:
         edges: settings of the search for edges.
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
             of the limb height is valid for an atmosphere of unknown scale height (6.5 to 9.5 km) and unknown
-            haze. If scale height and haze are known, a standard deviation of 1,000 m is sufficient.
+            haze. If scale height and haze are known, the value can be reduced to 1,000 m.
         uneven_limb_sigma: standard deviation of the variation of the limb's height along the limb, m. The
             height of the limb varies with the elevation of the Sun, latitude, haze and clouds.
         altitude_sigma: standard deviation of the altitude of a known position, m.
