@@ -20,7 +20,7 @@ SHAPE_ERROR = 0.1
 """Error of a bright streak's modelled counts, as a fraction, due to errors of ends, PSF and uniformity."""
 # Regularisation of the fit of brightnesses: number added to the unit diagonal of the normal equations.
 _RIDGE = 1e-10
-# Gradient below which a brightness of zero is optimal, as a fraction of the largest right-hand side.
+# Gradient, relative to the largest right-hand side, below which a brightness remains zero.
 _OPTIMAL = 1e-12
 # Maximum number of iterations of the fit for each brightness.
 _ITERATIONS = 30
@@ -120,10 +120,10 @@ def equations_with(images: FloatArray, target: FloatArray, sums: FloatArray, lin
 def brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[FloatArray, float]:
     """Return the non-negative least-squares coefficients (k,) of k images, and the chi-square.
 
-    The argument `normal` (k, k) contains the scalar products of the weighted images with one another, and
-    `right` (k,) their scalar products with the weighted pixels of the frame. The argument `power` is the sum
-    of the squares of the weighted pixels. Raises KnightCubeError if the equations are not positive definite,
-    or if the solver does not converge.
+    The matrix `normal` (k, k) contains the scalar products of the weighted images with one another. The
+    vector `right` (k,) contains the scalar products of these images with the weighted pixels of the frame.
+    The argument `power` is the sum of the squares of the weighted pixels. Raises KnightCubeError if the
+    equations are not positive definite, or if the solver does not converge.
     """
     brightness, decrease, failure = _non_negative(normal, right)
     if failure == _NOT_DEFINITE:
@@ -190,9 +190,10 @@ def _non_negative_numpy(normal: FloatArray, right: FloatArray) -> tuple[FloatArr
 def _non_negative(normal: FloatArray, right: FloatArray) -> tuple[FloatArray, float, int]:
     """Return the non-negative solution (k,) of the normal equations of a least-squares fit of k images.
 
-    The further results are the decrease of chi-square by the solution, and `_NOT_DEFINITE`, `_NOT_CONVERGED`
-    or 0. The loop form is the active-set method of Lawson and Hanson (Solving Least Squares Problems, chapter
-    23) with the Cholesky factor of the equations of the positive coefficients.
+    The second result is the decrease of chi-square relative to a model without images. The third result is 0,
+    or the failure `_NOT_DEFINITE` or `_NOT_CONVERGED`. The loop form is the active-set method of Lawson and
+    Hanson (Solving Least Squares Problems, chapter 23) with the Cholesky factor of the equations of the
+    positive coefficients.
     """
     size = len(right)
     scale, scaled, target = np.empty(size), np.empty((size, size)), np.empty(size)
@@ -295,7 +296,7 @@ def _set_positive(
         if not _append_row(factor, matrix, order, count):
             continue
         _solve_positive(factor, target, order, count + 1, found)
-        # A coefficient that is not positive has a gradient above zero only because of rounding errors.
+        # If the coefficient is not positive, its gradient was above zero only because of rounding errors.
         if found[count] > 0.0:
             count = _without_negative(matrix, target, factor, order, count + 1, found, solution)
             excluded[:] = False

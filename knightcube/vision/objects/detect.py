@@ -277,7 +277,7 @@ class SpaceObject:
     Attributes:
         endpoints: ends of the object's streak (2, 2), px, in the order in time that gives the slower motion
             relative to the stars.
-        sigma: standard deviation of each end (2,), px, along the axis of the larger error.
+        sigma: standard deviation of each end (2,), px, along the major axis of its error ellipse.
         fired: names of the indicators that exceed their thresholds; empty if the object was found by its
             pixels only.
         flux: flux of the object, counts.
@@ -307,9 +307,9 @@ class SpaceObject:
 class ObjectReport:
     """Result of the search of an image: the examined streaks, and the objects found, the brightest first.
 
-    `indicators` and `verdicts` have one entry for each streak with two ends, followed by those for the short
-    regions. The attribute `crowded` contains one verdict for each region with more than two corners.
-    `rotation` (3,), rad, is the rotation vector of the camera, in camera axes, that the search assumed.
+    The attributes `indicators` and `verdicts` have one entry for each streak with two ends, followed by one
+    entry for each short region. The attribute `crowded` contains one verdict for each region with more than
+    two corners. The attribute `rotation` (3,), rad, is the assumed rotation of the camera, camera axes.
     """
 
     indicators: Indicators
@@ -323,8 +323,7 @@ class ObjectReport:
 _LEAST_CROSSING_PX = 10.0
 # Largest distance (px) of a line's end from a star's path for which the line is part of the path.
 _ON_PATH_PX = 1.5
-# Distance (px) of a streak's ends from the ends predicted for a star below which the streak counts as a
-# star's streak.
+# Distance (px) from the predicted ends of a star's streak within which a streak counts as a star's streak.
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
@@ -332,16 +331,16 @@ _FEW_PATHS = 2
 _GOOD_FIT = 1.4
 # Upper limit of chi-square per pixel along a uniform streak (three standard deviations for 1000 pixels).
 _UNIFORM = 1.15
-# Minimum brightness of a star's path, as a fraction of the brightness of a line that is a segment of it.
+# Minimum brightness of a star's whole path, relative to a line of light that may be a segment of the path.
 _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided; every part must be bright enough.
 _PARTS = 12
-# Largest ratio of the excess chi-square that remains with an object to the decrease due to the object. The
-# second value is for a uniform streak that resembles the streak of a star.
+# Largest ratio of the excess of chi-square with an object to the decrease of chi-square due to the object.
+# The second value is for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
-# Fraction of the required decrease of chi-square above which light may be a segment of an object's streak.
+# Decrease of chi-square, relative to the required decrease, above which light may be a part of a streak.
 _PART = 0.6
-# Largest ratio of the remaining excess chi-square to its decrease due to an object whose ends are located.
+# Largest ratio of the excess of chi-square to its decrease, as above, at which the ends are still located.
 _HOPELESS = 4.0
 # Margin (standard deviations of the PSF) beyond the distance at which a star's profile equals the noise.
 _DIM_SIGMAS = 2.0
@@ -406,7 +405,7 @@ def _light_beside(
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """Classifier of the streaks and regions of a frame as stars or objects, by their pixels.
+    """Classifier that decides whether the pixels of a streak or region show stars only or an object.
 
     The camera rotates by `rotation` (3,), rad, camera axes, during the `exposure`, s.
     """
@@ -539,9 +538,8 @@ class Judge:
     def _only_stars(self, few: StarLight, enough: float) -> bool:
         """Return whether a few trial stars explain the pixels; then more trial stars need not be tested.
 
-        The trial stars explain the pixels if an additional object cannot decrease chi-square by `enough`. A
-        good fit of stars and an object has a chi-square of about one per pixel, so that the possible decrease
-        is limited.
+        The trial stars explain the pixels if an additional object cannot decrease chi-square by `enough`. An
+        object cannot decrease chi-square below about one per pixel, which is the value of a good fit.
         """
         calm = few.chi_square <= self.objects.worst_fit * few.pixels
         return few.chi_square - few.pixels < enough and calm
@@ -557,10 +555,10 @@ class Judge:
         """Return whether an object decreases chi-square enough and explains the pixels along its streak.
 
         If a streak differs from the streak of a star only near its ends, stars without an object fit most of
-        its length nearly as well. For a `uniform` streak, it is therefore sufficient that the object explains
-        nearly all light that stars do not explain. A line is rejected if it explains only a small part of the
-        light that remains after subtraction of the stars. Light in other regions does not count for a
-        `uniform` streak, because not all stars of other regions are modelled.
+        its length nearly as well. A `uniform` streak is therefore also accepted if the object explains nearly
+        all light that stars do not explain. A line is rejected if it explains only a small part of the light
+        that remains after subtraction of the stars. Light in other regions does not count for a `uniform`
+        streak, because not all stars of other regions are modelled.
         """
         gained = light.chi_square - found.chi_square
         remains = found.unexplained if uniform else found.chi_square - light.expected
@@ -628,7 +626,7 @@ class Judge:
         return [self._joined([found[k] for k in group]) for group in groups]
 
     def _joined(self, flashes: list[SpaceObject]) -> SpaceObject:
-        """Return one object from its `flashes` along a line. Its ends may be dark for as long as a gap."""
+        """Return one object from its `flashes` along a line. A dark end may be as long as the longest gap."""
         if len(flashes) == 1:
             return flashes[0]
         every = np.array([one.endpoints for one in flashes])
@@ -849,9 +847,8 @@ def detect_objects(
         rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
             from the streaks of the image. If the sign of the rate is unknown, the directions of motion of all
             objects may have the wrong sign.
-        exposure: exposure time, s. If the camera rotates so far during the exposure that no star remains in
-            the image, the result has no objects, and its `reason` states the rotation. The same holds if most
-            streaks contradict the rate.
+        exposure: exposure time, s. If no star remains in the image during the exposure, or if most streaks
+            contradict the rate, the result has no objects, and its `reason` contains the cause.
         settings: thresholds, gain and saturation, or None for the defaults.
 
     Raises:

@@ -1,8 +1,8 @@
 """Directions of possible objects in an image whose attitude is determined from the stars.
 
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
-object is also a point or a short streak. A possible object is then an area of light that is significantly
-above the noise and not at a catalogue star, or light beside a star that the star's image does not explain. A
+object is also a point or a short streak. Possible objects are then areas of light away from all catalogue
+stars that are significantly above the noise, and light beside a star that is not part of the star's image. A
 tracker over several images determines which possible objects move relative to the stars.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
@@ -414,7 +414,7 @@ def _significances(seen: Survey) -> FloatArray:
 
 
 def _faintness(flux: FloatArray) -> FloatArray:
-    """Return by how many magnitudes (n,) stars with a `flux` (n,), counts, are brighter than one count."""
+    """Return by how many magnitudes (n,) a `flux` (n,), counts, is brighter than a flux of one count."""
     return np.asarray(2.5 * np.log10(np.maximum(flux, 1e-9)))
 
 

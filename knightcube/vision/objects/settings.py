@@ -33,13 +33,13 @@ class EndpointSettings:
             that 0.005 allows a brightness ratio of 3.8 between the two ends.
         intensity_half_width: half-width of the window of the centre of intensity, px (N in Sease, eq.
             (3.15)).
-        centre_of: image whose centre of intensity locates an endpoint: the Harris response ("response") or,
-            as Sease does, the frame ("image").
+        centre_of: image in which the centre of intensity locates an endpoint, "response" for the Harris
+            response, or "image" for the frame as in Sease.
         endpoint_bias: outward displacement of the endpoints that compensates the bias of the corner detector,
             px; measured for a point spread function (PSF) of 1 px.
         endpoint_floor: standard deviation of the position of an endpoint of a bright streak, px.
-        endpoint_noise: standard deviation of an endpoint due to pixel noise, px, if the pixel noise equals
-            the streak's counts per px of length.
+        endpoint_noise: standard deviation of an endpoint due to pixel noise, px, divided by the ratio of
+            pixel noise to the streak's counts per px of length.
         border: distance from the border of the frame within which streaks are rejected, px.
         least_length: minimum median length of the streaks in a frame, px.
         least_streaks: minimum number of streaks in a frame.
@@ -150,7 +150,8 @@ class MeasuredObjects:
 
     Attributes:
         points: positions at mid-exposure (n, 2), px.
-        directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration.
+        directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration if the velocity
+            of the camera is known.
         covariance: covariances of the directions due to the errors of the positions (n, 3, 3), rad^2, ICRS.
         magnitudes: V magnitudes of the objects (n,), measured by comparison with the stars of the image, or
             NaN if unknown.

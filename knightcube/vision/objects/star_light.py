@@ -48,7 +48,8 @@ _LONGEST_CHAIN = 5.0
 _SAME_PATH = 0.15
 # Maximum number of iterations, each of which follows the light of an object's streak and fits its ends.
 _ROUNDS = 8
-# Minimum distance (px) to which light is followed beyond each end, in the first and in later iterations.
+# Distance (px) beyond the assumed ends over which light is followed: minimum if an end may be far away, and
+# value if both ends are near.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
 # Difference (px) between assumed and measured end of the light above which the fit uses the measured end.
 _FOLLOWED = 1.5
@@ -58,7 +59,7 @@ _END_FITS, _END_CONVERGED = 3, 0.05
 _LOCATED = 0.3
 # Ratio of local to median brightness on a path above which the local light belongs to another source.
 _BRIGHTER = 2.0
-# Error of subtracted starlight, as a fraction of the streak's brightness, above which light is ignored.
+# Error of the starlight subtracted at a point, relative to the streak, above which the point is not used.
 _HIDDEN = 0.25
 # Minimum length (px) of a streak whose ends are located.
 _LEAST_LOCATED = 12.0
@@ -76,7 +77,7 @@ _RIDGE = 1e-10
 class Explanation:
     """Quality of the hypothesis that the pixels of a region show stars and one object of `flux` counts.
 
-    The attribute `chi_square` belongs to the best-fitting sum of star streaks and the object's streak. The
+    The attribute `chi_square` is that of the best-fitting sum of star streaks and the object's streak. The
     attribute `unexplained` is the excess of chi-square over its expected value, without the pixels of bright
     regions that the object's streak does not touch. The attributes `misfit` and `misfit_of_stars` are the
     chi-squares per pixel along the object's streak, with the object and with stars only.
@@ -93,8 +94,8 @@ class Explanation:
 class LocatedEnds:
     """The ends (2, 2), px, of an object's streak, located by means of the light along the whole streak.
 
-    The standard deviation of each end (2,), px, is that along the axis of the larger error. The misfit is the
-    chi-square per pixel along the streak.
+    The standard deviation `sigma` of each end (2,), px, is along the major axis of its error ellipse. The
+    misfit is the chi-square per pixel along the streak.
     """
 
     ends: FloatArray
@@ -107,7 +108,7 @@ class StarLight:
 
     Only pixels near a trial star path, or near a line between two corners of the region, are used. The
     corners of a region are the peaks of the corner detector. A trial star path begins or ends at a corner of
-    the region, or passes the midpoint of all its corners.
+    the region, or lies on the arc of a star through the middle of the region.
 
     Args:
         segmented: frame with its bright regions.
@@ -188,7 +189,7 @@ class StarLight:
         """Return which pixels (p, 2) belong to bright regions other than those with the given `labels`."""
         regions = self._segmented.regions
         found = regions.labels[pixels[:, 1], pixels[:, 0]]
-        # The largest label of these pixels is used, because that of the whole frame takes longer to find.
+        # The largest label of the whole frame would take longer to find than the largest of these labels.
         largest = max(int(each.max(initial=0)) for each in (found, labels, regions.label))
         others = np.zeros(largest + 1, dtype=np.bool_)
         others[regions.label] = True
@@ -196,7 +197,7 @@ class StarLight:
         return np.asarray(others[found])
 
     def _object_images(self, ends: FloatArray) -> list[FloatArray]:
-        """Return the weighted images (p,) of an object on paths straight in the image and among the stars."""
+        """Return the weighted image (p,) of an object for each different path that it may have."""
         paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
         first = int(np.abs(paths[1] - paths[0]).max() < _SAME_PATH)
         return [self._weighted_image(path) for path in paths[first:]]
@@ -247,7 +248,7 @@ class StarLight:
             ends = found.ends
             if change < _LOCATED:
                 break
-            # The range stays long while the light may continue beyond the end of the range.
+            # The distance stays long as long as the light may continue beyond the shorter distance.
             ended = moved.max() < _BEYOND_LATER - 2.0 * _FOLLOWED
             beyond = _BEYOND_LATER if ended else max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         return found
@@ -330,10 +331,10 @@ class StarLight:
         return LocatedEnds(ends, sigma, misfit)
 
     def excess(self, region: IntArray) -> float:
-        """Return chi-square of stars alone minus its expected value, on pixels near paths and in a region.
+        """Return the excess of chi-square over its expected value, for a model that contains only stars.
 
-        The pixels of the `region` (m, 2), px, are in ascending order of rows and columns. The model of the
-        stars is zero on those pixels of the region that are not near any trial path.
+        The pixels used are those near the trial paths and those of the `region` (m, 2), px, which are in
+        ascending order of rows and columns. Away from all trial paths, the model is zero.
         """
         columns = self._segmented.signal.shape[1]
         near, own = (each[:, 1] * columns + each[:, 0] for each in (self._near, region))
@@ -347,7 +348,7 @@ class StarLight:
         """Return brightnesses (k + 1,) of k stars and an object of image `line` (p,), and chi-square."""
         sums = equations_with(self._stars, self._target, self._sums, line)
         brightness, chi_square = brightnesses(sums[:-1], sums[-1], self._power)
-        # Without rounding errors, chi-square would never be larger than without the object.
+        # Only rounding errors can make chi-square larger than without the object.
         return brightness, min(chi_square, self.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
@@ -397,8 +398,7 @@ def _around(inside: BoolArray, middle: int) -> IntArray:
 def _end_of_light(gain: FloatArray) -> tuple[float, float]:
     """Return the expected value of the last index with light, and its standard deviation.
 
-    The array `gain` (n,) contains, for each index, twice the logarithm of the likelihood ratio of light to no
-    light.
+    Each element of `gain` (n,) is twice the logarithm of the likelihood ratio of light to no light.
     """
     total = np.cumsum(gain)
     likelihood = np.exp(0.5 * (total - total.max()))
@@ -431,10 +431,10 @@ def _sums_of_ends(
 ) -> tuple[FloatArray, float, int]:
     """Return the normal equations (6, 5) of a fit of the brightness and the ends (2, 2), px, of a streak.
 
-    The first five rows are the matrix of the equations and the last row is their right-hand side. The
-    unknowns are the brightness and the displacements of the first and the last end, multiplied by the
-    brightness. The further results are the sum of the squares of the weighted counts, and the number of
-    pixels used.
+    The first five rows are the matrix of the equations and the last row is their right-hand side. The first
+    unknown is the brightness. The others are the displacements (x, y) of the first and of the last end, each
+    multiplied by the brightness. The further results are the sum of the squares of the weighted counts, and
+    the number of pixels used.
 
     The pixels (p, 2) have the counts `target` (p,) and the reciprocal standard deviations `weight` (p,). The
     `images` (3, p) are the image of the streak and its derivatives with respect to a displacement.
@@ -552,9 +552,10 @@ def _trial_starts(
 ) -> tuple[FloatArray, FloatArray]:
     """Return one point (n, 2), px, of each trial star path, and the fraction of the path at the point (n,).
 
-    One path begins and one path ends at each corner (k, 2), px. The other paths pass the `middle` (2,), px,
-    of the region. They begin at different distances from the middle, and form a chain over the region. The
-    argument `length` is the length of a path, px.
+    One path begins and one path ends at each corner (k, 2), px. The other paths lie on the arc of a star
+    through the `middle` (2,), px, of the region, and cover the region in equal steps. Their fractions of the
+    path are below 0 or above 1 if the path does not reach the middle. The argument `length` is the length of
+    a path, px.
     """
     size = len(corners)
     wide, high = np.ptp(corners[:, 0]), np.ptp(corners[:, 1])

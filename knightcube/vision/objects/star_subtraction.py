@@ -34,7 +34,7 @@ from knightcube.vision.objects.streak_images import (
     streak_images,
 )
 
-# Margin (px) of a patch of pixels around a region, which is wider than the PSF.
+# Margin (px) between a region and the border of its patch of pixels; the margin is wider than the PSF.
 _ROOM = 8
 _MOST_STARS = 12
 # Detection thresholds of stars and of remaining light, in standard deviations of the smoothed noise.
@@ -156,7 +156,7 @@ def _convolved_numpy(light: FloatArray, profile: FloatArray) -> FloatArray:
 def _convolved(light: FloatArray, profile: FloatArray) -> FloatArray:
     """Return an image convolved along both axes with a symmetric profile, with zeros beyond its border.
 
-    The array `profile` (k,) begins with the middle of the profile.
+    The array `profile` (k,) contains one half of the profile, from the middle outwards.
     """
     rows, columns = light.shape
     out, line = np.zeros((rows, columns)), np.empty(columns)
@@ -203,16 +203,16 @@ _FIRST_OFFSETS = 9
 
 
 def _steps_along(offsets: FloatArray, psf_sigma: float) -> tuple[IntArray, FloatArray]:
-    """Return the pixels (x, y) at which a star's path is tested (k, 2), and factors of the image there (k,).
+    """Return the pixels (k, 2) at which a star's path is tested, and factors (k,) for the image there.
 
-    The pixels are relative to the middle of the path, as are the points `offsets` (m, 2), px, of the path.
+    The pixels and the points `offsets` (m, 2), px, of the path are (x, y) relative to the path's middle.
     """
     every = max(1, round(2.0 * psf_sigma))
     steps = np.rint(offsets[np.unique(np.append(np.arange(0, len(offsets), every), len(offsets) - 1))])
     # At the end of a streak, the smoothed brightness is half the brightness along the streak.
     factor = np.ones(len(steps))
     factor[[0, -1]] = 2.0
-    # Most pixels are excluded by the tests at the middle of the path and at a few points along the path.
+    # The middle and a few other points of the path come first, because they exclude most positions.
     first = np.unique(np.linspace(0, len(steps) - 1, _FIRST_OFFSETS).astype(int))
     order = np.concatenate([first[len(first) // 2 :], first[: len(first) // 2]])
     order = np.concatenate([order, np.setdiff1d(np.arange(len(steps)), order)])
@@ -220,7 +220,7 @@ def _steps_along(offsets: FloatArray, psf_sigma: float) -> tuple[IntArray, Float
 
 
 def _brightest_star(patch: Patch, left: FloatArray, steps: IntArray, factor: FloatArray) -> FloatArray | None:
-    """Return the position (x, y) in the patch of the brightest possible star, or None if there is none.
+    """Return the position (x, y) of the brightest possible star in a patch, or None if there is none.
 
     The brightness of a star centred on a pixel is at most the minimum of the smoothed image `left` (rows,
     columns) along the star's path (see `_steps_along`).
@@ -259,18 +259,18 @@ def _brightest_path_numpy(
 def _brightest_path(
     seen: FloatArray, steps: IntArray, factor: FloatArray, beyond: FloatArray, threshold: float
 ) -> tuple[float, int, int]:
-    """Return the largest minimum of an image along a shifted path, and column and row of the path's middle.
+    """Return the largest minimum of an image along a path that is moved to each pixel, and that pixel.
 
-    Returns minus infinity, -1 and -1 if the minimum along the path is below the threshold at all positions of
-    the path.
+    The three results are the minimum, and the column and row of the path's middle. They are minus infinity,
+    -1 and -1 if the minimum is below the threshold at all pixels.
 
-    The image (rows, columns) is multiplied by `factor` (k,) at the pixels (x, y) of the path, which are given
-    relative to its middle by `steps` (k, 2). The values above, below, left and right of the image are
+    The path consists of the pixels `steps` (k, 2), (x, y) relative to its middle. The image (rows, columns)
+    is multiplied by `factor` (k,) at these pixels. The values above, below, left and right of the image are
     `beyond` (4,).
     """
     rows, columns = seen.shape
     best, best_column, best_row = -np.inf, -1, -1
-    # A path that leaves the image on a dark side is not bright enough.
+    # Positions are skipped if the path crosses the border on a dark side, where it is below the threshold.
     # To the left and right of the image, all rows have the value of that side.
     dark = factor.max() * beyond < threshold
     aside = dark[2] and dark[3]

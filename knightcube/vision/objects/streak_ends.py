@@ -77,9 +77,9 @@ class Regions:
 class Segmented:
     """A frame segmented into bright regions.
 
-    The signal (rows, columns), float32, contains the counts above the background, in which `hot_pixels` hot
-    pixels are repaired. The candidates are the regions that may be streaks, in descending order of the ratio
-    of length to endpoint error.
+    The signal (rows, columns), float32, contains the counts above the background. The number of hot pixels
+    repaired in the signal is `hot_pixels`. The candidates are the regions that may be streaks, in descending
+    order of the ratio of length to endpoint error.
     """
 
     signal: Image
@@ -225,7 +225,7 @@ def pixels_of_region(labels: Image, box: IntArray, label: int) -> IntArray:
 
 
 def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
-    """Return which regions (n,) lie within `border` px of the frame's border, which may truncate streaks."""
+    """Return which regions (n,) may be truncated: those within `border` px of the frame's border."""
     (rows, columns), (top, bottom, left, right) = shape, regions.boxes.T
     outside = (top < border) | (left < border) | (bottom > rows - border) | (right > columns - border)
     return np.asarray(outside)
@@ -290,7 +290,7 @@ def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[Float
 
 
 def _harris_corners(segmented: Segmented, settings: EndpointSettings) -> list[FloatArray]:
-    """Return the corners (n, 2), px, of each candidate region by the Harris response of the frame."""
+    """Return the corners (n, 2), px, of each candidate region from the Harris response of the frame."""
     candidates = segmented.candidates
     derivative, window = (kernel_radius(each) for each in (settings.derivative_sigma, settings.window_sigma))
     smooth = gaussian_kernel(settings.derivative_sigma, derivative)
@@ -460,9 +460,11 @@ def _correlate(
     half: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Set `out` to the correlation of an image with an outer product, within spans of columns (rows, 2).
+    """Set `out` within `spans` to the correlation of an image with the outer product of two kernels.
 
-    The image is extended by repeating its border pixels. The arrays `out` and `image` may be the same array.
+    The kernels are `down`, along each column, and `across`, along each row. The `spans` (rows, 2) are the
+    first and the last column. The image is extended by repeating its border pixels. The arrays `out` and
+    `image` may be the same array.
     """
     rows, columns = image.shape
     high, wide = len(down) // 2, len(across) // 2
@@ -565,8 +567,8 @@ def tensor_of(image: FloatArray, settings: EndpointSettings) -> StructureTensor:
 def structure_tensor(image: Image, derivative_sigma: float, window_sigma: float) -> StructureTensor:
     """Return the structure tensor: gradient products summed under a Gaussian window of `window_sigma` px.
 
-    Source: Sease, eq. (3.5), with the Gaussian window that the printed equation lacks. Without the Gaussian
-    window, the structure tensor has rank 1 and one eigenvalue is zero.
+    Source: Sease, eq. (3.5); the printed equation lacks the Gaussian window. Without the Gaussian window, the
+    structure tensor has rank 1 and one eigenvalue is zero.
     """
     gx, gy = gradient(image, derivative_sigma)
     window = gaussian_kernel(window_sigma, kernel_radius(window_sigma))
@@ -604,7 +606,7 @@ def gaussian_kernel(sigma: float, radius: int) -> FloatArray:
 
 
 def gaussian_derivative_kernel(sigma: float, radius: int) -> FloatArray:
-    """Return the kernel (2 radius + 1,), for correlation, that smooths by `sigma` px and differentiates.
+    """Return the correlation kernel (2 radius + 1,) of the derivative of a Gaussian with `sigma` px.
 
     The outer product of the returned kernel and `gaussian_kernel` is the kernel of Sease, eq. (3.4), mirrored
     from convolution to correlation.
@@ -646,9 +648,9 @@ def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntA
 def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> FloatArray:
     """Return the intensity-weighted centre (x, y) px of the (2 half_width + 1)^2 pixels around `pixel`.
 
-    Source: Sease, eq. (3.15) and (3.16), with the factor of the coordinate in the sums that the printed
-    equation lacks. Pixels with negative intensity have no weight. A window that would extend beyond the image
-    border is narrowed on both sides, so that it stays centred on `pixel` (x, y).
+    Source: Sease, eq. (3.15) and (3.16); the printed sums lack the coordinate as a factor. Pixels with
+    negative intensity have no weight. A window that would extend beyond the image border is narrowed on both
+    sides, so that it stays centred on `pixel` (x, y).
     """
     x, y = int(pixel[0]), int(pixel[1])
     rows, columns = image.shape
@@ -666,10 +668,10 @@ def find_corners(
 ) -> FloatArray:
     """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its cornerness (`response`).
 
-    The position of a corner is the centre of intensity of the image `intensity` around the peak, where
-    `intensity` is the cornerness or, as in Sease, the frame. If the centre of intensity is computed from the
-    frame, the corners lie up to 2 px inside the streak. A streak has two corners. A region with fewer or more
-    than two corners shows noise, crossing streaks or another source.
+    The position of a corner is the centre of intensity around the peak, computed in the image `intensity`.
+    This image is the cornerness or, as in Sease, the frame. In the frame, the centres lie up to 2 px inside
+    the streak. A streak has two corners. A region with fewer or more than two corners shows noise, crossing
+    streaks or another source.
     """
     peaks = local_maxima(response, mask, relative)
     return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)
@@ -694,8 +696,8 @@ def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
     """Return the centre of rotation (2,), px, which is nearest to the perpendicular bisectors of streaks.
 
     Each streak is given by its two ends (n, 2, 2), px. The centre is far away if the rotation axis is nearly
-    normal to the boresight, and NaN for parallel chords. Source: Sease, eq. (3.17) and (3.18) as corrected in
-    the errata.
+    normal to the boresight. The result is NaN if the chords are parallel. Source: Sease, eq. (3.17) and
+    (3.18) as corrected in the errata.
     """
     chord = endpoints[:, 1] - endpoints[:, 0]
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)
@@ -712,7 +714,7 @@ flash to the end of the last."""
 
 
 def flashes_of_objects(ends: FloatArray) -> list[list[int]]:
-    """Return the indices of the streaks (n, 2, 2), px, of each object, each list in the order along a line.
+    """Return, for each object, the indices of its streaks among `ends` (n, 2, 2), px, in order along a line.
 
     A tumbling object flashes, so that its streak has gaps. Streaks on a common line that do not overlap, and
     that are long enough compared with the gaps, are flashes of one object.

@@ -199,7 +199,7 @@ def _turned(x: float, y: float, z: float, axis: FloatArray, angle: float) -> tup
 
 
 def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the mid-exposure directions (2, 3) of two stars from their directions `vectors` at other times.
+    """Return the directions (2, 3) of two stars at mid-exposure, in camera axes.
 
     The rows of `vectors` (2, 3) are the first star's direction at the start of the exposure, and the second
     star's direction at the end of the exposure.
@@ -334,7 +334,7 @@ _NODES = 33
 _LEAST_AHEAD = 0.85
 # Distance from a path, in standard deviations, beyond which the compiled form omits the light.
 _DARK = 7.0
-# If the path of a streak has fewer points, its image is the sum of the images of these points.
+# Number of points of a path below which the streak's image is the sum of the images of the points.
 _LEAST_POINTS = 4
 
 
@@ -358,7 +358,7 @@ def _streak_images_numpy(pixels: IntArray, paths: FloatArray, sigma: float, slop
 
 
 def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
-    """Add one count, divided equally among `points` (m, 2), px, to `image` (1, p), or (3, p) with slopes."""
+    """Add one count, divided equally among `points` (m, 2), to `image` (1, p), or (3, p) with derivatives."""
     columns, rows = np.ascontiguousarray(pixels.T)
     reach = _FARTHEST * sigma + 1.0
     for point in points:
@@ -374,7 +374,7 @@ def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, s
 
 
 def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
-    """Add one count along a nearly straight `path` (m, 2), px, to `image` (1, p), or (3, p) with slopes."""
+    """Add one count along a nearly straight `path` (m, 2) to `image` (1, p), or (3, p) with derivatives."""
     chord = path[-1] - path[0]
     length = float(np.linalg.norm(chord))
     width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
@@ -423,9 +423,10 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
 
 
 def _between_ends(start: FloatArray, stop: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Return the factors (n,) by which the ends reduce a streak's brightness, and their derivatives along it.
+    """Return the brightness (n,) near the ends of a streak, relative to its middle, and the derivatives.
 
-    The distances `start` and `stop` (n,) from the ends are positive within the streak.
+    The derivatives (n,), 1/px, are along the streak. The distances `start` and `stop` (n,) from the ends, px,
+    are positive within the streak.
     """
     covered, sloping = np.ones(len(start)), np.zeros(len(start))
     for sign, distance in ((1.0, start), (-1.0, stop)):
@@ -658,7 +659,7 @@ def line_image(
     profile = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * length)
     covered = ndtr(a) - ndtr(b)
     whole = profile * covered
-    # The contribution of the second end is weighted by the position along the streak, as a fraction.
+    # The second end moves each point by the point's position along the streak, as a fraction of the length.
     second = profile * (s * covered + width * (bell_a - bell_b)) / length
     aside = n / width**2
     first_along = whole / length - profile * bell_a / width
@@ -745,7 +746,7 @@ def fitted_line(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: 
 def _sum_line(
     light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float, sums: FloatArray
 ) -> None:
-    """Set `sums` (6, 5) to the normal equations of a fit of the images of `line_image`, as for `solved`."""
+    """Set `sums` (6, 5) to the normal equations of the five images of `line_image`, for use by `_solved`."""
     rows, columns = light.shape
     width = math.sqrt(sigma**2 + 1.0 / 12.0)
     reach = 4.0 * width
@@ -837,8 +838,8 @@ def spread_with_slopes(
 ) -> list[FloatArray]:
     """Return the image of a streak with a flux of one count, and the derivatives of this image, 1/px.
 
-    The derivatives are with respect to k displacements of the path, each along x and along y. A displacement
-    of 1 px moves each of the m points of the path by the fraction of a pixel given in `shares` (k, m).
+    Each row of `shares` (k, m) gives two derivatives, for a displacement along x and for one along y. A
+    displacement of 1 px moves each of the m points of the path by its share of 1 px.
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     dx, dy = (_slopes_within_pixels(each, path[:, k], sigma) for k, each in enumerate((x, y)))
@@ -879,7 +880,7 @@ def _added(x: _Profiles, y: _Profiles, across: FloatArray, down: FloatArray) -> 
     """Return the sum (rows, columns) of the images of m points, each the product of two profiles.
 
     The arrays `across` (m, w) and `down` (m, w) contain the profiles of each point along x and along y. The
-    profiles `x` and `y` give the pixels that these arrays cover.
+    arguments `x` and `y` contain the first pixel of each profile.
     """
     width = across.shape[1]
     columns = x.count + 2 * width
