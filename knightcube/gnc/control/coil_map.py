@@ -39,14 +39,14 @@ _STEPS = 200
 _PARALLEL = 1e-6
 """Sine of the angle between two coil axes below which the coils count as parallel."""
 _NEWTON_STEPS, _EXACT = 60, 1e-9
-"""Largest number of Newton steps for limited currents, and accuracy of the resulting dipole moment as a
+"""Maximum number of Newton steps for limited currents, and tolerance of the resulting dipole moment as a
 fraction of the moment."""
 _SATURATED = 1e-4
 """Weight in the Newton matrix of a coil at its current limit, relative to a coil below its limit."""
 _WEAKEST = 0.15
-"""Torque, with the currents at their limits, below which a torque direction is discarded, as a fraction of
-the largest such torque of any direction. A torque in a discarded direction would need the full current, and
-scaling all currents to the limit would then reduce the torque in the other directions."""
+"""Torque at the current limits below which a torque direction is discarded, as a fraction of the largest such
+torque in any direction. A torque in a discarded direction would need the full current, and scaling all
+currents to the limit would then reduce the torque in the other directions."""
 
 
 def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None) -> FloatArray:
@@ -213,7 +213,7 @@ class CoilMap:
     def linear_shares(self, used: BoolArray) -> FloatArray:
         """Return the matrix (n, n) that maps currents to the currents of least heat with equal dipole moment.
 
-        Only the coils marked in `used` (n,) carry the currents of least heat, which depend linearly on the
+        The currents of least heat flow only in the coils marked in `used` (n,), and depend linearly on the
         given currents because current limits are ignored.
         """
         weights = np.sqrt(self.resistance / self.resistance.max())
@@ -227,7 +227,7 @@ class CoilMap:
         return np.asarray(self.dipoles @ currents)
 
     def per_dipole(self, matrix: FloatArray) -> FloatArray:
-        """Convert derivatives (k, n) by currents to derivatives (k, 3) by the dipole moment."""
+        """Return derivatives (k, 3) per A m^2 of dipole moment from derivatives (k, n) per ampere."""
         if self._strength is not None:
             return np.asarray(matrix / self._strength)
         return np.asarray(matrix @ self._inverse)
@@ -266,9 +266,9 @@ class CoilMap:
         normals = np.array([np.cross(one, other) for one, other in combinations(units.T, 2)])
         normals = normals[np.linalg.norm(normals, axis=1) > _PARALLEL]
         reached = np.abs(normals @ self.dipoles) @ self.current_limits
-        # Each element of `use @ box` belongs to a face of the zonotope of possible dipole moments.
-        # The element is the extent of the box along the face's normal, divided by the face's distance.
-        # Each iteration scales the multiplier of a face by this ratio (iterative proportional fitting).
+        # The array `use @ box` contains, for each face of the zonotope, the extent of the box along the
+        # face's normal, divided by the distance of the face from the origin. Each iteration scales the
+        # multiplier of a face by this ratio (iterative proportional fitting).
         use = np.abs(normals) / reached[:, None]
         multipliers = np.full(len(use), 3.0 / len(use))
         for _ in range(_STEPS):

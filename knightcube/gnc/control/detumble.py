@@ -53,7 +53,7 @@ class WindowSchedule:
         """Return the first time (ns) from `begin_ns` after which no coil switches for `length_ns`.
 
         Windows follow each other without gaps from time zero. If neither the phase with coils off nor the
-        phase with coils on is long enough, the result is `begin_ns`.
+        phase with coils on is long enough, `begin_ns` is returned.
         """
         phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
         later_ns = self.period_ns + pause_ns

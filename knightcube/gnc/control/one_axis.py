@@ -163,7 +163,7 @@ class LqTracker:
             v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
         else:
-            # The coil can decelerate by `braking` (rad/s^2) until the body reaches the angle of the path.
+            # The deceleration `braking` (rad/s^2) is available until the body reaches the angle of the path.
             authority = max(min(math.cos(angle), math.cos(wanted.angle)), 0.0)
             taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
             braking = max(

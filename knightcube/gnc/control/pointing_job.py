@@ -85,17 +85,18 @@ END = 2_000.0
 lasts for this time. The weight is high because disturbance torques are poorly known before the slew, and the
 errors that they cause should be corrected by the end of the slew."""
 HOTTER = 1.1
-"""Largest accepted ratio of the coil heat of a new plan to the coil heat of the present plan, for the
-remaining slew. A new plan with more heat is rejected, because it would correct a deviation for which the
-remaining time is too short."""
+"""Largest accepted ratio of the coil heat of a new plan for the remaining slew to that of the present plan. A
+new plan with more heat is rejected, because it would correct a deviation for which the remaining time is too
+short."""
 FEWEST = 12
 """Smallest number of collocation intervals for the remaining part of a slew."""
 _INSIDE = 1e-6
 """Additional reduction (rad) of the half angle of a violated exclusion cone, so that the path is outside the
 cone."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""If a slew rotates too fast, its duration is multiplied by the ratio of its rate to the permitted rate and
-by the first factor, but at most by the second factor. The third value is the largest number of trials."""
+"""Extension of a slew that rotates too fast: the duration is multiplied by the first value times the ratio of
+the rate to the permitted rate, but at most by the second value. The third value is the largest number of
+trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,8 +253,8 @@ def slew_table(
 
     The time step of the returned table is a fifth of the time step of `begin.times`.
 
-    The path was planned with the residual dipole moment `residual` (3,), A m^2. Only the environment in
-    `expected` is used, which is given at the times of `begin`.
+    The path was planned with the residual dipole moment `residual` (3,), A m^2. The environment is taken from
+    `expected`, whose instants are `begin.times`.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -286,7 +287,7 @@ def slew_table(
 
 
 def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
-    """Return a path interpolated at `times` (n,), s, with placeholders at the first `count` instants."""
+    """Interpolate a path at `times` (n,), s; the first `count` instants are copies of the next one."""
     rest = [path.at(float(time)) for time in times[count:]]
     whole = [*[rest[0]] * count, *rest]
     return AttitudeReferences(
@@ -430,8 +431,8 @@ does not depend on the duration of the initial guess."""
 class ObjectDirection:
     """The direction (3,) of an object, ICRS, `since` s after the time `origin_ns` of the planning job.
 
-    The vector `velocity` (3,), 1/s, is the object's velocity relative to the satellite, divided by the
-    distance, or zero.
+    The vector `velocity` (3,), 1/s, is the velocity of the object relative to the satellite, divided by the
+    distance. It is zero for a search direction.
     """
 
     direction: FloatArray

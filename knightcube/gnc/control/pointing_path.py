@@ -187,9 +187,9 @@ def _riccati_numpy(
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Return feedback matrices, the cost-to-go at the start, and whether the costs are singular.
 
-    `ahead` (n, 6, 6 + columns) contains the transition matrix and the affine part of the error model of each
-    step, and `weights`, of the same shape, the costs of the errors and their slopes. The feedback matrices
-    have the shape (n, controls, 6 + columns). See `sweep`.
+    For each step, `ahead` (n, 6, 6 + columns) contains the transition matrix and the affine part of the error
+    model, and `weights`, of the same shape, contains the quadratic and the linear weights of the errors. The
+    feedback matrices have the shape (n, controls, 6 + columns). See `sweep`.
     """
     from scipy.linalg.lapack import dgesv  # noqa: PLC0415 - only the worker that plans needs scipy
 
@@ -311,15 +311,14 @@ DEAR, PROHIBITIVE = 1e4, 1e6
 """Ratios of the cost of a torque along the field to the cost of the same torque across the field. The cost of
 a torque along the field is increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Largest rotation error (rad), in the second half of a path, of a path that counts as settled."""
+"""Largest rotation error (rad) in the second half of a path that counts as settled."""
 SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even if the sweeps have not converged."""
 SAVED = (0.05, 2e-3)
-"""Reductions of the total cost by a sweep, as fractions of the cost, below which a stage ends. If a sweep
-improves the total cost by less than the first value, the next stage begins, with an increased cost of a
-torque along the field. In the last stage, which has the cost `PROHIBITIVE`, the second value replaces the
-first value."""
+"""Relative reductions of the total cost by a sweep below which a stage ends. If a sweep improves the total
+cost by less than the first value, the next stage begins, with an increased cost of a torque along the field.
+In the last stage, which has the cost `PROHIBITIVE`, the second value replaces the first value."""
 NEAR = math.radians(10.0)
 """Angle (rad) between the first motion and the attitude law, up to which the linear-quadratic sweeps converge
 without an auxiliary torque along the field."""
@@ -369,12 +368,12 @@ class PathConditions:
         return found
 
     def pressed(self, count: int) -> list[tuple[FloatArray, FloatArray]]:
-        """Return aerodynamic and solar radiation torques at the first `count` instants, for `linearised`."""
+        """Return aerodynamic and solar radiation torques at `count` instants, as needed by `linearised`."""
         air, light = self.pressures.air[:count], self.pressures.light[:count]
         return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
 
     def until(self, count: int) -> PathConditions:
-        """Return the conditions at the first `count` instants."""
+        """Return these conditions at the first `count` instants."""
         field, position, pressures = self.field[:count], self.position[:count], self.pressures.until(count)
         return replace(
             self, wanted=self.wanted.until(count), field=field, position=position, pressures=pressures
@@ -427,9 +426,9 @@ class PathCriterion:
     Attributes:
         state: weights (6, 6) of rotation and rate errors relative to the attitude law.
         dipole: weight of the squared dipole moment of each axis.
-        end: cost-to-go of following the attitude law after the path. The linear part `end.slope` has one
-            column for the attitude law with the expected torques, and one further column per component of the
-            disturbance torques, per unit of that component.
+        end: cost-to-go of following the attitude law after the path. The first column of the linear part
+            `end.slope` belongs to the attitude law with the expected torques. Each further column belongs to
+            a unit of one component of the disturbance torques.
         shape: derivatives (n + 1, 3, 9) of the disturbance torque with respect to its 9 components, in the
             body axes of the commanded attitude.
         fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.

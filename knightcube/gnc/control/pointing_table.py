@@ -72,14 +72,14 @@ def midpoint_step(expected: PathConditions, motion: PlannedMotion) -> tuple[Floa
 
 
 def defects(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
-    """Return the defects (n, 6): rotation and rate from the next instant's state to the propagated state."""
+    """Return the defects (n, 6): rotation and rate of the propagated state relative to the next state."""
     there, speed = midpoint_step(expected, motion)
     turn = to_rotation_vector(multiply(there, conjugate(motion.quaternion[1:])))
     return np.concatenate([turn, speed - motion.rate[1:]], axis=1)
 
 
 def derivative(expected: PathConditions, motion: PlannedMotion) -> LinearErrorModel:
-    """Return the derivatives of the state after each step with respect to old state, dipole and torque."""
+    """Return the derivatives of each step's last state with respect to its first state, dipole and torque."""
     step, count = expected.step, len(motion.control)
     q, w, dipole = motion.quaternion[:count], motion.rate[:count], motion.control
     half, middle = _halfway(expected, motion)
@@ -299,8 +299,8 @@ class PointingWeights:
         dipole: dipole moment along one axis that has a cost of one, A m^2.
         fastest: rate above which the cost increases steeply while the body approaches the attitude law (see
             `pointing_path.EXCESS`), rad/s.
-        roll: rotation error about the unit vector `axis` (3,) that has a cost of one, rad, if rotations about
-            this axis have a smaller weight than other rotations.
+        roll: rotation error (rad) about the unit vector `axis` (3,) that has a cost of one, or None if
+            all axes have the same cost.
     """
 
     turn: float

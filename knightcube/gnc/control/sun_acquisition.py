@@ -149,7 +149,8 @@ FASTEST, FASTEST_ACROSS = 0.0165, 0.010
 body is only damped. The two rate limits are below the rates at which the flight software starts
 detumbling."""
 FASTEST_ROLL = 0.0105
-"""Roll rate (rad/s) about the Sun direction at which the extra cost of torques normal to it falls to 1/e."""
+"""Roll rate (rad/s) about the Sun direction at which the extra cost of torques normal to this direction falls
+to 1/e."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
 """Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the pointing
 law demands at most the fraction `SHARE` of the torque that the coils can produce."""
@@ -231,7 +232,7 @@ class SunAcquisition:
             self._sun.measure(time_ns, sun / length)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""
+        """Set the dipole moment (3,), A m^2, that actually acts until the next command."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
