@@ -1,14 +1,14 @@
 """A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
 The filter applies each measurement at the time for which the measurement is valid. A late measurement is
-inserted at its measurement time, and all later measurements are applied again, either in a single call, or a
-few in each call while the filter continues without the late measurement (class `Replay`). The rate from a
-streaked image is the mean rate during the exposure, so the filter stores the attitude at the start of an
-exposure until the exposure ends. The filter can also estimate the age of the inertial unit's samples (module
-`mekf`). For a body that hangs on the testbed's thread, the filter uses only the component of each measurement
-about the thread. The torsion and the damping of the thread are either known or estimated by the filter. The
-filter can distinguish the thread's torques from the estimated disturbance, because only the thread's torques
-depend on the angle and the rate.
+inserted at its measurement time, and all later measurements are applied again, in one call or in several
+calls while the filter continues without the late measurement (class `Replay`). The rate from a streaked image
+is the mean rate during the exposure, so the filter stores the attitude at the start of an exposure until the
+exposure ends. The filter can also estimate the age of the inertial unit's samples (module `mekf`). For a body
+that hangs on the testbed's thread, the filter uses only the component of each measurement about the thread.
+The torsion and the damping of the thread are either known or estimated by the filter. The filter can
+distinguish the thread's torques from the estimated disturbance, because only the thread's torques depend on
+the angle and the rate.
 
 The class `CommandCheck` compares the gyro samples with the commands to check whether the coils carry the
 commanded currents. With a broken coil, the innovations of the gyro become inconsistent with their covariance
@@ -77,9 +77,9 @@ _BEFORE_NS = 500_000_000
 weak fault affects the other states of the filter before it is detected. Treating the currents before the
 contradictory sample as unknown corrects the other states."""
 _MAXIMUM_CHANGE = 3.0
-"""Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
-coils. A reversed coil causes an innovation of twice the commanded change, and the uncertain age of a sample
-increases the innovation further."""
+"""Largest innovation that a coil fault can explain, as a multiple of the largest rate change that unknown
+coil currents can cause. A reversed coil causes an innovation of twice the commanded change, and the uncertain
+age of a sample increases the innovation further."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
 """Minimum and maximum time (s) between gyro samples during which wrong coil currents may have acted. If wrong
 currents were assumed to act for a longer time, they could explain any innovation after a long gap."""
@@ -112,7 +112,7 @@ class CommandCheck:
         self._model = model
         self._scale = 1.0
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
-        # Times (ns) and innovations in standard deviations, as sums over all samples up to these times.
+        # Times (ns) and cumulative sums, up to these times, of the innovations in standard deviations.
         self._totals: deque[tuple[int, list[float]]] = deque(maxlen=max(_DEPARTURES) + 1)
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._natural: FloatArray = np.zeros(1)
@@ -227,8 +227,8 @@ class FilterSettings:
     """Noise and limits of the attitude filter.
 
     Attributes:
-        current_noise: standard deviation of the current noise of a driven coil, A. The noise is independent
-            from control cycle to control cycle.
+        current_noise: standard deviation of the current noise of a driven coil, A. The noise of different
+            control cycles is independent.
         control_period: duration of a control cycle, s.
         disturbance_walk: random walk of the unmodelled angular acceleration, rad/s^2 per sqrt(s).
         disturbance_start: initial standard deviation of the unmodelled angular acceleration, rad/s^2.
@@ -238,13 +238,13 @@ class FilterSettings:
             known.
         damping_start: initial standard deviation of the thread's damping, 1/s; zero if the damping is known.
         gain_start: initial standard deviation of the coils' gain; zero if the gain is known.
-        latency_start: initial standard deviation of the age that the inertial unit's samples have at their
-            time stamps, s; zero if the age is known.
+        latency_start: initial standard deviation of the age of the inertial unit's samples, s; zero if the
+            age is known.
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
         field_bias_start: initial standard deviation of the magnetometer bias, T; zero if there is no
             magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
-        rate_walk: random walk of the rate due to torque noise except that of the coils, rad/s per sqrt(s).
+        rate_walk: random walk of the rate due to torque noise other than coil noise, rad/s per sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
         gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
             probable than a one-dimensional deviation of this size.
@@ -432,8 +432,8 @@ class AttitudeFilter:
         """Treat the coil currents recorded since `since_ns` as unknown.
 
         The filter may have attributed the effect of wrong currents to a disturbance or a change of
-        parameters. The measurements since `since_ns` are therefore applied again, some of them at each call
-        of `catch_up`.
+        parameters. The measurements since `since_ns` are therefore applied again, a few at each call of
+        `catch_up`.
         """
         self.catch_up()
         self._commands.mark_unknown(since_ns)
@@ -506,7 +506,7 @@ class AttitudeFilter:
         return used
 
     def measure_late(self, late: Sequence[Measurement], applied: OnApplied) -> None:
-        """Insert late measurements at their measurement times, some of them at each call of `catch_up`.
+        """Insert late measurements at their measurement times, a few at each call of `catch_up`.
 
         The estimate continues without the late measurements until all are inserted. At the end of the replay,
         the callback `applied` receives, for each late measurement, whether the measurement passed the gate.
@@ -553,7 +553,7 @@ class AttitudeFilter:
 
     @property
     def latency(self) -> float:
-        """Estimated age (s) of the inertial unit's samples at their time stamps, within plausible limits."""
+        """Estimated age (s) of the inertial unit's samples, limited to plausible values."""
         found = self._history.newest.state.latency if self._history else self._prior.latency
         return min(max(found, 0.0), LONGEST_LATENCY)
 
@@ -586,7 +586,7 @@ class AttitudeFilter:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
-        """Replay measurements in time order from the newest checkpoint, and return whether `asked` passed."""
+        """Replay measurements in time order, and return whether the measurement `asked` passed."""
         replay = Replay(self._model, self._history.newest, measurements)
         replay.advance()
         self._history.replace_from(len(self._history), replay.checkpoints)
@@ -597,7 +597,7 @@ class AttitudeFilter:
         return mine.used
 
     def _count(self, kind: type[Measurement], used: bool) -> None:
-        """Count consecutive rejections, and restart after too many, except for mean rates, which are rare."""
+        """Count consecutive rejections, and restart after too many; mean rates cause no restart."""
         in_a_row = 0 if used else self._refused_in_a_row.get(kind, 0) + 1
         self._refused_in_a_row[kind] = in_a_row
         self.refused += not used

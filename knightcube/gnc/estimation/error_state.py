@@ -35,7 +35,7 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateBlock:
-    """A vector (n,) of the error state.
+    """A block of n elements of the error state.
 
     Attributes:
         name: name of the block, unique within the list.
@@ -92,8 +92,9 @@ class ErrorState:
 class Weighed(NamedTuple):
     """The optimal gain (n, k) for an innovation of k components and n states, with intermediate results.
 
-    The intermediate results are `square`, the normalised square y' S^-1 y of the innovation y, `cross`, the
-    covariance (n, k) of states and innovation, and `spread`, the covariance S (k, k) of the innovation.
+    The intermediate results are the normalised square `square` = y' S^-1 y of the innovation y, the
+    covariance `cross` (n, k) of states and innovation, and the covariance `spread` S (k, k) of the
+    innovation.
     """
 
     square: float
@@ -119,8 +120,8 @@ def direction_error(observed: FloatArray, expected: FloatArray, across: FloatArr
     """Return the deviation (2,), rad, of an observed direction (3,) from an expected direction (3,).
 
     The components are along the rows of `across` (2, 3), which are normal to the expected direction. Up to a
-    right angle, the length of the deviation is the sine of the angle between the directions. Beyond, it is
-    the angle, because the sine would make an opposite direction appear correct.
+    right angle, the length of the deviation is the sine of the angle between the directions. At larger
+    angles, the length is the angle itself, because the sine would make an opposite direction appear correct.
     """
     error = np.asarray(across @ observed)
     if float(expected @ observed) < 0.0:
@@ -237,8 +238,8 @@ class PriorCheck:
     """Test whether mutually consistent measurements contradict the estimated states.
 
     The states are contradicted if the normalised squared innovations in `CONTRADICTED` seconds have a mean
-    above 5; the expected mean is 3. Each squared innovation is clipped at a value that is exceeded once in a
-    thousand, so that a few outliers cause no contradiction.
+    above 5; the expected mean is 3. Each squared innovation is clipped at the value that one in a thousand
+    consistent innovations exceeds, so that a few outliers cause no contradiction.
     """
 
     def __init__(self) -> None:
@@ -291,8 +292,8 @@ def check_amounts(settings: Any, *positive: str) -> None:
 def gate_bounds(sigma: float) -> dict[int, float]:
     """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 
-    A larger normalised square is less probable than a deviation of a normal variable by `sigma` standard
-    deviations.
+    The probability that this value is exceeded equals that of a normal deviation of more than `sigma`
+    standard deviations.
     """
     chance = math.erfc(sigma / math.sqrt(2.0))
     return {components: chi_square.bound(chance, components) for components in (1, 2, 3)}

@@ -53,7 +53,8 @@ def _check_length(name: str, value: FloatArray) -> None:
 def check_measured(covariance: FloatArray, *units: str, **measured: FloatArray) -> None:
     """Raise ArgumentError unless the covariance is (3, 3), and the arrays `measured` are vectors (3,).
 
-    An array called `quaternion` must be (4,). The arrays named in `units` must have the length one.
+    An array called `quaternion` must be (4,). The arrays named in `units` must be unit vectors or unit
+    quaternions.
     """
     _check_shape("covariance", covariance, (3, 3))
     for name, value in measured.items():
@@ -233,7 +234,7 @@ class Estimate:
         parameters: estimated torsion and damping of the thread, and gain of the coils.
         covariance: covariance (19, 19) of the error state; the attitude error is a rotation in body axes.
         measured_ns: time of the newest accepted measurement, ns.
-        latency: age of the inertial unit's samples at the time of their time stamps, s.
+        latency: age of the inertial unit's samples (delay between measurement and time stamp), s.
         field_bias: magnetometer bias (3,) in body axes, T.
     """
 
@@ -254,7 +255,7 @@ class FilterState(NamedTuple):
 
     Attributes:
         kept: attitude at the start of each unfinished exposure, with the mean rate measured in that exposure.
-        latency: age of the inertial unit's samples at the time of their time stamps, s.
+        latency: age of the inertial unit's samples (delay between measurement and time stamp), s.
         field_bias: magnetometer bias in body axes, T.
     """
 
@@ -279,7 +280,7 @@ class SlowPrior:
     Attributes:
         bias: gyro bias (3,), rad/s, with the covariance `bias_covariance` (3, 3).
         parameters: parameters of the body's model, with the covariance `parameters_covariance` (3, 3).
-        latency: age of the inertial unit's samples at the time of their time stamps, s.
+        latency: age of the inertial unit's samples (delay between measurement and time stamp), s.
     """
 
     bias: FloatArray = field(default_factory=np.zeros(3).copy)

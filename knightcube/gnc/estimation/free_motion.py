@@ -58,10 +58,7 @@ class MotionStep(NamedTuple):
 def _rates_numpy(
     inertia: FloatArray, inverse: FloatArray, rate: FloatArray, torque: FloatArray, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the rate (3,) after a step of `dt` s, and three other elements of a `MotionStep`.
-
-    The other elements are the integral of the rate, and the rate and the acceleration in the middle.
-    """
+    """Return the rate (3,) after `dt` s, and `swept`, `middle` and `acceleration` of a `MotionStep`."""
 
     def accelerated(at: FloatArray) -> FloatArray:
         return np.asarray(inverse @ (torque - cross_product(at, inertia @ at)))
@@ -139,7 +136,7 @@ def _by_inertia(v: Vector) -> FloatArray:
 
 @loop_helper
 def _add(to: FloatArray, first: int, factor: float, one: FloatArray, other: FloatArray) -> None:
-    """Add the product of a factor and of matrices (3, 3) and (3, n) to columns of `to`, from `first` on."""
+    """Add `factor` * `one` (3, 3) @ `other` (3, n) to the n columns of `to` that begin with `first`."""
     for i in range(3):
         for j in range(other.shape[1]):
             for k in range(3):
@@ -194,7 +191,7 @@ def _exposed(areas: FloatArray, pressure: Vector) -> Vector:
 def _by_unknowns(
     body: Bodies, dipole: Vector, field: Vector, up: Vector, strength: float, air: Vector, light: Vector
 ) -> FloatArray:
-    """Return the derivatives (3, 39) of the torque by the unknowns that do not depend on the rate."""
+    """Return the derivatives (3, 39) of the torque without the terms that depend on the rate."""
     inertia, _, _, trace = body
     found, gradient, eye = np.zeros((3, 39)), np.zeros((3, 3)), np.eye(3)
     upright, across = _skew(up), _skew(field)

@@ -7,18 +7,19 @@ by Euler's equation, because the plant model predicts the rate more accurately t
 attitudes that later measurements need are appended to the state (stochastic cloning, Roumeliotis and Burdick
 2002).
 
-The filter estimates the age that the inertial unit's samples have at their time stamps, because of the delays
-of the serial line, the driver's buffer and the filters inside the inertial unit. Between sample and time
-stamp, the attitude changes by rate times age, and the rate changes by acceleration times age. Only attitude
-samples correct the estimated age. The acceleration is mostly caused by the coils, which respond to the noise
-of earlier samples. An estimate of the age from rate samples would be a closed-loop identification and would
-drift with the noise while the attitude is held. A rate sample therefore treats the age as a considered
-parameter (Schmidt 1966): its variance and correlations enter the gains of all other states.
+The filter estimates the age of the inertial unit's samples. The age is the delay between measurement and time
+stamp, which the serial line, the driver's buffer and the filters inside the inertial unit cause. Between
+sample and time stamp, the attitude changes by rate times age, and the rate changes by acceleration times age.
+Only attitude samples correct the estimated age. The acceleration is mostly caused by the coils, which respond
+to the noise of earlier samples. An estimate of the age from rate samples would be a closed-loop
+identification and would drift with the noise while the attitude is held. A rate sample therefore treats the
+age as a considered parameter (Schmidt 1966): its variance and correlations enter the gains of all other
+states.
 
 The class `Replay` applies measurements in order of time. After a late measurement is inserted, all later
-measurements are applied again. The application of the measurements of one second takes longer than a control
-cycle. The replay can therefore be distributed over several cycles, during which the filter continues without
-the late measurement.
+measurements are applied again. Applying the measurements of one second takes longer than a control cycle. The
+replay can therefore be distributed over several cycles, during which the filter continues without the late
+measurement.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ from knightcube.gnc.estimation.rigid_body import (
 )
 
 LONGEST_LATENCY = 0.25
-"""Largest plausible age (s) of an inertial unit's sample at its time stamp."""
+"""Largest plausible age (s) of the inertial unit's samples."""
 
 _EYE: FloatArray = np.eye(3)
 
@@ -110,7 +111,7 @@ def innovation(
     argument `change` is needed for rate samples whose age is estimated.
     """
     size, noise = SIZE + 3 * len(state.kept), measurement.covariance
-    # Directions and fields need no projection, as a suspended body has no attitude variance about x and z.
+    # A suspended body has no attitude variance about x and z, so directions and fields need no projection.
     if isinstance(measurement, DirectionMeasurement):
         return _direction(state, measurement, size)
     if isinstance(measurement, FieldMeasurement):
@@ -242,8 +243,9 @@ def correct_about_thread(
 ) -> tuple[Correction, float]:
     """Return the correction of a suspended body by a measured attitude or rate, and the innovation.
 
-    The result equals that of `correct` for the result of `innovation`, but is computed faster. The argument
-    `change` is needed for rate samples whose age is estimated, and such samples do not correct the age.
+    This function is faster than `correct` applied to the result of `innovation`, and returns the same result.
+    The argument `change` is needed for rate samples whose age is estimated, and such samples do not correct
+    the age.
     """
     variance, latency, speed = measurement.covariance.item(4), measurement.latency, 0.0
     if isinstance(measurement, RateMeasurement):
@@ -267,7 +269,7 @@ _Corrected = tuple[bool, float, FloatArray, FloatArray, FloatArray]
 
 
 def _correction(state: FilterState, found: _Corrected) -> Correction:
-    """Return the result of `correct` for a state and the result of `_corrected`."""
+    """Return the `Correction` of a state from the result of `_corrected`."""
     used, square, error, covariance, spread = found
     if used:
         state = _moved(state, error.tolist())
@@ -501,7 +503,7 @@ _EVER_NS = -(1 << 63)
 class CommandHistory:
     """The recent coil commands in order of time.
 
-    Before the first command, no coil is driven, with the dipole moment and magnetic field `idle`.
+    Before the first command, no coil is driven, and `idle` contains the dipole moment and the magnetic field.
     """
 
     def __init__(self, body: RigidBody, history_ns: int) -> None:
@@ -652,7 +654,7 @@ class PropagationModel:
     def correct(
         self, state: FilterState, covariance: FloatArray, measurement: Measurement
     ) -> tuple[Correction, tuple[float, ...]]:
-        """Return the correction by a measurement at the time of the state, and the innovation."""
+        """Return the correction by a measurement taken at the time of the state, and the innovation."""
         change, rate_gate = None, math.inf
         if isinstance(measurement, RateMeasurement):
             if measurement.latency is not None:
@@ -669,7 +671,7 @@ class PropagationModel:
         return correct(state, covariance, found, gate, rate_gate, considers_age=is_aged), found.value
 
     def apply(self, then: Checkpoint, measurement: Measurement) -> Checkpoint:
-        """Return the checkpoint after `then` that includes a later measurement; mean rates are excluded."""
+        """Return the checkpoint after `then` that includes a later measurement other than a mean rate."""
         state, covariance = self.propagate(then.state, then.covariance, then.time_ns, measurement.time_ns)
         done, value = self.correct(state, covariance, measurement)
         return Checkpoint(
@@ -733,8 +735,8 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Time (ns) by which the oldest checkpoint may be older than the history. Beyond this time, all checkpoints
-older than the history are dropped."""
+"""Largest excess (ns) of the age of the oldest checkpoint over `history_ns`. If the excess is larger, all
+checkpoints older than `history_ns` are dropped."""
 _TIME = attrgetter("time_ns")
 
 
@@ -804,7 +806,7 @@ class CheckpointHistory:
         self._checkpoints[index:] = checkpoints
 
     def index_of(self, checkpoint: Checkpoint) -> int:
-        """Return the index of a checkpoint of the history."""
+        """Return the index of `checkpoint` in the history."""
         return next(k for k in range(len(self) - 1, -1, -1) if self._checkpoints[k] is checkpoint)
 
     def restart(self, first: Checkpoint | None) -> None:

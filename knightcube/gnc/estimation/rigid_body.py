@@ -264,8 +264,8 @@ def _linearised(
 LONGEST_STEP = 0.025
 """Longest propagation step (s), equal to the control period of the testbed."""
 _LARGEST_ROTATION = 0.01
-"""Largest rotation (rad) of the body in one propagation step. The error of the midpoint rule, per radian of
-rotation, is about a 24th of the squared rotation of a step."""
+"""Largest rotation (rad) of the body in one propagation step. The relative error of the midpoint rule is
+about a 24th of the squared rotation (rad^2) of a step."""
 _FASTEST = 10.0
 """Rate (rad/s) above which the propagation steps are not shortened further."""
 _UNKNOWN_FOR = 0.3
@@ -475,10 +475,10 @@ def rate_change(
 ) -> RateChange:
     """Return the angular acceleration at a gyro sample whose age is uncertain.
 
-    The arguments `before` and `after` are the coil states at two times, which precede and follow the sample
-    by half the standard deviation of its age. The two accelerations differ if a coil command begins or ends
-    between their times. Half the difference of the two accelerations, and the product of the errors of age
-    and acceleration, are treated as noise.
+    The arguments `before` and `after` are the coil states half a standard deviation of the age before and
+    after the sample. The two accelerations differ if a coil command begins or ends between their times. Half
+    the difference of the two accelerations, and the product of the errors of age and acceleration, are
+    treated as noise.
     """
     coils = before.dipole, before.field, after.dipole, after.field
     motion = state.quaternion, state.rate, state.disturbance, state.parameters[:]
@@ -693,8 +693,8 @@ _INDICES = np.arange(3)
 def whitenings(counts: tuple[int, ...], independent: float, variance: float, walk: float) -> FloatArray:
     """Return matrices (w, m, m), each of which whitens the newest differences of bins, as `_whitening` does.
 
-    The number of differences is m for the first matrix, and `counts` contains the numbers for all matrices.
-    The elements for earlier differences are zero. The other arguments are those of `_whitening`.
+    `counts` contains the number of differences for each matrix, and m is the first of these numbers. The
+    elements for earlier differences are zero. The other arguments are those of `_whitening`.
     """
     matrices = np.zeros((len(counts), counts[0], counts[0]))
     for place, count in enumerate(counts):
@@ -732,8 +732,8 @@ def _fitted_gains_numpy(
     is the weighted sum of the squared residuals of its fit.
 
     Args:
-        normal: normal equations (w, p + n + 1, p + n + 1): products of the whitened coefficients of the other
-            parameters, of the gains and of the right-hand side with each other.
+        normal: matrices A^T A (w, p + n + 1, p + n + 1), where the columns of A are the whitened coefficients
+            of the other parameters, those of the gains, and the whitened right-hand side.
         prior: prior weights (p,) of the other parameters, whose expected values are zero.
         weights: prior weights (k, n) of the gains.
         expected: expected gains (k, n), 1 or -1.
