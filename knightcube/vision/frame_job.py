@@ -81,8 +81,8 @@ _POINT_PX = 1.0
 _SHORT_PX = 4.0
 # Uncertainty (px) of the predicted motion above which the models of star images do not include the motion.
 _KNOWN_PX = 0.3
-# Scatter (px, per axis) of identified points about their predicted positions above which the stars may be
-# defocused. Without defocus, the scatter is below 0.2 px (campaign `resting`).
+# Scatter (px, per axis) of identified points about their predictions above which defocus is possible.
+# Without defocus, the scatter is below 0.2 px (campaign `resting`).
 _SCATTERED_PX = 0.25
 # Standard deviation (px) of the boresight above which each star may have been detected as several points.
 _UNCERTAIN_PX = 0.5

@@ -118,8 +118,8 @@ class StarMatch:
 # Rotation step (rad) below which the iteration ends. After a step d, the error is about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition number of the normal equations. If all stars lie within 1e-6 rad of one
-# direction, the reciprocal condition number has this value.
+# Minimum reciprocal condition number of the normal equations.
+# Stars within 1e-6 rad of one direction have about this reciprocal condition number.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -755,7 +755,7 @@ def _fit_distorted(
                         normal[i, j] += squared * slope[axis, i] * slope[axis, j]
         normal[4, 4] += PRIOR**-2
         gradient[4] += distortion / PRIOR**2
-        inverse = np.linalg.inv(normal)  # `np.linalg.solve` takes twice the time to compile
+        inverse = np.linalg.inv(normal)  # `np.linalg.solve` would take twice as long to compile
         for i in range(5):
             step[i] = 0.0
             for j in range(5):

@@ -100,8 +100,8 @@ def refit_motion(
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
     """Return `motion` fitted again with all catalogue stars, or None if the fit fails or changes the rate."""
-    # With a rolling shutter, an ambiguous streak permits two rates. The result contains the mean of both
-    # rates, which is not a valid initial value.
+    # With a rolling shutter, an ambiguous streak permits two rates.
+    # The result contains the mean of both rates, which is not a valid initial value.
     between = likelihood.delay_per_row != 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None

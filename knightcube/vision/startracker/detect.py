@@ -213,7 +213,7 @@ def _worth_measuring(
         if seen[side] == _MOST_COMPARED:
             continue
         seen[side] += 1
-        # If enough peaks of this kind are selected, the peak serves only for comparison with the other kind.
+        # If enough peaks in (or outside) the open sky are selected, the peak there only hides other peaks.
         if kept[side] < most and not _is_hidden(place, height, core, compared[:count], peak):
             row, column = place[peak, 1] * _CELLS // rows, place[peak, 0] * _CELLS // columns
             cell = row * _CELLS + column
@@ -410,7 +410,7 @@ def _among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
 
 
 def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:
-    """Return which sources (n,) are significant and have a known position near their peak, in the frame."""
+    """Return which sources (n,) are significant, in the frame, and have a known position near their peak."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
     # The position is unknown if, for instance, all pixels of the source are saturated.
@@ -446,7 +446,7 @@ def assemble(
 
 
 def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
-    """Return quality flags STREAK and CLUTTER (p,) of peaks, which are derived from the bright areas."""
+    """Return the quality flags STREAK and CLUTTER (p,) of peaks, derived from the bright areas."""
     noise = sky.smooth_noise
     restless = noise.at(*peaks.place.T) > _RESTLESS * median(noise.values)
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)

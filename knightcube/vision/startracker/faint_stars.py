@@ -36,41 +36,43 @@ from knightcube.vision.startracker.verification import expected_stars, log10_cho
 
 # Mean number, per field of view, of the brightest guide stars, from which the pairs are formed.
 _PER_FIELD = 20.0
-# Largest expected number of pairs of guide stars. A field of 4 x 3 deg has about this number of pairs. A
-# narrow strip of the sky would have several times as many pairs, and their search would take a minute.
+# Largest expected number of pairs of guide stars. A field of 4 x 3 deg has about this number of pairs.
+# A narrow strip of the sky would have several times as many pairs, and their search would take a minute.
 _MOST_PAIRS = 4e6
-# Number of the brightest points, from which pairs are formed, and minimum distance between the points of a
-# pair, as a fraction of the frame's diagonal.
+# Number of the brightest points, from which pairs are formed.
+# Minimum distance between the points of a pair, as a fraction of the frame's diagonal.
 _BRIGHTEST, _LEAST_APART = 5, 0.1
 # Largest difference (mag) between the magnitude difference of two points and that of two guide stars.
 _MOST_UNLIKE = 1.5
 # Tolerance (px) of the distance of two points, because of their errors and of a distortion of the lens.
 _APART_TOLERANCE = 1.0
-# Largest ratio of the highest to the lowest image scale for which a search is made. Largest number of
-# candidates of a frame; the search ends before this number would be exceeded.
+# Largest ratio of the highest to the lowest image scale for which a search is made.
+# Largest number of candidates of a frame; the search ends before this number would be exceeded.
 _WIDEST_SCALE, _MOST_CANDIDATES = 1.15, 600_000
 # Number of candidates in one batch, and number of further iterations that determine their image scales.
 _TOGETHER, _SCALE_STEPS = 20_000, 3
-# Number of the brightest neighbours of a guide star that are predicted for every candidate, and number of
-# stars that are predicted for the `_FINALISTS` candidates with the highest likelihood ratios.
+# Number of the brightest neighbours of a guide star that are predicted for every candidate.
+# Number of stars that are predicted for the `_FINALISTS` candidates with the highest likelihood ratios.
 _NEIGHBOURS, _PREDICTED_STARS, _FINALISTS = 48, 60, 40
-# Standard deviation (px) of the Gaussian that smooths the frame, and factor on the pixel values before the
-# smoothing, so that the variance of rounding, which the background's noise includes, is negligible.
+# Standard deviation (px) of the Gaussian that smooths the frame.
+# Factor on the pixel values before smoothing, which makes the assumed rounding noise negligible.
 _SMOOTHING, _FINER = 1.0, 100.0
-# Lowest and highest signal of a pixel, in standard deviations of the noise; values beyond them are set to the
-# limit. Number of bins between the two.
+# Lowest and highest signal of a pixel, in standard deviations of the noise.
+# Signals outside this range are set to its nearer limit.
+# Number of bins in this range.
 _LEAST_LIGHT, _MOST_LIGHT, _LEVELS = -3.0, 13.0, 240
 # Logarithms of the tabulated signal-to-noise ratios; stars below the lowest of them are omitted.
 _LN_PREDICTED = np.linspace(math.log(0.5), math.log(20.0), 38)
 _LN_STEP = float(_LN_PREDICTED[1] - _LN_PREDICTED[0])
-# Attenuations, in steps of `_LN_STEP`, by which all stars may be dimmer than predicted from the two points,
-# for instance because the camera does not respond linearly. All attenuations are equally likely.
+# Trial attenuations, in steps of `_LN_STEP`, of all stars relative to the prediction from the two points.
+# Stars are attenuated, for instance, if the camera does not respond linearly.
+# All attenuations are equally likely.
 _DIMMER = np.array([0, 4, 8, 12])
-# Relative error of the predicted brightness of a star, because of its colour, and fraction of the stars that
-# are not visible.
+# Relative error of the predicted brightness of a star, because of its colour.
+# Fraction of the stars that are not visible.
 _BRIGHTNESS_ERROR, _UNSEEN = 0.35, 0.1
-# Distance (px) from the frame's edge and from the points of the pair within which a star is omitted, and
-# distance within which the same pixels may be counted for two predicted stars.
+# Distances (px) from the frame's edge, and from the points of the pair, within which a star is omitted.
+# Distance (px) within which the same pixels are possibly counted for two predicted stars.
 _EDGE, _BESIDE, _OVERLAPPING = 4, 10, 5.0
 # Standard deviation (px) of a predicted position, and side (px) of the square whose highest light is used.
 _PLACE_SIGMA, _SQUARE = 0.5, 3
@@ -86,8 +88,9 @@ class FrameLight:
         level: index of the bin of the highest signal in the 3 x 3 pixels around each pixel (rows, columns),
             uint8. Pixels near the frame's edge, and pixels of the ideal image that the frame does not cover,
             have the value `_LEVELS` and are not used.
-        log_ratio: logarithm of the likelihood ratio of a star to no star (r, `_LEVELS` + 1), for a star whose
-            predicted signal-to-noise ratio has the logarithm in `_LN_PREDICTED` (r,), and for each bin.
+        log_ratio: logarithm of the likelihood ratio of a star to no star (r, `_LEVELS` + 1). Row k is for a
+            star whose predicted signal-to-noise ratio has the logarithm `_LN_PREDICTED[k]`, and each column
+            is for a bin.
     """
 
     camera: Pinhole
@@ -110,8 +113,7 @@ class FrameLight:
         level = np.full(pixels.shape, _LEVELS, dtype=np.uint8)
         inner = slice(_EDGE, -_EDGE), slice(_EDGE, -_EDGE)
         level[inner] = np.clip((highest[inner] - _LEAST_LIGHT) * step, 0, _LEVELS - 1)
-        # One is added to the count of each bin. Otherwise a signal that occurs nowhere else in the frame
-        # would have an unlimited likelihood ratio.
+        # One is added to the count of each bin, so that the likelihood ratio of a unique signal is finite.
         count = np.bincount(level[inner].ravel(), minlength=_LEVELS) + 1.0
         ideal = camera.ideal
         if not isinstance(camera, Pinhole):
@@ -270,7 +272,7 @@ class _Search:
                 yield pair, stars
 
     def best(self, pair: IntArray, stars: IntArray) -> LightMatch | None:
-        """Return the most significant of the candidates for a pair of points and the guide stars (c, 2)."""
+        """Return the most significant candidate for a pair of points, among c pairs of guide stars (c, 2)."""
         guide, magnitude = self.sky.stars.direction, self.sky.stars.magnitude
         column, row = np.rint(self.points[pair]).astype(np.int64).T
         bright = float(2.5 * np.log10(np.maximum(self.light.signal[row, column], 1.0)).mean())
@@ -288,7 +290,7 @@ class _Search:
         promising = np.flatnonzero(ratio > 0.0)
         if not len(promising):
             return None
-        # The accepted chance matches are divided among the numbers of brighter stars, 0, 1, 2, ...
+        # Each number of brighter stars, 0, 1, 2, ..., has a fixed share of the accepted chance matches.
         ranks, count = brighter[promising], np.bincount(brighter)
         chance = np.log10(count[ranks]) + np.array([log10_choice(rank) for rank in ranks.tolist()])
         first = np.argsort(chance - ratio[promising] / math.log(10.0), kind="stable")[:_FINALISTS]
@@ -316,7 +318,7 @@ class _Search:
         # A star is not used if the same pixels may be counted for a brighter star.
         close = np.linalg.norm(place[:, None] - place, axis=-1) < _OVERLAPPING
         ratio[np.any(close & np.tri(len(stars), k=-1, dtype=bool), axis=1)] = 0.0
-        # A detected point has a more accurate position than the square whose highest light is used.
+        # For a detected point, the likelihood ratio also depends on its distance from the prediction.
         off = self.points - place[:, None]
         off = off[np.arange(len(stars)), np.argmin(np.linalg.norm(off, axis=-1), axis=1)]
         detected = np.all(np.abs(off) < 0.5 * _SQUARE, axis=1) & ratio.any(axis=1)
@@ -340,11 +342,12 @@ def _evidence_numpy(
 ) -> tuple[FloatArray, IntArray]:
     """Return the logarithms of the likelihood ratios (c,) of candidates, and numbers of brighter stars (c,).
 
-    A candidate is a pair of the guide stars with the directions `guide` (n, 3) and indices `stars` (c, 2),
-    for the two points with the directions `seen` (2, 3). The image scale is between `lowest` and `highest`.
-    Only the `neighbours` (n, k) of the first guide star are predicted. On average, the two points are
-    brighter by `bright` mag than a point with a signal-to-noise ratio of one. The brighter stars are the
-    predicted stars in the frame that are brighter than the fainter of the two guide stars.
+    A candidate assigns two guide stars to the two points with the directions `seen` (2, 3). All guide stars
+    have the directions `guide` (n, 3), and those of the candidates have the indices `stars` (c, 2). The image
+    scale is between `lowest` and `highest`. Only the `neighbours` (n, k) of the first guide star are
+    predicted. On average, the two points are brighter by `bright` mag than a point with a signal-to-noise
+    ratio of one. The brighter stars are the predicted stars in the frame that are brighter than the fainter
+    of the two guide stars.
     """
     ratios, brighter = np.zeros(len(stars)), np.zeros(len(stars), dtype=np.int64)
     for begin in range(0, len(stars), _TOGETHER):
@@ -449,7 +452,7 @@ def _level_at(star: FloatArray, matrix: FloatArray, focal_length: float, level: 
 
 @loop_helper
 def _stretch_pair(seen: FloatArray, scale: float, pair: FloatArray) -> float:
-    """Write two unit vectors with x/z and y/z multiplied by `scale` to two columns; return their chord."""
+    """Write two unit vectors, with x/z and y/z multiplied by `scale`, to `pair`, and return their chord."""
     for k in range(2):
         x, y, z = seen[k, 0] * scale, seen[k, 1] * scale, seen[k, 2]
         norm = math.sqrt(x * x + y * y + z * z)
@@ -504,7 +507,7 @@ def _places(
 
 
 def _pixels(place: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return columns and rows (...) of positions (..., 2), px; those of the first pixel for NaN."""
+    """Return the columns and rows (...) of positions (..., 2), px; NaN gives column 0 and row 0."""
     column, row = np.moveaxis(np.rint(np.where(np.isnan(place), 0.0, place)).astype(np.int64), -1, 0)
     return column, row
 

@@ -61,8 +61,8 @@ class Unknowns:
 
     Attributes:
         scale: whether the scale of the image, and thus the focal length, is fitted.
-        bend: reciprocal prior variances (6,) of tilt, decentring and distortion of the lens (`sky_map`), or
-            (8,) if the pixels may not be square; empty (0,) if the lens is exact.
+        bend: reciprocal prior variances of the fitted lens errors (`sky_map`): (6,) for tilt, decentring and
+            distortion, (8,) if the pixels are possibly not square, or (0,) if the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
         scatter: whether a variance common to all stars is added to the variances of the positions as soon as
@@ -765,8 +765,8 @@ def attitude_by(
         points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
-    # At an angle a from the boresight, the angle that a pixel subtends is proportional to cos^2 a in the
-    # radial direction, and to cos a in the tangential direction.
+    # At an angle a from the boresight, a pixel subtends a radial angle that is proportional to cos^2 a.
+    # The tangential angle is proportional to cos a.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
     fix = solver(seen, reference[fit.agree], sigma)
     # The loss function of a solver is half of the sum of the stars' chi-squares.

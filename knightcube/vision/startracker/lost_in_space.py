@@ -320,7 +320,7 @@ def _add_runs(
 def _matching_entries(
     runs: npt.NDArray[np.int32], windows: npt.NDArray[np.uint32], entries: npt.NDArray[np.uint32], most: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], int]:
-    """Return the entries (k,) within the windows of ranges, their triangles, and the number of entries read.
+    """Return the entries (k,) within the `windows`, their triangles, and the number of entries read.
 
     Only the first ranges are read, with at most `most` entries in total.
     """
@@ -474,9 +474,9 @@ def _runs(
     """Return the ranges of index entries that may contain triangles similar to observed triangles.
 
     The longest sides of the observed triangles have the limits `sizes` (t, 2), and their two side ratios have
-    the limits `places` (t, 2, 2), in positions within all cells. For each range, the result contains the
-    index of the observed triangle, the cells (2,) of the two ratios, the first entry, and the entry after the
-    last.
+    the limits `places` (t, 2, 2), in steps of which a cell has `FINE`. For each range, the result contains
+    the index of the observed triangle, the cells (2,) of the two ratios, the first entry, and the entry after
+    the last.
     """
     low, high = places[:, :, 0] // FINE, places[:, :, 1] // FINE
     spans = high - low
@@ -679,7 +679,7 @@ def _choose(
 
 @loop_helper
 def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16]) -> int:
-    """Return how many of the three pairs of a match, (3,) and (3,), are among the pairs (k, 2)."""
+    """Return how many of the three pairs of `observed` (3,) and `star` (3,) are among the `pairs` (k, 2)."""
     shared = 0
     for c in range(3):
         for k in range(len(pairs)):

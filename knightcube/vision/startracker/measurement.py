@@ -108,8 +108,8 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     """Return the width of the PSF and the noise model of a frame, from the stars selected by `plain` (n,).
 
     A gain in the settings is used unchanged. The width in the settings is used unless at least eight stars
-    determine the width. If no star is usable, a missing width is set to 1 px, and the photon noise for a
-    missing gain to 0.
+    determine the width. If no star is usable, the width is 1 px unless given, and the photon noise is 0
+    unless the gain is given.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -293,8 +293,8 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # The variable `gain` is minus the derivative of the moment with respect to the weight's position. For
-        # a star with the same width as the weight, `gain` is half of the weighted sum of counts.
+        # The variable `gain` is minus the derivative of the moment with respect to the weight's position.
+        # For a star with the same width as the weight, `gain` is half of the weighted sum of counts.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))

@@ -168,8 +168,9 @@ def middle_covariance(
 ) -> FloatArray:
     """Return the covariance (3, 3), rad^2, of the measured attitude relative to the attitude at mid-exposure.
 
-    The rotation vectors `turns` (4, 3), rad, lead from mid-exposure to the times `NODES`. The density of the
-    unmodelled white angular acceleration is (3, 3), rad^2/s^3.
+    The rotation vectors `turns` (4, 3), rad, lead from mid-exposure to the times `NODES`. The argument
+    `angular_acceleration_psd` (3, 3), rad^2/s^3, is the power spectral density of the unmodelled angular
+    acceleration, which is assumed to be white noise.
     """
     known = np.asarray(weighting.weights) @ turns
     return np.outer(known, known) + angular_acceleration_psd * weighting.noise_share * exposure**3
@@ -206,7 +207,7 @@ _CONTRADICTED = 1.5
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
 # The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
 _UNCALIBRATED_SIGMA_PX = 0.3
-# Attitude error (px) from an uncalibrated lens and from refraction that remains after the fit of the lens.
+# Attitude error (px) due to an uncalibrated lens and refraction, after the fit of the lens.
 # For the rotation about the boresight, an attitude error in px is measured at the image edge.
 # The error is the difference between the attitudes that different solvers find for the same photograph.
 _UNCALIBRATED_LENS_PX = 0.25
@@ -223,15 +224,15 @@ _SPLIT_PX = 10.0
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference of two attitudes that agree (1 false rejection in 100,000 frames).
 _NEAR = 25.9
-# Minimum height (standard deviations) of a star near its predicted position, and minimum number of such
-# stars, for a frame in which few stars are detected without a prediction.
+# Minimum height (standard deviations) of a star near its predicted position, and minimum number of stars.
+# These limits are for a frame in which few stars are detected without a prediction.
 _FAINT_SIGMAS, _FEWEST_FAINT = 3.5, 3
 # Number of guide stars that the tracking mode searches near their predicted positions.
 _LOOKED_FOR = 30
 # Minimum and maximum search radius (px) around a predicted position.
 # If a larger search radius is needed, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
-# Maximum number of fits with larger variances of the stars that unresolved catalogue stars displace.
+# Maximum number of fits, each with larger variances for stars displaced by unresolved catalogue stars.
 _COMPANION_ROUNDS = 3
 # Distance (PSF widths) up to which an unresolved star can displace another one.
 _COMPANION_REACH = 8.0
@@ -490,11 +491,11 @@ def _beside_companions(
 def _shift_by_companions(
     solution: FrameSolution, psf_sigma: float, sky: SkyIndex, velocity: FloatArray | None
 ) -> FloatArray:
-    """Return by how many px (n,) catalogue stars that were not measured displace the measured stars.
+    """Return the displacements (n,), px, of the measured stars by catalogue stars that were not measured.
 
-    A fit of a Gaussian with the width s to noise of equal variance in all pixels is displaced by the fraction
-    exp(-d^2 / 4 s^2) of the distance d, times the ratio of the fluxes. For noise that grows with the
-    brightness, the displacement is about twice as large; this displacement is returned.
+    If all pixels have equal noise, a companion at the distance d displaces the fit of a Gaussian of width s
+    by d exp(-d^2 / 4 s^2), times the ratio of the fluxes. For noise that grows with the brightness, the
+    displacement is about twice as large; this displacement is returned.
     """
     shift = np.zeros(len(solution.points))
     if solution.fix is None or not math.isfinite(psf_sigma):
@@ -506,7 +507,7 @@ def _shift_by_companions(
     companion = np.setdiff1d(expected_stars(sky, matrix, half_width, len(sky.stars)), star)
     nearest = np.max(direction[companion] @ direction[star].T, axis=1, initial=-1.0)
     companion = companion[nearest > math.cos(_COMPANION_REACH * width / camera.focal_length)]
-    # A point near a companion that does not match a star is the companion, which was fitted with the star.
+    # A companion at an unmatched point was measured together with the star, and does not displace it.
     seen = _mirrored(solution) if solution.mirrored else solution
     rest = camera.unit_vectors(np.delete(seen.points, solution.matched, axis=0)) @ matrix
     rest = rest[np.isfinite(rest).all(axis=1)]
@@ -602,8 +603,8 @@ def star_field(
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * (seen.covariance[:, 0, 0] + seen.covariance[:, 1, 1]) + least**2)
-    # At an angle a from the boresight, the angle that a pixel subtends is proportional to cos^2 a in the
-    # radial direction, and to cos a in the tangential direction.
+    # At an angle a from the boresight, a pixel subtends a radial angle that is proportional to cos^2 a.
+    # The tangential angle is proportional to cos a.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     magnitude = None if flux is None else -2.5 * np.log10(flux)
@@ -674,9 +675,10 @@ def _contradiction(seen: FrameSolution, chosen: IntArray, fit: ImageFit) -> str:
 
     If the positions are wrong, for example because a defocused lens images stars as rings, only points that
     are within the gate by chance match. If fewer than half of the points match, the matching points may be
-    only those that lie near stars by chance. The residuals of matches by chance do not show the error. Only
-    points down to the median brightness of the matching points are counted, because faint points may be noise
-    or stars that are not in the catalogue. The array `chosen` contains the indices of the fitted points.
+    only those that lie near stars by chance. The residuals of such chance matches do not show that the
+    positions are wrong. Only points down to the median brightness of the matching points are counted, because
+    faint points may be noise or stars that are not in the catalogue. The array `chosen` contains the indices
+    of the fitted points.
     """
     agreeing = chosen[fit.agree]
     if seen.kind is not FrameKind.POINTS or fit.excess < _CONTRADICTED or not len(agreeing):

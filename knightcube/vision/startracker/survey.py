@@ -567,8 +567,8 @@ def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturati
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with many bright pixels.
 
-    A block has many bright pixels if their fraction exceeds `share`. A second grid of blocks, displaced by
-    half a block along rows and columns, is also tested.
+    A block has many bright pixels if their fraction exceeds `share`. Grids of blocks that are displaced by
+    half a block along rows, along columns, or along both are also tested.
     """
     return _cluttered(areas.row, areas.column, np.ascontiguousarray(place), *areas.shape, share)
 
@@ -602,7 +602,7 @@ def _cluttered(
         filled[bright_row[k] // half, bright_column[k] // half] += 1
     for k in range(len(place)):
         down, across = place[k, 1] // half, place[k, 0] // half
-        # The block of each grid consists of four half-sized blocks, of which one contains the pixel.
+        # In each of the four grids, the block that contains the pixel consists of four half-sized blocks.
         for top in (down - down % 2, down - (down + 1) % 2):
             for left in (across - across % 2, across - (across + 1) % 2):
                 bright = 0
@@ -657,7 +657,7 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Maximum median sine of the angle between streaks and image flow, which lines of a foreground exceed.
+# Median sine of the angle between streaks and image flow, above which they are lines of a foreground.
 _CROOKED = 0.12
 
 

@@ -63,8 +63,8 @@ def track(
         )
         if found is not None:
             matrix, scale = found.matrix, found.scale
-    # The searched fraction of attitudes is the volume of rotations near the prior, divided by 8 pi^2. A prior
-    # that is more accurate than the direction of a star does not make this fraction smaller.
+    # The searched fraction of attitudes is the volume of rotations near the prior, divided by 8 pi^2.
+    # A prior that is more accurate than the direction of a star does not make this fraction smaller.
     reach = PRIOR_SIGMAS * max(sigma, float(field.sigma.min()))
     searched = min(reach**3 / (6.0 * math.pi), 1.0)
     return verify(field, sky, matrix, scale, searched, settings)

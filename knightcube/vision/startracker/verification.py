@@ -35,8 +35,8 @@ from knightcube.vision.startracker.attitude_fit import (
 from knightcube.vision.startracker.index import SkyIndex
 
 _MOST_ORDERED = 12
-# Share of the accepted chance matches that is used for comparisons with all observed stars. The rest is for
-# comparisons with the brightest observed stars alone.
+# Share of the accepted chance matches that is used for comparisons with all observed stars.
+# The rest is used for comparisons with the brightest observed stars alone.
 _ALL_OBSERVED = 0.9
 
 
@@ -68,11 +68,11 @@ class Chance:
         The observed stars with the indices `observed` match the expected stars `ranks` within `gate` standard
         deviations, both in order of brightness. Only expected stars down to a brightness limit are compared,
         and the limit with the most significant match is selected. The bound is therefore multiplied by j^2
-        pi^2/6, where j - 1 is the number of expected stars down to the limit without a match. Either all
-        observed stars are compared, or only those down to the faintest match. In the second case, the bound
-        is also multiplied by the factor for this limit, in which j - 1 is the number of compared observed
-        stars without a match. The choice between the two divides the bound by `_ALL_OBSERVED` or by 1 -
-        `_ALL_OBSERVED`.
+        pi^2/6, where j - 1 is the number of expected stars that are brighter than the limit and have no
+        match. Either all observed stars are compared, or only those down to the faintest match. In the second
+        case, the bound is also multiplied by the factor for this limit, in which j - 1 is the number of
+        compared observed stars without a match. The bound is divided by `_ALL_OBSERVED` in the first case,
+        and by 1 - `_ALL_OBSERVED` in the second case.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -111,7 +111,7 @@ class Chance:
         lost = observed - matched
         ways = math.lgamma(observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
         rest = (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
-        # The probabilities of more matches decrease faster than a geometric series (Feller, section VI.3).
+        # The probabilities of 1, 2, ... more matches decrease faster than a geometric series (Feller, VI.3).
         ratio = lost / (matched + 1.0) * chance / (1.0 - chance)
         return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
 
@@ -183,9 +183,8 @@ class _Matching:
 # Fraction of bright expected stars with a match below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
 # Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
-# The second value is the radius of the search for nearby stars, as a fraction of the distance from the image
-# centre to a corner.
 # A larger fraction indicates a wrong fit of the lens: a foreground hides stars but does not displace them.
+# Radius of the search for nearby stars, as a fraction of the distance from image centre to corner.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
 # Excess of log10 chance matches over the limit above which a candidate is rejected without refinement.
 _HOPELESS = 7.0
@@ -276,7 +275,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 
 
 def _bright_matched(expected: npt.NDArray[np.integer[Any]], star: npt.NDArray[np.integer[Any]]) -> list[bool]:
-    """Return whether each expected star, in order of brightness down to the median match, has a match."""
+    """Return which expected stars have matches, from the brightest star to the match of median brightness."""
     known = set(star.tolist())
     matched = [number in known for number in expected.tolist()]
     places = [place for place, found in enumerate(matched) if found]
@@ -668,7 +667,7 @@ def _first_inside(
 def _in_field(
     matrix: FloatArray, across: float, down: float, cosine: float, x: float, y: float, z: float
 ) -> bool:
-    """Return whether the direction (x, y, z) is in the field; `cosine` is that of the image corners."""
+    """Return whether the direction (x, y, z) is in the field; `cosine` is for the corners' field angle."""
     along: float = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
     right: float = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z
     below: float = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z
@@ -748,7 +747,7 @@ def _best_gate(
     fields: float,
     scales: float,
 ) -> tuple[float, float]:
-    """Return the most significant gate, or 0 if too few stars match, and log10 of the chance matches."""
+    """Return the most significant gate (0 if too few stars match) and log10 of the chance matches."""
     best, bound, matched = 0.0, math.inf, least - 1
     for gate in gates:
         within, rank = _within(squared, nearest, gate)
@@ -811,7 +810,8 @@ def _log10_chance(
 def _log10_places(matched: int, observed: int, chance: float, attitudes: float, pairs: float) -> float:
     """Return the value of `Chance._of_places` for the probability `chance` that an observed star matches.
 
-    The expected numbers of first matched stars and of first pairs are `attitudes` and `pairs`.
+    The first matched star has `attitudes` possible guide stars, and the first two matched stars have `pairs`
+    possible pairs of guide stars.
     """
     if matched <= observed * chance:
         return math.log10(attitudes)

@@ -245,7 +245,8 @@ class TriangleIndex:
     """Triangles of guide stars, sorted by form and longest side.
 
     Attributes:
-        begin: index of the first triangle of each form, and the number of triangles (f + 1,), int32.
+        begin: index of the first triangle of each of f forms, followed by the number of triangles (f + 1,),
+            int32.
         entry: entry of each triangle (m,), uint32: the longest side (`size_steps`) in the upper 16 bits, and
             the positions of the shortest and of the middle side's ratios in 8 bits each.
         corners: indices of the guide stars opposite the shortest, middle and longest side (m, 3), uint16.
@@ -264,7 +265,7 @@ class TriangleIndex:
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """The number of triangles before each interval of the longest side of each form (i + 1,)."""
+        """The numbers (i + 1,) of triangles before each of i intervals of the longest side, form by form."""
         form = np.repeat(np.arange(len(self.begin) - 1), np.diff(self.begin))
         intervals = SIZES >> RUN_BITS
         count = np.bincount(
@@ -277,7 +278,8 @@ class TriangleIndex:
     def table(self) -> tuple[npt.NDArray[Any], ...]:
         """The arrays entry, corners and below, contiguous and read-only, and the layout (6,) of entries.
 
-        The layout is `CELLS`, `SIZES`, `OCTAVE`, `RUN_BITS`, and the smallest and largest longest side.
+        The layout is `CELLS`, `SIZES`, `OCTAVE`, `RUN_BITS`, and the minimum and maximum of all longest
+        sides.
         """
         size = self.entry >> np.uint32(16)
         limits = (int(size.min()), int(size.max())) if len(size) else (0, 0)
@@ -388,7 +390,7 @@ def evenly_spread(count: int) -> FloatArray:
 def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:
     """Return the triangles (m, 3) with a longest side between `smallest` and `largest`.
 
-    Each star of a triangle has fewer than `rank` brighter stars that are closer than the longest side.
+    For each star of a triangle, fewer than `rank` brighter stars are closer to it than the longest side.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
@@ -489,8 +491,8 @@ class SkyIndex:
     def boxes(self) -> tuple[npt.NDArray[np.int32], FloatArray, npt.NDArray[np.int32]]:
         """Guide stars sorted by spatial box: indices (n,), directions (n, 3), and the offset of each box.
 
-        The cube around the unit sphere is divided into equally many boxes along each axis. The stars of a box
-        are in order of brightness, the brightest first.
+        The cube around the unit sphere is divided into boxes, the same number along each axis. The stars of a
+        box are in order of brightness, the brightest first.
         """
         x, y, z = np.minimum(((self.stars.direction + 1.0) * (0.5 * _BOXES)).astype(np.int64), _BOXES - 1).T
         box = (x * _BOXES + y) * _BOXES + z

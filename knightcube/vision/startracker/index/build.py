@@ -40,10 +40,10 @@ class IndexSettings:
         epoch: Julian year of the directions; the method `SkyIndex.at` changes the epoch.
         resolution: angle below which two stars are merged, rad.
         smallest, largest: limits of the longest side of a triangle, rad.
-        density: limit of the number of brighter stars around the corners of triangles with a longest side of
-            2.5 deg. A star is a corner of triangles of this size only if fewer than `density` brighter stars
-            are within 2.5 deg of it. For larger triangles, the limit is higher, so that every octave of size
-            has about the same number of triangles.
+        density: limit for the corners of triangles with a longest side of 2.5 deg. A star is a corner of such
+            a triangle only if fewer than `density` brighter stars are within 2.5 deg of it. For larger
+            triangles, the limit is higher, so that every octave of size has about the same number of
+            triangles.
         few: number of brightest stars per circle on the sky, whose triangles are always in the index.
     """
 
