@@ -7,7 +7,7 @@ a simulated flight.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -216,11 +216,35 @@ def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
 
 def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> Any:
     device = driver_of(kind, section, f"{key}.driver").open(rig, section)
+    _check_methods(kind, section, device, f"{key}.driver")
     stack.callback(device.close)
     # The built-in drivers check their readings themselves, at less cost than `CheckedUnit`.
     if kind in {"inertial_unit", "magnetometer"} and ":" in section.driver:
         return CheckedUnit(device, section.field_range)
     return device
+
+
+_PROTOCOLS: Mapping[str, type[Any]] = {
+    "inertial_unit": InertialUnit,
+    "magnetometer": InertialUnit,
+    "coils": TorqueCoils,
+    "power_monitor": PowerMonitor,
+    "gps": GpsReceiver,
+    "solar_strings": SolarStrings,
+    "camera": CameraDevice,
+}
+"""Protocol of the drivers of each kind."""
+
+
+def _check_methods(kind: str, section: Any, device: Any, key: str) -> None:
+    """Raise NotResponding if a driver of another package lacks a method of its Protocol."""
+    named = getattr(section, "driver", None) or section.__struct_config__.tag
+    if ":" not in named:
+        return
+    for name, value in vars(_PROTOCOLS[kind]).items():
+        if callable(value) and not name.startswith("_") and not callable(getattr(device, name, None)):
+            problem = f"whose driver {type(device).__name__} has no method `{name}`: add it"
+            raise NotResponding(f"`{key}`", f"is {named!r}, {problem}")
 
 
 def _dated(rig: Rig, config: Config) -> Rig:
@@ -297,6 +321,7 @@ def open_camera(
         raise ConfigError("camera.device", NO_CAMERA)
     key = "camera.device.driver"
     device: CameraDevice = driver_of("camera", camera.device, key).open(rig, camera)
+    _check_methods("camera", camera.device, device, key)
     source: ServedCamera = _called(key, camera.device, ServedCamera, device, rig.clock, patient)
     stack.callback(source.close)
     return source

@@ -89,7 +89,7 @@ from flight.loop.state import Learned, StateKeeper, open_state, service_folder, 
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings, stated_accuracy
-from flight.schema.document import ConfigError, imported, merged_text, read_text
+from flight.schema.document import ConfigError, imported, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
@@ -297,7 +297,7 @@ def _judge(request: RunRequest) -> _Judged:
     text, config = requested_config(request, chosen.text)
     with placing(text, str(chosen.path)):
         check_settings(config)
-    return _Judged(request, chosen, text, merged_text(text, str(chosen.path)), config)
+    return _Judged(request, chosen, text, configuration.merged_text(text, str(chosen.path)), config)
 
 
 def _open(judged: _Judged, stack: ExitStack) -> _Opened:

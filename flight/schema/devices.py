@@ -39,6 +39,7 @@ from flight.schema.document import (
     SignedAxis,
     Vector,
     call_named,
+    derived_struct,
     imported,
 )
 from hal.interfaces.errors import NotResponding
@@ -821,37 +822,46 @@ def _explained(driver: Driver, named: str, key: str) -> Driver:
 
 def with_drivers(shape: type[Any], document: Document) -> type[Any]:
     """Return a type of configuration with the sections that the drivers registered. Raises ConfigError."""
-
-    def section_of(kind: str, named: Any, key: str) -> type[Any]:
-        try:
-            return _named(kind, named, key).section
-        except ConfigError as error:
-            raise document.error(error.where, error.problem) from error
-
     fields: list[tuple[str, Any]] = []
-    for kind in DRIVERS:
-        section = document.values.get(kind)
-        named = section.get("driver") if isinstance(section, dict) else None
-        if isinstance(named, str) and kind != "camera" and named != next(iter(DRIVERS[kind])):
-            fields.append((kind, section_of(kind, named, f"{kind}.driver")))
-            _drop_inherited(kind, fields[-1][1], document)
     others: dict[str, type[Any]] = {}
-    for key, camera in _cameras(document.values):
-        device = camera.get("device")
-        named = device.get("driver") if isinstance(device, dict) else None
-        if isinstance(named, str) and ":" in named:
-            others[named] = section_of("camera", named, f"{key}.device.driver")
+    for kind, dotted, section in _driven(document.values):
+        named, place = section["driver"], f"{dotted}.driver"
+        if kind != "camera" and named != next(iter(DRIVERS[kind])):
+            fields.append((kind, _named(kind, named, place).section))
+        elif named not in DRIVERS[kind]:
+            others[named] = _named(kind, named, place).section
     if others:
         fields += _camera_fields(tuple(sorted(others.items())))
-    return _shape(cast(Hashable, shape), tuple(fields)) if fields else shape
+    return derived_struct(cast(Hashable, shape), tuple(fields)) if fields else shape
 
 
-def _drop_inherited(kind: str, section: type[Any], document: Document) -> None:
-    """Remove keys that an extended file gives for another driver, because they do not apply."""
-    known = {field.encode_name for field in msgspec.structs.fields(section)}
-    for key in set(document.values[kind]) - known:
-        if f"{kind}.{key}" in document.files:
-            del document.values[kind][key]
+def drop_inherited(document: Document) -> None:
+    """Remove keys that an extended file gives for another driver, because they do not apply.
+
+    A key is removed if the section of the named driver does not have it, and if its file is extended by the
+    file that names the driver. Raises ConfigError for an unknown driver.
+    """
+    for kind, dotted, section in _driven(document.values):
+        place = f"{dotted}.driver"
+        try:
+            shape = _named(kind, section["driver"], place).section
+        except ConfigError as error:
+            raise document.error(error.where, error.problem) from error
+        known = {field.encode_name for field in msgspec.structs.fields(shape)}
+        for key in set(section) - known:
+            if document.depth(f"{dotted}.{key}") > document.depth(place):
+                del section[key]
+
+
+def _driven(values: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return the kind, the dotted name and the values of each section that names a driver."""
+    found = [(kind, kind, values.get(kind)) for kind in DRIVERS if kind != "camera"]
+    found += [("camera", f"{key}.device", camera.get("device")) for key, camera in _cameras(values)]
+    return [
+        (kind, dotted, section)
+        for kind, dotted, section in found
+        if isinstance(section, dict) and isinstance(section.get("driver"), str)
+    ]
 
 
 def _cameras(values: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
@@ -870,17 +880,5 @@ def _camera_fields(others: tuple[tuple[str, type[Any]], ...]) -> list[tuple[str,
         device |= msgspec.defstruct(
             name, [], bases=bases, tag_field="driver", tag=named, frozen=True, kw_only=True
         )
-    camera, wide = (_shape(kind, (("device", device),)) for kind in (Camera, WideCamera))
+    camera, wide = (derived_struct(kind, (("device", device),)) for kind in (Camera, WideCamera))
     return [("camera", camera | None), ("wide_cameras", tuple[wide, ...])]  # type: ignore[valid-type]
-
-
-@lru_cache(maxsize=64)
-def _shape(shape: Hashable, fields: tuple[tuple[str, Any], ...]) -> type[Any]:
-    """Return a struct type derived from `shape`, in which some fields have other types but equal defaults."""
-    assert isinstance(shape, type)
-    defaults = {one.name: one.default for one in msgspec.structs.fields(shape)}
-    given = [
-        (name, kind) if defaults[name] is msgspec.NODEFAULT else (name, kind, defaults[name])
-        for name, kind in fields
-    ]
-    return msgspec.defstruct(shape.__name__, given, bases=(shape,), frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ import re
 import stat
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -79,6 +79,10 @@ class Document:
             known = re.sub(r"(\.[^.\[]+|\[[^\]]*\]|^[^.\[]+)$", "", known)
         where = f"{self.files.get(known, self.name)}:{self.lines[known]}" if known else self.name
         return ConfigError(where, f"`{dotted or 'configuration'}` {problem}")
+
+    def depth(self, dotted: str) -> int:
+        """Return the place in the chain of the file that gives a value: 0 for this file."""
+        return self.chain.index(self.files.get(dotted, self.name)) if self.chain else 0
 
 
 MODULES = "KNIGHTCUBE_MODULES"
@@ -328,16 +332,6 @@ def read_document(text: str, name: str) -> Document:
     extended file cannot be read.
     """
     return _extended(_read_single(text, name), ())
-
-
-def merged_text(text: str, name: str) -> str:
-    """Return a configuration and the files that it extends as one text. Raises ConfigError."""
-    document = read_document(text, name)
-    if len(document.chain) == 1:
-        return text
-    # The names are quoted, because they may contain line breaks.
-    names_of = ", ".join(ascii(Path(one).name) for one in document.chain)
-    return f"# merged from {names_of}\n{to_yaml(document.values)}"
 
 
 def _extended(document: Document, above: tuple[str, ...]) -> Document:
@@ -677,6 +671,18 @@ def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
     if isinstance(kind, inspect.DictType):
         return [kind.value_type]
     return []
+
+
+@lru_cache(maxsize=64)
+def derived_struct(shape: Hashable, fields: tuple[tuple[str, Any], ...]) -> type[Any]:
+    """Return a struct type derived from `shape`, in which some fields have other types but equal defaults."""
+    assert isinstance(shape, type)
+    defaults = {one.name: one.default for one in msgspec.structs.fields(shape)}
+    given = [
+        (name, kind) if defaults[name] is msgspec.NODEFAULT else (name, kind, defaults[name])
+        for name, kind in fields
+    ]
+    return msgspec.defstruct(shape.__name__, given, bases=(shape,), frozen=True, kw_only=True)
 
 
 Positive = Annotated[float, Meta(gt=0.0)]

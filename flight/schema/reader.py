@@ -30,6 +30,7 @@ from flight.schema.devices import (
     WideCamera,
     camera_model,
     driver_of,
+    drop_inherited,
     fitted_devices,
     structure_mask,
     with_drivers,
@@ -42,6 +43,7 @@ from flight.schema.document import (
     convert,
     read_document,
     read_text,
+    to_yaml,
 )
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from hal.interfaces.devices import MOST_COILS
@@ -464,6 +466,9 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
 # Largest distance of the optical axis from the image centre along a side of the image, relative to the side.
 _MOST_OFF_CENTRE = 0.25
 
+# Largest relative difference between the field of view of a lens and the stated field of view.
+_FIELD_TOLERANCE = 0.1
+
 
 def _check_wide_camera(dotted: str, camera: WideCamera, first: WideCamera, refuse: Refuse) -> None:
     _check_length(f"{dotted}.mounting", camera.mounting, refuse)
@@ -491,10 +496,18 @@ def _check_lens(dotted: str, camera: Camera | WideCamera, refuse: Refuse) -> Non
     if abs(x - 0.5 * columns) > _MOST_OFF_CENTRE * columns or abs(y - 0.5 * rows) > _MOST_OFF_CENTRE * rows:
         problem = f"is ({x:g}, {y:g}): far from the centre of an image of {columns} x {rows} pixels"
         refuse(f"{dotted}.lens.centre", f"{problem}; give the lens of a calibration with images of this size")
+    field_deg = 2.0 * math.degrees(math.atan(0.5 * columns / camera.lens.focal_length))
+    if abs(field_deg / camera.field_of_view_deg - 1.0) > _FIELD_TOLERANCE:
+        problem = f"is {camera.lens.focal_length:g} px: {columns} columns then cover {field_deg:.4g} deg,"
+        stated = f"but `{dotted}.field_of_view_deg` is {camera.field_of_view_deg:g}"
+        refuse(f"{dotted}.lens.focal_length", f"{problem} {stated}: give both of the same camera")
 
 
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
     _check_lens("camera", camera, refuse)
+    if camera.saturation is not None and camera.saturation > (highest := 2**camera.bits - 1):
+        problem = f"is {camera.saturation:g}: pixels of {camera.bits} bits (`camera.bits`) have at most"
+        refuse("camera.saturation", f"{problem} {highest} counts")
     if camera.exposure >= camera.period:
         problem = f"is {camera.exposure:g} s: must be shorter than `camera.period` ({camera.period:g} s)"
         refuse("camera.exposure", problem)
@@ -572,9 +585,24 @@ def parse(text: str, name: str = "configuration") -> Config:
     _replace_unit(document)
     _check_body(document)
     shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
+    drop_inherited(document)
     config: Config = convert(document, with_drivers(shape, document))
     check_consistency(config, document)
     return config
+
+
+def merged_text(text: str, name: str) -> str:
+    """Return a configuration and the files that it extends as one text. Raises ConfigError.
+
+    The text has no inherited keys of a driver that an extending file replaces.
+    """
+    document = read_document(text, name)
+    if len(document.chain) == 1:
+        return text
+    drop_inherited(document)
+    # The names are quoted, because they may contain line breaks.
+    names_of = ", ".join(ascii(Path(one).name) for one in document.chain)
+    return f"# merged from {names_of}\n{to_yaml(document.values)}"
 
 
 def _check_body(document: Document) -> None:

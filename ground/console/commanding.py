@@ -31,8 +31,8 @@ from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION,
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, Packer, PacketArray, TelemetryError
-from flight.schema.document import merged_text, read_text
-from flight.schema.reader import parse
+from flight.schema.document import read_text
+from flight.schema.reader import merged_text, parse
 from flight.schema.sections import Commands
 from ground.console.history import values
 from ground.documentation import Body, commands_for, foreign_modes, layouts_for

@@ -133,10 +133,21 @@ def test_a_value_that_the_device_does_not_accept_is_refused(
 @pytest.mark.parametrize(
     ("old", "new", "problem", "status"),
     [
-        ("return Ina226(rig.wires", "return Ina226(rig.wire", "`open_monitor` failed: LINE: Attr", 1),
+        (
+            "return Ina226(rig.wires",
+            "return Ina226(rig.wire",
+            "`open_monitor` failed: LINE: Attr",
+            1,
+        ),
         ("return Ina226(rig.wires", "Ina226(rig.wires", "`open` returns None: return the device", 1),
+        ("def error(self)", "def errors(self)", "driver Ina226 has no method `error`: add it", 1),
         ("if section.averages not", "if section.average not", "`check` failed: LINE: Attr", 2),
-        ("i2c(section.bus).attach(chip)", "i2c(section.bus).atach(chip)", "`emulate` failed: LINE: Attr", 2),
+        (
+            "i2c(section.bus).attach(chip)",
+            "i2c(section.bus).atach(chip)",
+            "`emulate` failed: LINE: Attr",
+            2,
+        ),
     ],
 )
 def test_a_mistake_in_the_code_of_a_driver_is_named_with_its_line(
@@ -148,7 +159,9 @@ def test_a_mistake_in_the_code_of_a_driver_is_named_with_its_line(
     (folder / "ina226.py").write_text(text.replace(old, new), encoding="utf-8")
     assert main(["run", "ina226.yaml", "--out", "run"]) == status
     error, problem = capsys.readouterr().err, problem.replace("LINE", r".*ina226\.py:\d+")
-    assert re.search(f"`power_monitor.driver`:? is 'ina226:INA226', whose function {problem}", error), error
+    assert re.search(f"`power_monitor.driver`:? is 'ina226:INA226', whose (function )?{problem}", error), (
+        error
+    )
 
 
 def test_a_board_imports_the_driver_only_if_root_permits_it(

@@ -40,7 +40,7 @@ from flight.schema.devices import (
     fitted_devices,
     structure_mask,
 )
-from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
+from flight.schema.document import ConfigError, config_path, names, read_document
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError, NotResponding
 from hal.interfaces.wires import LATE_NS
@@ -373,7 +373,7 @@ def check(options: argparse.Namespace) -> int:
     chain = read_document(chosen.text, str(path)).chain
     verdict = CheckResult(config, path, chain, [chosen.problem] if chosen.problem else [])
     if options.merged is not None:
-        _write(options.merged, merged_text(chosen.text, str(path)))
+        _write(options.merged, configuration.merged_text(chosen.text, str(path)))
     with placing(chosen.text, str(path)):
         check_values(config)
         if config.simulation is None:

@@ -182,6 +182,16 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
             "lens: {focal_length: 1450.0, centre: [256.0, 255.0], k1: -50.0}\n  columns: 512",
             "`camera.lens` is refused: k1 -50.0",
         ),
+        (
+            "columns: 512",
+            "lens: {focal_length: 2900.0, centre: [256.0, 255.0]}\n  columns: 512",
+            "is 2900 px: 512 columns then cover 10.09 deg, but `camera.field_of_view_deg` is 20: give both of",
+        ),
+        (
+            "columns: 512",
+            "bits: 12\n  columns: 512",
+            r"`camera.saturation` is 20000: pixels of 12 bits \(`camera.bits`\) have at most 4095 counts",
+        ),
         ("point: sun}", "point: moon}", r"`targets\[0\].point` is 'moon'.*nadir"),
         (
             "point: sun}",
@@ -578,3 +588,40 @@ def test_bridges_of_which_the_last_has_no_address_are_refused() -> None:
     assert reader.parse(text).coils.address == 0x66
     with pytest.raises(ConfigError, match=r"is 0x67: the coils use .* up to 0x69, .*: give at most 0x66"):
         reader.parse(text.replace("0x66", "0x67"))
+
+
+_SENSORS = (
+    "{driver: sensors, angle_noise: 1.5e-3, sensors: ["
+    "{part: icm20948, address: 0x69, measures: {gyro: [x, y, z], acceleration: [x, y, z]}}, "
+    "{part: lis3mdl, address: 0x1c, measures: {magnetic: [x, y, z]}}]}"
+)
+
+
+@pytest.mark.parametrize(
+    ("base", "own"),
+    [
+        ("name: base", f"inertial_unit: {_SENSORS}"),
+        (f"inertial_unit: {_SENSORS}", "inertial_unit: {driver: vn100}"),
+        (
+            "camera: {bits: 8, saturation: null, device: {driver: aravis, name: a, pixel_format: Mono8}}",
+            "camera: {device: {driver: v4l2, pixel_format: GREY}}",
+        ),
+        (
+            "camera: {bits: 8, saturation: null, device: {path: /dev/video7, pixel_format: GREY}}",
+            "camera: {device: {driver: aravis, name: a, pixel_format: Mono8}}",
+        ),
+    ],
+)
+def test_keys_of_a_replaced_driver_are_neither_inherited_nor_merged(
+    tmp_path: Path, base: str, own: str
+) -> None:
+    (tmp_path / "base.yaml").write_text(f"extends: step_demo\n{base}\n")
+    text, name = f"extends: base.yaml\n{own}\n", str(tmp_path / "own.yaml")
+    merged = reader.merged_text(text, name)
+    assert reader.parse(merged, "merged.yaml") == reader.parse(text, name)
+
+
+def test_a_misspelt_key_beside_its_driver_is_refused_in_a_file_that_extends_it(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("extends: orbit\ngps: {driver: nmea, baudrate: 9600}\n")
+    with pytest.raises(ConfigError, match=r"base\.yaml:2: `gps\.baudrate` is an unknown key, did you mean"):
+        reader.parse("extends: base.yaml\n", str(tmp_path / "own.yaml"))

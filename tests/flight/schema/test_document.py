@@ -29,12 +29,11 @@ from flight.schema.document import (
     config_path,
     imported,
     join,
-    merged_text,
     read_document,
     read_text,
     to_yaml,
 )
-from flight.schema.reader import load, simulation_section
+from flight.schema.reader import load, merged_text, simulation_section
 from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"

@@ -14,7 +14,7 @@ from tuf.api.metadata import Metadata, Timestamp
 
 from flight.link.files.store import locked
 from flight.link.process.commanding import Report, Stage
-from flight.schema.document import merged_text
+from flight.schema.reader import merged_text
 from ground.commands import renewal
 from tests.deploy.scripts import changed_testbed, script
 from tests.ground.commands.in_process import command
