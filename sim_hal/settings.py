@@ -21,9 +21,9 @@ from hal.interfaces.devices import MOST_COILS
 Vector = tuple[float, float, float]
 PerCoil = Annotated[tuple[float, ...], Meta(min_length=1, max_length=MOST_COILS)]
 Multiple = Annotated[float, Meta(ge=0.0, le=1e4)]
-Delay = Annotated[float, Meta(ge=0.0, le=3600.0)]
-Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
-ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
+Delay = Annotated[float, Meta(ge=0.0, le=3600.0, description="s")]
+Angle = Annotated[float, Meta(ge=-360.0, le=360.0, description="deg")]
+ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0, description="deg")]
 YEARS = 2001, 2043
 """First and last year of a simulation; `sim_hal.worlds.orbit` has the magnetic field of 2000 to 2045."""
 
@@ -49,11 +49,11 @@ class OrbitSection(Section, frozen=True, kw_only=True):
     and mean local solar time differ by up to 18 min.
     """
 
-    altitude: Annotated[float, Meta(ge=200e3, le=2_000e3)] = 500e3
+    altitude: Annotated[float, Meta(ge=200e3, le=2_000e3, description="m")] = 500e3
     eccentricity: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.001
     inclination_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 97.4
     ascending_node_deg: Angle = 0.0
-    local_time: Annotated[float, Meta(ge=0.0, le=24.0)] | None = None
+    local_time: Annotated[float, Meta(ge=0.0, le=24.0, description="h")] | None = None
     argument_of_perigee_deg: Angle = 0.0
     true_anomaly_deg: Angle = 0.0
 

@@ -121,7 +121,7 @@ class Step(Section, frozen=True, kw_only=True):
 
     at: Annotated[NotNegative, Meta(description="mission time, s")]
     q2: Annotated[Q2, Meta(description="second quaternion component, -0.68 to 0.68")]
-    rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
+    rate: Annotated[float, Meta(ge=-0.1, le=0.1, description="rad/s")] = 0.0
 
 
 class Cage(Section, frozen=True, kw_only=True):
@@ -193,7 +193,7 @@ inertia (kg m^2) of this CubeSat."""
 _DIPOLE_PER_MASS = 3.5e-3
 """Residual dipole (A m^2) per kg of a satellite of class II that does not spin (NASA SP-8018)."""
 
-ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
+ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0, description="deg")]
 
 
 class CraftAccuracy(Section, frozen=True, kw_only=True):
@@ -212,8 +212,8 @@ class CraftAccuracy(Section, frozen=True, kw_only=True):
     axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 5.0
     coil_gain: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.2
     coil_axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 3.0
-    centre_of_mass: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
-    residual_dipole: Annotated[float, Meta(ge=0.0, le=100.0)] | None = None
+    centre_of_mass: Annotated[float, Meta(ge=0.0, le=1.0, description="m")] = 0.02
+    residual_dipole: Annotated[float, Meta(ge=0.0, le=100.0, description="A m^2")] | None = None
 
 
 class Craft(Section, frozen=True, kw_only=True):
@@ -261,7 +261,7 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     field_noise: Positive = 5.0e-7
     torque_noise: Positive | None = None
     horizon: Positive = 1500.0
-    replan: Annotated[float, Meta(ge=1.0)] = 5.0
+    replan: Annotated[float, Meta(ge=1.0, description="s")] = 5.0
     gentle: Positive = 0.052
     spin_up: Annotated[float, Meta(ge=1.0)] = 3.0
 
@@ -340,10 +340,10 @@ class PointingSection(Section, frozen=True, kw_only=True):
     rate: Positive = 1.0
     dipole: Positive | None = None
     roll: Positive | None = None
-    act: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.8
-    replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
-    coil_test: Annotated[float, Meta(ge=0.0, le=86400.0)] = 600.0
-    slew: Annotated[float, Meta(ge=60.0, le=1500.0)] | None = None
+    act: Annotated[float, Meta(ge=0.1, le=10.0, description="s")] = 1.8
+    replan_period: Annotated[float, Meta(ge=10.0, le=900.0, description="s")] = 300.0
+    coil_test: Annotated[float, Meta(ge=0.0, le=86400.0, description="s")] = 600.0
+    slew: Annotated[float, Meta(ge=60.0, le=1500.0, description="s")] | None = None
     cones: ExclusionCones = ExclusionCones()
     planner: Literal["collocation", "vmc"] = "collocation"
 

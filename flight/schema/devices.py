@@ -58,7 +58,7 @@ _MOST_HIDDEN = 0.5
 """Largest fraction of a horizon camera's image that the configured structure may cover."""
 Polygon = Annotated[tuple[tuple[float, float], ...], Meta(min_length=3, max_length=64)]
 Quantity = Literal["gyro", "magnetic", "acceleration"]
-ExposureTime = Annotated[float, Meta(ge=1e-6, le=10.0)]
+ExposureTime = Annotated[float, Meta(ge=1e-6, le=10.0, description="s")]
 
 
 class UnitAccuracy(Section, frozen=True, kw_only=True):
@@ -177,7 +177,7 @@ class Winding(Section, frozen=True, kw_only=True):
     turns: Annotated[int, Meta(gt=0, le=100_000)] | None = None
     area: Positive | None = None
     resistance: Annotated[Positive, Meta(description="resistance of the winding, ohm")]
-    current_limit: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
+    current_limit: Annotated[float, Meta(gt=0.0, le=1.0, description="A")] | None = None
     channels: tuple[Channel, Channel] | None = None
     sign: Sign = 1
     position: Vector | None = None
@@ -222,7 +222,7 @@ class Coils(Section, frozen=True, kw_only=True):
     windings: Annotated[tuple[Winding, ...], Meta(min_length=1, max_length=64)]
     supply_voltage: Annotated[Positive, Meta(description="voltage across a coil at full duty, V")]
     current_limit: Annotated[Positive, Meta(description="largest current of a coil, A")]
-    stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
+    stale_after: Annotated[float, Meta(gt=0.0, le=0.4, description="s")] = 0.25
 
     @property
     def absent(self) -> frozenset[int]:
@@ -326,7 +326,7 @@ class Battery(Section, frozen=True, kw_only=True):
 
     capacity: Annotated[float, Meta(gt=0.0, le=1000.0), Meta(description="capacity of the battery, A h")]
     cells: Annotated[int, Meta(ge=1, le=3)] = 2
-    resistance: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
+    resistance: Annotated[float, Meta(gt=0.0, le=10.0, description="ohm")] = 0.1
     open_circuit: Annotated[
         tuple[Annotated[float, Meta(gt=1.0, lt=5.0)], ...], Meta(min_length=2, max_length=101)
     ] = (3.0, 3.45, 3.55, 3.6, 3.65, 3.7, 3.78, 3.87, 3.96, 4.06, 4.18)
@@ -358,7 +358,7 @@ class LowBattery(Section, frozen=True, kw_only=True):
     critical: Share = 0.2
     hysteresis: Annotated[float, Meta(ge=0.01, le=0.5)] = 0.1
     coil_share: Share = 0.3
-    camera_period: Annotated[float, Meta(gt=0.0, le=3600.0)] = 60.0
+    camera_period: Annotated[float, Meta(gt=0.0, le=3600.0, description="s")] = 60.0
 
 
 class Power(Section, frozen=True, kw_only=True):
@@ -467,7 +467,7 @@ class V4l2Device(Section, frozen=True, kw_only=True, tag_field="driver", tag="v4
     pixel_format: PixelName = "GREY"
     gain: int | None = None
     stamp: Literal["told", "start", "end"] = "told"
-    stamp_delay: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    stamp_delay: Annotated[float, Meta(ge=0.0, le=1.0, description="s")] = 0.0
 
 
 class AravisDevice(Section, frozen=True, kw_only=True, tag_field="driver", tag="aravis"):
@@ -501,8 +501,8 @@ class Camera(Section, frozen=True, kw_only=True):
 
     device: V4l2Device | AravisDevice | None = None
 
-    columns: Annotated[int, Meta(ge=64, le=8192)] = 1024
-    rows: Annotated[int, Meta(ge=64, le=8192)] = 1024
+    columns: Annotated[int, Meta(ge=64, le=8192, description="px")] = 1024
+    rows: Annotated[int, Meta(ge=64, le=8192, description="px")] = 1024
     field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
     lens: CameraLens | None = None
     accuracy: CameraAccuracy = CameraAccuracy()
@@ -514,8 +514,8 @@ class Camera(Section, frozen=True, kw_only=True):
     gain: Positive = 1.0
     read_noise: Positive = 10.0
     saturation: Positive | None = None
-    psf_sigma: Annotated[float, Meta(ge=PSF_SIGMAS[0], le=PSF_SIGMAS[1])] = 1.0
-    line_time: Annotated[float, Meta(ge=0.0, le=LONGEST_LINE_TIME)] | None = None
+    psf_sigma: Annotated[float, Meta(ge=PSF_SIGMAS[0], le=PSF_SIGMAS[1], description="px")] = 1.0
+    line_time: Annotated[float, Meta(ge=0.0, le=LONGEST_LINE_TIME, description="s per row")] | None = None
     estimator: Estimator = "likelihood"
     star_tracker: StarTrackerSection | None = None
     objects: ObjectTracking | None = None
@@ -538,7 +538,7 @@ class Gps(Section, frozen=True, kw_only=True):
     driver: DriverName = "ublox"
     device: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-gps"
     baud_rate: BaudRate = 115200
-    period: Annotated[float, Meta(ge=0.1, le=60.0)] = 1.0
+    period: Annotated[float, Meta(ge=0.1, le=60.0, description="s")] = 1.0
     max_age: Positive = 60.0
 
 
@@ -566,7 +566,7 @@ class SolarStringsSection(Section, frozen=True, kw_only=True):
     driver: DriverName = "ads1115"
     bus: Bus | None = None
     strings: Annotated[tuple[SolarString, ...], Meta(min_length=4, max_length=16)]
-    period: Annotated[float, Meta(ge=0.04, le=60.0)] = 0.5
+    period: Annotated[float, Meta(ge=0.04, le=60.0, description="s")] = 0.5
     max_age: Positive = 2.0
 
 
@@ -585,17 +585,17 @@ class WideCamera(Section, frozen=True, kw_only=True):
     """
 
     device: V4l2Device | AravisDevice | None = None
-    columns: Annotated[int, Meta(ge=64, le=2048)] = 384
-    rows: Annotated[int, Meta(ge=64, le=2048)] = 384
+    columns: Annotated[int, Meta(ge=64, le=2048, description="px")] = 384
+    rows: Annotated[int, Meta(ge=64, le=2048, description="px")] = 384
     field_of_view_deg: Annotated[float, Meta(gt=10.0, lt=150.0)] = 67.0
     lens: CameraLens | None = None
     response: Literal["logarithmic", "linear"] = "logarithmic"
     decades: Annotated[float, Meta(ge=1.0, le=12.0)] = 6.0
     bits: Annotated[int, Meta(ge=8, le=16)] = 8
     pedestal: Annotated[float, Meta(ge=0.0, le=200.0)] = 8.0
-    exposure: Annotated[float, Meta(ge=1e-6, le=1.0)] = 0.005
-    period: Annotated[float, Meta(ge=0.5)] = 5.0
-    fine_period: Annotated[float, Meta(ge=0.5)] = 60.0
+    exposure: Annotated[float, Meta(ge=1e-6, le=1.0, description="s")] = 0.005
+    period: Annotated[float, Meta(ge=0.5, description="s")] = 5.0
+    fine_period: Annotated[float, Meta(ge=0.5, description="s")] = 60.0
     sun: bool = True
     max_age: Positive = 30.0
     lens_error_deg: NotNegative = 0.02

@@ -614,7 +614,7 @@ def _limits(kinds: list[inspect.Type]) -> str:
     }
     if len(found) != 1:
         return ""
-    bounds = [f"{bound:g}" if isinstance(bound, float) else bound for bound in found.pop()]
+    bounds = [f"{bound:.7g}" if isinstance(bound, float) else bound for bound in found.pop()]
     above, least, below, most = bounds
     if least is not None and most is not None:
         return f"{least} to {most}"

@@ -109,9 +109,9 @@ class Detumble(Section, frozen=True, kw_only=True):
     for `low_for` s.
     """
 
-    settle: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
-    measure: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.05
-    act: Annotated[float, Meta(ge=0.02, le=5.0)] = 0.15
+    settle: Annotated[float, Meta(ge=0.0, le=1.0, description="s")] = 0.05
+    measure: Annotated[float, Meta(ge=0.02, le=1.0, description="s")] = 0.05
+    act: Annotated[float, Meta(ge=0.02, le=5.0, description="s")] = 0.15
     low_rate: Positive = 0.02
     low_for: Positive = 2.0
 
@@ -125,7 +125,7 @@ class Health(Section, frozen=True, kw_only=True):
     `hottest` a reaction.
     """
 
-    look_period: Annotated[float, Meta(ge=0.5, le=600.0)] = 5.0
+    look_period: Annotated[float, Meta(ge=0.5, le=600.0, description="s")] = 5.0
     warm_up: NotNegative = 120.0
     slope_window: Positive = 1200.0
     cpu_share: Positive = 0.7
@@ -166,7 +166,7 @@ class LinkSerial(Section, frozen=True, kw_only=True):
     """A serial line to a radio: its device file and bit rate (bit/s), with KISS framing if `kiss` is true."""
 
     device: Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="a device file")]
-    baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
+    baud: Annotated[int, Meta(ge=1200, le=4_000_000, description="baud")] = 115200
     kiss: bool = False
 
 
@@ -215,11 +215,11 @@ class Link(Section, frozen=True, kw_only=True):
     peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
     kiss: HostPort | None = None
     call_signs: tuple[CallSign, CallSign] | None = None
-    frame_bytes: Annotated[int, Meta(ge=128, le=2048)] = 1115
-    command_frame_bytes: Annotated[int, Meta(ge=128, le=1024)] = 1024
-    rate: Annotated[float, Meta(ge=100.0, le=1.0e7)] = 50_000.0
-    command_loss: Annotated[float, Meta(ge=0.0, le=3.2e7)] = 0.0
-    idle_rate: Annotated[float, Meta(ge=0.0, le=1.0e7)] = 0.0
+    frame_bytes: Annotated[int, Meta(ge=128, le=2048, description="bytes")] = 1115
+    command_frame_bytes: Annotated[int, Meta(ge=128, le=1024, description="bytes")] = 1024
+    rate: Annotated[float, Meta(ge=100.0, le=1.0e7, description="bytes/s")] = 50_000.0
+    command_loss: Annotated[float, Meta(ge=0.0, le=3.2e7, description="s")] = 0.0
+    idle_rate: Annotated[float, Meta(ge=0.0, le=1.0e7, description="bytes/s")] = 0.0
     encrypt_telemetry: bool = True
     coding: LinkCoding = LinkCoding()
 
@@ -227,9 +227,9 @@ class Link(Section, frozen=True, kw_only=True):
 class Telemetry(Section, frozen=True, kw_only=True):
     """Maximum sizes (bytes) of a log segment, of all segments of a log, and of all runs in an archive."""
 
-    segment_bytes: Annotated[int, Meta(ge=4096)] = 16 * 1024 * 1024
-    budget_bytes: Annotated[int, Meta(ge=16384)] = 1024 * 1024 * 1024
-    archive_bytes: Annotated[int, Meta(ge=32768)] = 8 * 1024 * 1024 * 1024
+    segment_bytes: Annotated[int, Meta(ge=4096, description="bytes")] = 16 * 1024 * 1024
+    budget_bytes: Annotated[int, Meta(ge=16384, description="bytes")] = 1024 * 1024 * 1024
+    archive_bytes: Annotated[int, Meta(ge=32768, description="bytes")] = 8 * 1024 * 1024 * 1024
 
 
 class State(Section, frozen=True, kw_only=True):
@@ -240,13 +240,13 @@ class State(Section, frozen=True, kw_only=True):
     """
 
     folder: Annotated[str, Meta(min_length=1)] | None = None
-    period: Annotated[float, Meta(ge=1.0, le=3600.0)] = 10.0
+    period: Annotated[float, Meta(ge=1.0, le=3600.0, description="s")] = 10.0
 
 
 class Separation(Section, frozen=True, kw_only=True):
     """Coils and transmitter stay off until the satellite has had power for `inhibit` s."""
 
-    inhibit: Annotated[float, Meta(ge=0.0, le=86_400.0)] = 0.0
+    inhibit: Annotated[float, Meta(ge=0.0, le=86_400.0, description="s")] = 0.0
 
 
 class Config(Section, frozen=True, kw_only=True):

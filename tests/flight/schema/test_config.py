@@ -127,10 +127,10 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ),
         ("exposure: 1.0", "exposure: 1.0e-10", "`camera.exposure`.*1e-06"),
         ("exposure: 1.0", "exposure: 6.0", "must be shorter than `camera.period`"),
-        ("exposure: 1.0", "exposure: 60.0", r"`camera.exposure` is 60.0: must be 1e-06 to 10$"),
+        ("exposure: 1.0", "exposure: 60.0", r"`camera.exposure` is 60.0: must be 1e-06 to 10 \(s\)$"),
         ("address: 0x40", "address: 0x90", r"`coils.address` is 0x90 \(144\): must be .* to .*"),
-        ("psf_sigma: 1.0", "psf_sigma: 0.2", r"`camera.psf_sigma` is 0.2: must be 0.3 to 6$"),
-        ("line_time: 0.0 ", "line_time: 0.02 ", r"`camera.line_time` is 0.02: must be 0 to 0.01$"),
+        ("psf_sigma: 1.0", "psf_sigma: 0.2", r"`camera.psf_sigma` is 0.2: must be 0.3 to 6 \(px\)$"),
+        ("line_time: 0.0 ", "line_time: 0.02 ", r"`camera.line_time` is 0.02: must be 0 to 0.01 \(s per row\)$"),
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
         ("name: step-demo", "name: a\nname: b", "`name` is given twice, first in line"),
         ("name: step-demo", "name: [", "is not YAML"),
@@ -185,7 +185,7 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
         (
             "columns: 512",
             "lens: {focal_length: 2900.0, centre: [256.0, 255.0]}\n  columns: 512",
-            "is 2900 px: 512 columns then cover 10.09 deg, but `camera.field_of_view_deg` is 20: give both of",
+            "is 2900 px: 512 columns then cover 10.09 deg, but `camera.field_of_view_deg` is 20: give both",
         ),
         (
             "columns: 512",
