@@ -135,7 +135,8 @@ def _detumbling(found: Object | None) -> list[str]:
         f"Detumbling, rates from the {'truth' if found['rate_source'] == 'truth' else 'gyro'}",
         *columns(found["periods"], shown),
         f"  rate from the magnetometer alone: available {number(known, 1, 100.0)} % of the time, "
-        f"{number(error, 3, DEGREES)} deg/s rms error per axis, {found['restarts']} restarts",
+        f"{'' if error is None else f'{number(error, 3, DEGREES)} deg/s rms error per axis, '}"
+        f"{found['restarts']} restarts",
     ]
 
 
@@ -145,6 +146,14 @@ def _knowledge(found: Object | None) -> list[str]:
     share = ", ".join(f"{name} {number(part, 1, 100.0)} %" for name, part in found["share"].items())
     dipole, judged, camera = found["dipole_error_share"], found["dipole_judged_s"], found["star_camera"]
     own: list[str] = []
+    errors = [  # unknown without the truth of a simulation
+        f"  error of the fine attitude {number(found['fine_error_rms_rad'], 4, DEGREES)} deg rms over "
+        f"three axes ({number(found['with_stars_error_rms_rad'], 4, DEGREES)} with stars), "
+        f"maximum {number(found['fine_error_worst_rad'], 4, DEGREES)} deg; "
+        f"maximum {number(found['worst_sigmas'], 1)} sigma per axis, "
+        f"NEES per axis {number(found['nees_per_axis'])}"
+    ]
+    errors = errors if found["fine_error_rms_rad"] is not None else []
     if camera is not None:
         error, nees = number(camera["with_stars_error_rms_rad"], 4, DEGREES), number(camera["nees_per_axis"])
         own = [f"  error of the star camera's attitude {error} deg rms with stars, NEES per axis {nees}"]
@@ -160,11 +169,7 @@ def _knowledge(found: Object | None) -> list[str]:
     return [
         "Attitude knowledge",
         f"  {share}; first fine at {number(found['fine_after_s'], 1)} s",
-        f"  error of the fine attitude {number(found['fine_error_rms_rad'], 4, DEGREES)} deg rms over "
-        f"three axes ({number(found['with_stars_error_rms_rad'], 4, DEGREES)} with stars), "
-        f"maximum {number(found['fine_error_worst_rad'], 4, DEGREES)} deg; "
-        f"maximum {number(found['worst_sigmas'], 1)} sigma per axis, "
-        f"NEES per axis {number(found['nees_per_axis'])}",
+        *errors,
         *own,
         *learned,
         *(
@@ -423,13 +428,19 @@ def _health(health: Object | None) -> list[str]:
         f"watchdog fed {health['watchdog_fed']} times, wall clock set {health['clock_steps']} times",
     ]
     if health["proportional_bytes"] is not None:
-        lines.append(
-            f"  maximum {number(health['cpu_share'])} of a core, "
-            f"{number(health['proportional_bytes'], 0, 2.0**-20)} MiB, "
-            f"{number(health['temperature_c'], 1)} deg C; memory slope "
-            f"{number(health['memory_slope_bytes_per_hour'], 2, 2.0**-20)} MiB/h; "
-            f"{number(health['disk_free_bytes'], 0, 2.0**-20)} MiB of disk free"
+        known = (
+            ("cpu_share", 2, 1.0, "maximum {} of a core"),
+            ("proportional_bytes", 0, 2.0**-20, "{} MiB"),
+            ("temperature_c", 1, 1.0, "{} deg C"),
+            ("memory_slope_bytes_per_hour", 2, 2.0**-20, "memory slope {} MiB/h"),
+            ("disk_free_bytes", 0, 2.0**-20, "{} MiB of disk free"),
         )
+        shown = [
+            phrase.format(number(health[key], digits, scale))
+            for key, digits, scale, phrase in known
+            if health[key] is not None
+        ]
+        lines.append("  " + ", ".join(shown))
     return lines
 
 

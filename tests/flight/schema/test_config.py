@@ -130,7 +130,11 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ("exposure: 1.0", "exposure: 60.0", r"`camera.exposure` is 60.0: must be 1e-06 to 10 \(s\)$"),
         ("address: 0x40", "address: 0x90", r"`coils.address` is 0x90 \(144\): must be .* to .*"),
         ("psf_sigma: 1.0", "psf_sigma: 0.2", r"`camera.psf_sigma` is 0.2: must be 0.3 to 6 \(px\)$"),
-        ("line_time: 0.0 ", "line_time: 0.02 ", r"`camera.line_time` is 0.02: must be 0 to 0.01 \(s per row\)$"),
+        (
+            "line_time: 0.0 ",
+            "line_time: 0.02 ",
+            r"`camera.line_time` is 0.02: must be 0 to 0.01 \(s per row\)$",
+        ),
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
         ("name: step-demo", "name: a\nname: b", "`name` is given twice, first in line"),
         ("name: step-demo", "name: [", "is not YAML"),

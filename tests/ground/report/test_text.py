@@ -132,6 +132,10 @@ def test_detumbling_is_in_degrees_a_second() -> None:
         "4 restarts"
     )
     assert "rates from the truth" in blocks(detumbling={**found, "rate_source": "truth"})[0]
+    [unknown, _] = blocks(detumbling={**found, "rate_error_rms_rad_s": None})
+    assert unknown.splitlines()[4] == (
+        "  rate from the magnetometer alone: available 25.5 % of the time, 4 restarts"
+    )
 
 
 def test_knowledge_is_in_degrees_and_percent() -> None:
@@ -157,6 +161,8 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
         "  error of the residual dipole in the last 1.5 min in shadow: 5 %",
         "  5 measurements and 6 fixes refused, 7 restarts",
     ]
+    [unknown, _] = blocks(knowledge={**found, "fine_error_rms_rad": None})
+    assert "error of the fine attitude" not in unknown
 
 
 def test_pointing_is_in_degrees_and_milliwatts() -> None:
@@ -345,8 +351,11 @@ def test_modes_health_and_events_are_listed() -> None:
     assert health_text.splitlines() == [
         "Health: streams good imu 98.7 %",
         "  conditions detected: none; watchdog fed 5 times, wall clock set 1 times",
-        "  maximum 0.26 of a core, 3 MiB, 45.7 deg C; memory slope 0.50 MiB/h; 7 MiB of disk free",
+        "  maximum 0.26 of a core, 3 MiB, 45.7 deg C, memory slope 0.50 MiB/h, 7 MiB of disk free",
     ]
+    health |= {"temperature_c": None, "memory_slope_bytes_per_hour": None}
+    [_, without] = blocks(health=health)
+    assert without.splitlines()[2] == "  maximum 0.26 of a core, 3 MiB, 7 MiB of disk free"
     assert [line.split() for line in event_text.splitlines()[2:]] == [
         ["started", "information", "1", "0.250"],
         ["x", "9", "2", "1.000"],
