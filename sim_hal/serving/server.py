@@ -13,6 +13,7 @@ import os
 import selectors
 import signal
 import socket
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -28,6 +29,7 @@ from hal.buses.system import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import LATE_NS
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.errors import reason_of
 from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, render_wide
 from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.camera import EmulatedCamera
@@ -284,7 +286,11 @@ class DeviceServer:
                 continue
             path = self.socket_path.parent / f"frame-{number}-{self._frames_sent % _FRAME_SLOTS}.raw"
             self._frames_sent += 1
-            path.write_bytes(frame.pixels.tobytes())
+            try:
+                path.write_bytes(frame.pixels.tobytes())
+            except OSError as error:  # such as a full disk, which loses this frame but no other device
+                sys.stderr.write(f"sim_hal: a frame is lost: {path}: {reason_of(error)}\n")
+                continue
             times = frame.sequence, frame.exposure_start_ns, frame.exposure_ns
             description = [*times, list(frame.pixels.shape), frame.pixels.dtype.str]
             for connection in self._connections.values():

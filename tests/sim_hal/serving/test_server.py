@@ -43,6 +43,25 @@ def test_a_frame_that_waits_to_be_rendered_is_given_up_for_the_next() -> None:
     assert not second.cancelled()
 
 
+def test_a_frame_that_cannot_be_written_is_lost_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = Frame(4, 5, 6, 7, np.ones((2, 3), np.uint16))
+    client = Mock(wants_frames={0})
+    server = DeviceServer.__new__(DeviceServer)
+    server.hardware = Mock(camera=Mock(poll=lambda: frame), orbit=Mock(wide=()))
+    server.__dict__.update(_frames_sent=0, _connections={1: client}, socket_path=tmp_path / "devices")
+    (tmp_path / "frame-0-0.raw").mkdir()
+    server._deliver_frames()
+    assert re.fullmatch(
+        "sim_hal: a frame is lost: .*frame-0-0.raw: Is a directory.*\n", capsys.readouterr().err
+    )
+    client.answer.assert_not_called()
+    server._deliver_frames()
+    assert client.answer.call_args.args[0][-1] == "frame-0-1.raw"
+    assert (tmp_path / "frame-0-1.raw").read_bytes() == frame.pixels.tobytes()
+
+
 def test_a_server_starts_without_the_optics_that_its_renderer_needs() -> None:
     code = "import sys, sim_hal.__main__; sys.stdout.write(str('sim_hal.star_camera' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
