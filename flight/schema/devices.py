@@ -494,6 +494,10 @@ class Camera(Section, frozen=True, kw_only=True):
     after the end of its exposure, and vision counts as slow if a frame takes longer than `vision_slow_after`
     s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
 
+    The value `gain` is in electrons per count, `saturation` in counts (by default the highest count of
+    `bits`), `psf_sigma` in px, and `line_time` in s per row. The value `read_noise`, in electrons, is that of
+    the simulated camera.
+
     With `learn_lens`, the star tracker estimates lens parameters, line time and point spread from its solved
     frames, and the next boot continues with the estimates. Nothing is estimated for a camera that is exact
     according to `accuracy`.

@@ -140,8 +140,10 @@ def make_signing_keys(folder: Path) -> Path:
     """Make two root keys, a signing key and the first root metadata, and return the metadata file."""
     try:
         folder.mkdir(mode=0o700, parents=True)
-    except OSError as error:
+    except FileExistsError as error:
         raise UsageError(f"{folder}: {error.strerror}: name a folder that does not exist") from error
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made: {reason_of(error)}") from error
     (folder / "metadata").mkdir()
     roots = [_new_key(folder / f"root-{number}.pem") for number in (1, 2)]
     signing = _new_key(folder / "signing.pem")

@@ -99,6 +99,13 @@ def test_a_release_that_is_too_large_for_the_board_is_not_signed(
     assert not (signing / "metadata/targets.json").exists(), "no version is used up"
 
 
+def test_keys_below_a_file_are_refused_with_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = command("renewal", "keys", tmp_path / "file/signing")
+    assert done.returncode == 2
+    assert "file/signing: cannot be made: Not a directory" in done.stderr
+
+
 def test_keys_are_readable_by_their_owner_only_and_never_overwritten(signing: Path) -> None:
     keys = sorted(signing.glob("*.pem"))
     assert [key.name for key in keys] == ["root-1.pem", "root-2.pem", "signing.pem"]
