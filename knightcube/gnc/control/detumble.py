@@ -3,7 +3,7 @@
 The field of the coils disturbs the magnetometer, so time is divided into windows. In each window the coils
 are first off to let the field settle, then the field is measured and averaged, and then the coils are driven.
 The rate is computed from the mean fields of two consecutive windows. A field that is constant in inertial
-axes changes in body axes by B' = -w x B, which gives the component of the rate across the field, w_p = B' x B
+axes changes in body axes by B' = -w x B. The component of the rate across the field is therefore w_p = B' x B
 / B^2. The dipole moment m = (k / B^2) w_p x B reduces the rate, because its torque m x B is -k w_p for any
 direction of the field (B-dot control: Wertz 1978, section 18.3, and Avanzini and Giulietti 2012, Journal of
 Guidance, Control, and Dynamics 35(4)). The gain k is chosen so that in one window the torque k w_p removes

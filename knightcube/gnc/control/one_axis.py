@@ -74,7 +74,7 @@ class CurrentCommand(NamedTuple):
 
 
 class AngleController(Protocol):
-    """Interface of a controller, which computes a coil current from commanded and estimated motion."""
+    """Interface of a controller that computes a coil current from commanded and estimated motion."""
 
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
@@ -109,7 +109,7 @@ _MINIMUM_BRAKING = 0.05
 
 
 class LqTracker:
-    """The linear-quadratic tracker of an angle, which has no internal state.
+    """The linear-quadratic tracker of an angle, without internal state.
 
     Attributes:
         error_gain, rate_gain: elements of the gain K for the error e (1/s^2) and for its derivative e' (1/s).

@@ -139,7 +139,7 @@ class SlewStart:
         times: equally spaced times (m,) of table and preview, s.
         kept: number of time steps in the pointing table.
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
-        limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
+        limit: mean dipole limit (A m^2) along each body axis, one number for all axes or an array (3,).
         sizes: estimated components (9,) of the disturbance torques, N m.
         areas: scaled areas (3,) of the body's faces, on which air and sunlight act.
     """
@@ -453,7 +453,7 @@ class PointingJob:
         origin_ns: time at which the orbit state, the attitude and the body rate are valid, ns.
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
-        limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
+        limit: mean dipole limit (A m^2) along each body axis, one number for all axes or an array (3,).
         areas: scaled areas (3,) of the body's faces, on which air and sunlight act.
         slew: parameters of slews, or None if the body approaches every attitude law without a slew.
         running: the slew in progress whose remaining part is replanned, or None if a new path is planned.
@@ -483,7 +483,7 @@ class PointingJob:
 
 
 def prepare() -> None:
-    """Import the modules that plan slews, which the worker process does before its first job."""
+    """Import the modules that plan slews, before the first job of the worker process."""
     from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process does not need scipy
 
 

@@ -213,7 +213,7 @@ def _riccati_numpy(
 
 @loop_helper
 def _product(one: FloatArray, other: FloatArray, columns: int) -> FloatArray:
-    """Return the product (columns, k) of the transposed first columns of `one` (m, n) with `other` (m, k)."""
+    """Return `one[:, :columns].T @ other` (columns, k) for matrices `one` (m, n) and `other` (m, k)."""
     result = np.zeros((columns, other.shape[1]))
     for m in range(len(one)):
         for i in range(columns):
@@ -340,7 +340,7 @@ class PathConditions:
         pressures: pressure vectors of air and sunlight, to which the torques are proportional.
         sizes: estimated components (9,) of the disturbance torques, N m.
         inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and the inverse of this tensor.
-        limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
+        limit: dipole limit (A m^2) along each body axis, one number for all axes or an array (3,).
     """
 
     wanted: AttitudeReferences

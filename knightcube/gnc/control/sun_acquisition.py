@@ -29,7 +29,7 @@ from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.estimation.error_state import check_amounts
 
 MEMORY = 2400.0
-"""Longest time (s) over which the Sun direction is propagated, which covers the longest eclipse of a low
+"""Longest time (s) over which the Sun direction is propagated, enough for the longest eclipse of a low
 orbit."""
 SMOOTHED, DRIFT = 10.0, 6.5e-4
 """Averaging time (s) of measured directions (first value), and gain (1/s^2) with which a direction error
@@ -170,7 +170,7 @@ class SunAcquisitionSettings:
     """Settings of Sun acquisition.
 
     The inertia tensor (3, 3), kg m^2, and the unit vector `axis` (3,) to align with the Sun are in body axes.
-    The dipole limit, A m^2, is equal for all axes or (3,).
+    The dipole limit, A m^2, is one number for all axes or an array (3,).
     """
 
     inertia: FloatArray
@@ -236,7 +236,7 @@ class SunAcquisition:
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a gyro rate (3,) rad/s and a field (3,) T, which is used only in pauses of the coils."""
+        """Accept a gyro rate (3,) rad/s and a field (3,) T; the field is used only in pauses of the coils."""
         if time_ns <= self._time_ns or not np.all(np.isfinite(np.concatenate([field, rate]))):
             return
         rate = rate - self._sun.bias
