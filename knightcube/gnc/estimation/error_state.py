@@ -51,7 +51,7 @@ class StateBlock:
 
 
 def slices(sizes: Mapping[str, int]) -> list[slice]:
-    """Return the slices of consecutive blocks whose numbers of elements are given by block name."""
+    """Return the slices of consecutive blocks with the given numbers of elements."""
     ends = np.cumsum(list(sizes.values())).tolist()
     return [slice(end - size, end) for end, size in zip(ends, sizes.values(), strict=True)]
 
@@ -207,8 +207,9 @@ _IDENTITY: FloatArray = np.eye(6)
 def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> FloatArray:
     """Return the initial covariance (n, n) if attitude and rate depend on the other states.
 
-    The derivatives of the errors of attitude and rate with respect to the states are `by_states` (6, n). The
-    matrix `first` (6, 6) is the covariance of attitude and rate if all other states are known exactly.
+    The array `by_states` (6, n) contains the derivatives of the errors of attitude and rate with respect to
+    the states. The matrix `first` (6, 6) is the covariance of attitude and rate if all other states are known
+    exactly.
     """
     whole = covariance.copy()
     whole[:6] = by_states @ covariance
@@ -272,8 +273,8 @@ _SHAPES = {"int": ((),), "float": ((),), "tuple[float, float]": ((2,),), "float 
 def check_amounts(settings: Any, *positive: str) -> None:
     """Raise ArgumentError unless the numbers in the fields of a dataclass are finite and not negative.
 
-    The fields named in `positive` must be above zero, and fields annotated as int must be whole numbers.
-    The fields that are checked contain one number, a pair of numbers, or either one or three numbers (3,).
+    The fields named in `positive` must be above zero, and fields annotated as int must be whole numbers. Each
+    checked field contains one number, a pair of numbers, or either one number or an array (3,).
     """
     for field in dataclasses.fields(settings):
         value, shapes = getattr(settings, field.name), _SHAPES.get(str(field.type))

@@ -159,7 +159,7 @@ class DirectionMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldMeasurement(_AtOneTime):
-    """A magnetic field (3,) T measured in body axes, which contains the magnetometer's bias.
+    """A magnetic field (3,), T, measured in body axes and including the magnetometer's bias.
 
     The field model gives the field `reference` (3,), T, in reference axes. The white noise of the measurement
     has the covariance `covariance` (3, 3), T^2, in body axes. The filter estimates the bias.

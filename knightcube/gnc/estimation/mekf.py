@@ -351,8 +351,8 @@ def _corrected_about_thread_numpy(
 ) -> _Corrected:
     """Return the result of `_corrected` for an innovation about the thread.
 
-    The innovation `value` of an angle or a rate, which changes with `speed`, has the variance `variance`. The
-    states 1, 4 and 7 are angle, rate and gyro bias about the suspension thread.
+    The innovation `value` of an angle or a rate with the time derivative `speed` has the variance `variance`.
+    The states 1, 4 and 7 are angle, rate and gyro bias about the suspension thread.
     """
     rows = np.zeros((1, len(covariance)))
     rows[0, [4, 7] if is_rate else 1] = 1.0

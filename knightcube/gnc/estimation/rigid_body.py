@@ -106,7 +106,7 @@ class RigidBody:
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         dipole_per_ampere: dipole moment per current of each coil (turns times area), m^2.
-        field: magnetic field (3,), T, in reference axes, which is the default field of a command.
+        field: magnetic field (3,), T, in reference axes; the default field of a command.
         suspended: whether the body hangs on the thread and rotates only about its y axis.
         stiffness: nominal torsion stiffness k of the thread, N m/rad.
         damping: nominal damping constant c of the thread, N m s/rad.
@@ -269,9 +269,9 @@ about a 24th of the squared rotation (rad^2) of a step."""
 _FASTEST = 10.0
 """Rate (rad/s) above which the propagation steps are not shortened further."""
 _UNKNOWN_FOR = 0.3
-"""Correlation time (s) of an unknown coil current, which gives the spectral density of an equivalent white
-noise. The correlation time exceeds the delay after which the guardian switches off the coils of a hung
-control loop."""
+"""Correlation time (s) of an unknown coil current, from which the spectral density of an equivalent white
+noise follows. The correlation time exceeds the delay after which the guardian switches off the coils of a
+hung control loop."""
 
 
 class ProcessNoise(NamedTuple):
@@ -299,9 +299,9 @@ def propagate(
 ) -> tuple[FilterState, FloatArray]:
     """Propagate over `duration` s under one coil command.
 
-    A step lasts at most `LONGEST_STEP` s, and the body rotates by at most `_LARGEST_ROTATION` in a step. At
-    rates above `_FASTEST`, which no body reaches, the rotation in a step is larger, so that the number of
-    steps is limited.
+    A step lasts at most `LONGEST_STEP` s, and the body rotates by at most `_LARGEST_ROTATION` in a step. To
+    limit the number of steps, the steps are not shortened further at rates above `_FASTEST`, which no body
+    reaches.
     """
     speed = min(math.hypot(*state.rate), _FASTEST)
     steps = math.ceil(duration * max(1.0 / LONGEST_STEP, speed / _LARGEST_ROTATION) - 1e-9) or 1
@@ -473,7 +473,7 @@ class RateChange(NamedTuple):
 def rate_change(
     body: RigidBody, state: FilterState, covariance: FloatArray, before: Torquing, after: Torquing
 ) -> RateChange:
-    """Return the angular acceleration at a gyro sample whose age is uncertain.
+    """Return the angular acceleration at the time of a gyro sample whose age is uncertain.
 
     The arguments `before` and `after` are the coil states half a standard deviation of the age before and
     after the sample. The two accelerations differ if a coil command begins or ends between their times. Half
@@ -550,7 +550,7 @@ _FLAT = 2e-6
 """Largest excess of a moment of inertia over the sum of the other two due to rounding, relative to the trace.
 """
 _NEGLIGIBLE = 1e-6
-"""Variance of a principal component of Q, as a fraction of the largest, below which it is omitted."""
+"""Variance below which a principal component of Q is omitted, as a fraction of the largest variance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -652,7 +652,7 @@ def _random_tensors(inertia: FloatArray, errors: BodyErrors, generator: np.rando
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return the arrays T (..., 3, 3, 3) of inertia tensors for which w'_i = T_ijk w_j w_k without torque."""
+    """Return T (..., 3, 3, 3) of inertia tensors, with w'_i = T_ijk w_j w_k if there is no torque."""
     crosses = cross_matrices(np.eye(3))
     return np.asarray(-np.einsum("...il,jlm,...mk->...ijk", np.linalg.inv(inertia), crosses, inertia))
 
@@ -709,7 +709,7 @@ def _whitening(count: int, independent: float, variance: float, walk: float) -> 
         count: number m of differences between bins.
         independent: variance of the independent errors of the differences.
         variance: variance of the rate of a bin, divided by the squared time between bins.
-        walk: increase per bin of the variance of the disturbance, which is a random walk.
+        walk: variance that the random walk of the disturbance adds per bin.
     """
     covariance = (independent + 2.0 * variance) * np.eye(count)
     covariance -= variance * (np.eye(count, k=1) + np.eye(count, k=-1))
