@@ -99,7 +99,7 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
 def _place(pixel: float, pixels: int, blocks: int) -> tuple[int, int, float]:
     """Return the indices of the two blocks around one pixel of a side, and the weight of the second block.
 
-    The side has `pixels` pixels, which are divided into `blocks`.
+    The side has `pixels` pixels, which are divided into `blocks` blocks of equal length.
     """
     size = pixels // blocks
     place = min(max((pixel - 0.5 * (size - 1)) / size, 0.0), blocks - 1.0)

@@ -87,7 +87,7 @@ class Moments:
     Attributes:
         flux: sum of the counts above the background in each region (n,).
         centre: centroid of each region (n, 2), x and y, px.
-        length: length of the uniform line that has the same second moments as each region (n,), px. The
+        length: length (n,), px, of the uniform line that has the same second moments as the region. The
             attribute `length` is about 0 for a round region.
         thickness: rms width of each region across its long axis (n,), px.
         direction: angle from the x axis to the long axis of each region (n,), rad.
@@ -507,7 +507,7 @@ LONGEST_LINE_TIME = 0.01
 
 
 def check_detector(settings: Any, kind: type[object]) -> None:
-    """Raise ArgumentError unless `settings` of the class `kind` describe a possible detector and lens.
+    """Raise ArgumentError if `settings`, of the class `kind`, do not describe a possible detector and lens.
 
     Gain, saturation and width of the point spread must be positive, and the line time must be short.
     """
@@ -534,10 +534,10 @@ def gain_in_counts(gain: float, unit: float) -> float:
 def raw_counts(image: Image) -> tuple[Image, float, float]:
     """Return an image (rows, columns) as unsigned integers, the unit of a count, and the value of 0 counts.
 
-    A pixel value is the value of 0 counts plus its counts times the unit. For whole numbers, the unit is 1,
-    and the value of 0 counts is 0 unless a pixel is negative or too large to be exact as a float32. Other
-    numbers are rounded to a sixteenth of their noise. Raises ArgumentError if the range of the pixels is
-    infinite.
+    A pixel value is the value of 0 counts plus the number of counts times the unit. For whole numbers, the
+    unit is 1, and the value of 0 counts is 0 unless a pixel is negative or too large to be exact as a
+    float32. Other numbers are rounded to a sixteenth of their noise. Raises ArgumentError if the range of the
+    pixels is infinite.
     """
     if image.dtype.kind == "u" and image.itemsize <= 2:
         return image, 1.0, 0.0
@@ -643,7 +643,7 @@ _MOST_BETWEEN = 0.01
 
 
 def in_steps(pixels: Image) -> tuple[Image, int, int]:
-    """Return `pixels` (rows, columns) divided by the step between their counts, the step, and the offset.
+    """Return `pixels` (rows, columns) divided by the step between counts, and this step and the offset.
 
     If the counts have no common step, the pixels are returned unchanged, with the step 1 and the offset 0.
     """

@@ -84,7 +84,7 @@ _KNOWN_PX = 0.3
 # Scatter (px, per axis) of identified points about their predictions above which defocus is possible.
 # Without defocus, the scatter is below 0.2 px (campaign `resting`).
 _SCATTERED_PX = 0.25
-# Standard deviation (px) of the boresight above which each star may have been detected as several points.
+# Standard deviation (px) of the boresight above which each star is possibly detected as several points.
 _UNCERTAIN_PX = 0.5
 # Minimum number of bins in a row and in a column.
 _LEAST_BINNED = 64
@@ -109,7 +109,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Interface of an alternative estimator of the motion from streaks, which must support pickling."""
+    """Interface of an alternative motion estimator for streaks, which must support pickling."""
 
     def motion(
         self,
@@ -149,7 +149,7 @@ class FrameJob:
         tracker: settings of the star identification. If `tracker` is None, stars are not identified.
         rate_prior, attitude_prior: predicted rate and attitude of the camera, or None if unknown.
         previous_checksum: checksum of the previous frame. Identical checksums indicate a frozen camera.
-        motion_first: whether the motion is always estimated, instead of only if a survey shows streaks.
+        motion_first: whether the motion is estimated even if a survey shows no streaks.
         objects: settings of the measurement of objects. If `objects` is None, objects are not measured.
         kept: folder in which the frame is saved on disk, or None if the frame is not saved.
         lens: lens parameters estimated from earlier frames, with which this frame is solved, together with
@@ -487,8 +487,8 @@ def binned_settings(settings: SolveSettings, size: int) -> SolveSettings:
 def _of_defocused_stars(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, bins: Bins) -> FrameSolution:
     """Return the attitude from a frame after binning.
 
-    Because the shape of a defocused star is unknown, all stars may have a common error, which is a fraction
-    of the bin size.
+    Because the shape of a defocused star is unknown, an error common to all stars is assumed, which is a
+    fraction of the bin size.
     """
     estimator, size, solve = job.estimator, bins.size, binned_settings(tracker.solve, bins.size)
     if isinstance(estimator, LikelihoodSettings):

@@ -65,7 +65,7 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 _DETERMINED = 0.5
 """Ratio of posterior to prior standard deviation below which a lens parameter counts as determined."""
 _MAX_EXCESS = 3.0
-"""Excess of chi-square (in its standard deviations) above which the star position errors are increased."""
+"""Excess of chi-square, in its standard deviations, above which star position errors are increased."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 """Prior standard deviations that fix omitted lens terms (px for the centre).
 

@@ -299,9 +299,9 @@ def matched_frame(
 ) -> MatchedFrame:
     """Return the identified stars of a solution as a matched frame.
 
-    The velocity (3,) of the camera, m/s, corrects aberration. With `shutter`, which is the line time of the
-    solution and its standard deviation, s, the matched frame includes the covariances of the positions and
-    the effect of the line time.
+    The velocity (3,) of the camera, m/s, corrects aberration. If `shutter` (the line time of the solution and
+    its standard deviation, s) is given, the matched frame includes the covariances of the positions and the
+    effect of the line time.
     """
     matched = solution.matched
     own, points = solution.covariance[matched], solution.points[matched]
@@ -494,7 +494,7 @@ class LensKnowledge:
     def restored(self, values: FloatArray, covariance: FloatArray, changed: float) -> LensKnowledge | None:
         """Return an estimate that starts from stored values (7,) of LEARNED and their covariance (7, 7).
 
-        Since the values were stored, each may have changed by the fraction `changed` of its configured
+        Since the values were stored, each has possibly changed by the fraction `changed` of its configured
         standard deviation. Returns None if a value differs from the configuration by more than five
         configured standard deviations, or if there are not seven values.
         """

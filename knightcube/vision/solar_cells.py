@@ -32,7 +32,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.errors import UsageError
 
 _MOST_STEPS, _FULL_STEPS = 30, 8
-"""Maximum number of Gauss-Newton steps, and number of first steps that may increase chi-square."""
+"""Maximum number of Gauss-Newton steps, and number of initial steps that may increase chi-square."""
 _SOFT = 0.05
 """Width of the range of the incidence angle's cosine in which the modelled current rises smoothly from zero.
 
@@ -64,9 +64,10 @@ class SolarStringModel:
         peaks: currents (n,) in full sunlight at normal incidence, A.
         sigma: standard deviation of a reading, as a fraction of the peak current, including departures from
             the cosine law.
-        albedo: mean illumination by an Earth that would fill half the sky, as a fraction of the Sun's.
+        albedo: mean illumination by an Earth that would fill half the sky, as a fraction of the illumination
+            by the Sun.
         albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
-        dark: fraction of its peak current below which a string counts as dark.
+        dark: fraction of the peak current below which a string counts as dark.
 
     Raises:
         UsageError: if a value is out of range.
@@ -122,7 +123,7 @@ class CoarseSun:
 def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArray | None = None) -> CoarseSun:
     """Return the Sun direction in body axes from the currents (n,) of the solar strings, A.
 
-    An error of ten degrees of the nadir direction (3,), body axes, has little effect. Raises ValueError if
+    The nadir direction (3,) is in body axes; an error of ten degrees has little effect. Raises ValueError if
     the currents are not n finite numbers, or if the nadir direction is not finite.
     """
     currents = np.asarray(currents, dtype=float)
@@ -251,7 +252,8 @@ class KnownDirections:
     Attributes:
         field: magnetic field vector (3,), T.
         sun, nadir: unit vectors (3,) to the Sun and to nadir.
-        light: illumination by an Earth that would fill half the sky, as a fraction of the Sun's.
+        light: illumination by an Earth that would fill half the sky, as a fraction of the illumination by the
+            Sun.
         light_sigma: standard deviation of `light`.
     """
 
@@ -361,8 +363,8 @@ class FieldAndStrings:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the chi-squares of the currents of the solar strings for t trial rotations.
 
-        The currents `shares` (n,) are divided by the peak currents of their strings. The first returned array
-        (t,) uses all strings, and each row of the second array (n, t) omits one string.
+        The values `shares` (n,) are the currents of the strings, divided by their peak currents. The first
+        returned array (t,) uses all strings, and each row of the second array (n, t) omits one string.
         """
         strings = self._strings
         sunlight, slopes = _sunlight(_rotated_about(base @ sky.sun, axis) @ strings.normals.T)

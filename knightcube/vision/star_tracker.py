@@ -273,10 +273,10 @@ class StarTracker:
             image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger.
                 Larger values are brighter. The luminance of a colour image (rows, columns, 3) is used; the
                 colours are red, green and blue, and a fourth channel of transparency is ignored.
-            exposure: exposure time, s. The exposure time is only needed to determine the rate from streaks,
-                and if a rate is predicted.
+            exposure: exposure time, s. The exposure time is needed only to determine the rate from streaks,
+                or if a rate is predicted.
             utc: date of the image, from 1900 to 2099. A date without a time zone is UTC. The date is used for
-                proper motion and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is
+                proper motion and for the aberration (at most 20.5") by the Earth's velocity. If `utc` is
                 None, the epoch of the index is used, without aberration.
             attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
                 predicted positions, which is faster than a search of the whole sky. If the search near the
@@ -420,7 +420,7 @@ def _priors(
 
 
 def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None:
-    """Raise InputError unless the field of view is 1 to 120 deg and its error is from 0 to below 120 deg."""
+    """Raise InputError unless the field of view is 1 to 120 deg and its error is 0 or more, below 120 deg."""
     if fov_deg is not None and not 1.0 <= real_number(fov_deg) <= 120.0:
         raise InputError("field of view", f"{fov_deg!r}: give 1 to 120 degrees across the columns")
     if error_deg is not None and not 0.0 <= real_number(error_deg) < 120.0:

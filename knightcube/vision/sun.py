@@ -164,7 +164,7 @@ class SunSolution:
         reason: short reason why no Sun was found. If the Sun was found, `reason` is empty.
         sun: the measurement, or None unless the status is FOUND or PARTIAL.
         pixels_read: number of pixels that were read.
-        candidates: the measured discs, one of which may be the Sun, if the status is AMBIGUOUS.
+        candidates: if the status is AMBIGUOUS, the measured discs, one of which is possibly the Sun.
     """
 
     status: SunStatus
@@ -635,12 +635,12 @@ _CONTRADICTED = 5.0
 
 @dataclass(frozen=True, slots=True)
 class CameraChoice:
-    """A camera, and whether it may have the Sun in its field of view.
+    """A camera, and whether the Sun is possibly in its field of view.
 
     Attributes:
         index: index of the camera among all cameras.
         likely: whether the coarse Sun direction is in the field of view.
-        possible: whether the Sun may be in the field of view, within three standard deviations.
+        possible: whether the Sun is possibly in the field of view, within three standard deviations.
         angle: angle between the boresight and the coarse Sun direction, rad.
     """
 

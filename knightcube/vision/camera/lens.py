@@ -148,7 +148,7 @@ class Pinhole:
 
 
 _MOST_STEPS, _LAST_STEP = 60, 1e-8
-"""Maximum number of Newton steps that invert the distortion, and step (tangent) that ends the iteration."""
+"""Maximum number of Newton steps that invert the distortion, and tangent step below which they end."""
 _NO_FOLD = 1e-12
 """Minimum denominator in the formula for the tangent at which the distortion folds the image back.
 
@@ -461,7 +461,7 @@ shear.
 
 @dataclass(frozen=True, slots=True)
 class DistortedPinhole(Pinhole):
-    """A pinhole camera with the image errors of a lens, which moves a point u of the ideal image to A d(u).
+    """A pinhole camera with the image errors of a lens: a point u of the ideal image moves to A d(u).
 
     Unlike a `Lens`, the camera has derivatives of the distortion, and images all directions in front of it.
     The distorted point is d(u) = u (1 + scale + cubic s + fourth s^2) + t(u), where u is the position
@@ -884,7 +884,7 @@ class Exposures:
     scale: float
 
     def at(self, rate: float) -> float:
-        """Return the exposure time, s, for an angular rate about axes normal to the boresight, rad/s."""
+        """Return the exposure time, s, for an angular `rate`, rad/s, about axes normal to the boresight."""
         speed = rate * self.scale
         if speed * self.usual < _POINT:
             return self.usual

@@ -229,7 +229,7 @@ def _refined_numpy(
     scale: float,
     free_scale: bool,
 ) -> _Refined:
-    """Return whether the fit converged, and the four attributes of the resulting `Refinement`."""
+    """Return a flag of convergence, and the four attributes of the resulting `Refinement`."""
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
     # A row contains a star's weighted prediction, residual and derivative with respect to ln scale.
@@ -694,7 +694,7 @@ def _fit_distorted_numpy(
     distortion: float,
     corner: float,
 ) -> _Distorted:
-    """Return whether the fit converged, matrix, scale, distortion, normal matrix and chi-squares (n,).
+    """Return a flag of convergence, matrix, scale, distortion, normal matrix and chi-squares (n,).
 
     Raises LinAlgError if the normal matrix is singular.
     """

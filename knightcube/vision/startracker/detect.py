@@ -244,7 +244,7 @@ def _is_hidden(place: IntArray, height: FloatArray, core: FloatArray, higher: In
 
 
 def _on_wings_numpy(place: IntArray, height: FloatArray, core: FloatArray) -> BoolArray:
-    """Return which peaks (p,) may be local maxima on the wings of a brighter star; the highest is first."""
+    """Return which peaks (p,), the highest first, may be local maxima on the wings of a brighter star."""
     x, y = place.T
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
     # Only peaks closer than 60 px are compared: at 60 px, the wings are a millionth of the peak.

@@ -5,7 +5,7 @@ star, which is the difference between observed and predicted unit vector, is res
 to the star and scaled to unit variance with the covariance of the position. The minimum of the sum of
 squares, found by a Gauss-Newton iteration, is the maximum likelihood estimate for Gaussian errors. A streak
 that overlaps another star has a wrong position. Streaks with wrong positions are found by means of Huber's
-weights, which limit the influence of each star, and are excluded.
+weights, which limit the influence of each star. These streaks are excluded.
 
 Tilt, decentring and distortion of the lens (the lens errors `bend`, see `sky_map`) are also fitted, with a
 prior from the calibration or from typical lenses. The covariance of the attitude includes the remaining
@@ -92,8 +92,8 @@ class ImageFit:
         delay: fitted error of the shutter's line time, in standard deviations.
         excess: chi-square per degree of freedom of the stars that agree with each other, for the measured
             variances of their positions; 1 unless it is significantly larger. Only attitude and scale are
-            counted as fitted parameters. With fitted lens errors also counted, a frame with few stars would
-            have too few degrees of freedom.
+            counted as fitted parameters. If fitted lens errors were also counted, a frame with few stars
+            would have too few degrees of freedom.
         agree: mask of the stars that were used for the attitude (n,).
     """
 
@@ -372,7 +372,7 @@ def _fitted_numpy(
     weight: FloatArray,
     steps: int,
 ) -> _Fitted:
-    """Return whether the fit converged, the matrix, the scale, lens errors and delay, and the covariance.
+    """Return a flag of convergence, the matrix, the scale, lens errors and delay, and the covariance.
 
     The fitted parameters are a rotation, ln scale if `free_scale` is true, some of the lens errors, and the
     delay if `late` is not empty. The array `held` contains the initial lens errors and delay, and `known`
@@ -712,7 +712,7 @@ def _surprise(seen: _Seen, pose: _FittedPose, agree: BoolArray, factor: float) -
 def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
-    Bright points that disagree with the fit given their own variances may agree given the larger variances.
+    Bright points that disagree with the fit at their own variances possibly agree at the larger variances.
     The common variance is estimated again with all points that agree. Excluded streaks remain excluded.
     """
     own = seen

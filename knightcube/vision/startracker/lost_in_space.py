@@ -186,7 +186,7 @@ def _look_up_numpy(
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
     begin, count, query, cells = begin[:kept], count[:kept], query[:kept], cells[:kept]
-    # Most of the time is spent on these indices; with int32 instead of int64, it is half as long.
+    # Most of the time is spent on these indices; int32 instead of int64 halves this time.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
     columns = np.ascontiguousarray(entries[entry]).view(np.uint8).reshape(-1, 4)
@@ -260,7 +260,7 @@ def _look_up(
     return *_matches(entry, query, entries, longest, corners, star_of), total
 
 
-# Maximum number of pairs of cells that contain both side ratios, in up to five cells each.
+# Maximum number of pairs of cells that contain both side ratios; each ratio is in up to five cells.
 _MOST_RUNS = 25
 
 
@@ -294,8 +294,8 @@ def _add_runs(
 ) -> int:
     """Write the ranges of entries that may contain triangles similar to an observed triangle.
 
-    The first two columns of `runs` are the index of the first entry and the index after the last. The columns
-    of `windows` are two entries that contain the lower and the upper limits of the longest side and of both
+    The first two columns of `runs` are the index of the first entry and the index after the last. The two
+    columns of `windows` are entries with the lower and with the upper limits of the longest side and of both
     positions. Returns the number of ranges.
     """
     cells, sizes, run_bits = layout[0], layout[1], layout[3]

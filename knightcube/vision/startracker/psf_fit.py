@@ -65,7 +65,7 @@ def cut(
     ceiling: float,
     trail: FloatArray | None = None,
 ) -> StarWindows:
-    """Return the windows of half-width `half` around the pixels `middle` (n, 2), which are inside the frame.
+    """Return the windows of half-width `half` around the pixels `middle` (n, 2) inside the frame.
 
     The level (n,) and noise (n,) of the sky in each window are in counts. A pixel with counts of `ceiling` or
     more is saturated and not used. The displacement of each star during the exposure is `trail` (n, 2), px.
@@ -139,7 +139,7 @@ class StarTargets:
     correlation: float
 
     def windows(self, half: int, middle: IntArray | None = None) -> StarWindows:
-        """Return the windows around all targets, or around `middle` (n, 2) instead."""
+        """Return the windows around all targets, or around `middle` (n, 2) if it is given."""
         about = self.middle if middle is None else middle
         return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
@@ -199,8 +199,8 @@ def nodes(trail: FloatArray) -> tuple[FloatArray, FloatArray]:
 def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | None = None) -> FloatArray:
     """Return the fraction of each star's flux in each pixel of its window (n, k, k), rows first.
 
-    The offset of each star (n, 2) is relative to the centre of the middle pixel, px, `sigma` is the standard
-    deviation of its PSF (n,), px, and `trail` is its displacement during the exposure (n, 2), px.
+    The `offset` (n, 2), px, of each star is relative to the centre of the middle pixel. The standard
+    deviation of its PSF is `sigma` (n,), px, and its displacement during the exposure is `trail` (n, 2), px.
     """
     out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))
     for shift, share in path(np.zeros_like(offset) if trail is None else trail):
@@ -729,7 +729,7 @@ def _model(values: FloatArray, shift: FloatArray, share: FloatArray, jacobian: F
 
 
 def _advance(values: FloatArray, step: FloatArray, half: int) -> None:
-    """Add `step` (n, p), limited to the maximum step, in place to the parameters `values` (n, 5)."""
+    """Add `step` (n, p) to the first p of the parameters `values` (n, 5), both limited to their ranges."""
     step[:, :2] = np.clip(step[:, :2], -_LONGEST_STEP, _LONGEST_STEP)
     if step.shape[1] > WIDTH:
         step[:, WIDTH] = np.clip(step[:, WIDTH], -_WIDEST_STEP, _WIDEST_STEP)

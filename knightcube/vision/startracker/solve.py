@@ -145,7 +145,7 @@ class Weighting:
 
 
 MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
-"""Weighting for points, which show the mean attitude over the exposure, by Simpson's rule."""
+"""Weighting by Simpson's rule for points, which show the mean attitude over the exposure."""
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
 """Weighting for streaks that are fitted with a constant rate, or of which only the ends are measured."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
@@ -202,7 +202,7 @@ SHAPE_DOUBT = 0.05
 _LEAST_SIGMA_PX = 0.005
 # Minimum position error (px) of a star due to its colour, if the accuracy of the lens is stated.
 _COLOUR_PX = 0.002
-# Significant chi-square per degree of freedom above which the positions contradict their uncertainties.
+# Excess chi-square (`ImageFit.excess`) above which the positions contradict their uncertainties.
 _CONTRADICTED = 1.5
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
 # The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
@@ -674,11 +674,11 @@ def _contradiction(seen: FrameSolution, chosen: IntArray, fit: ImageFit) -> str:
     """Return the reason to reject an attitude whose points have too large residuals, or an empty string.
 
     If the positions are wrong, for example because a defocused lens images stars as rings, only points that
-    are within the gate by chance match. If fewer than half of the points match, the matching points may be
-    only those that lie near stars by chance. The residuals of such chance matches do not show that the
-    positions are wrong. Only points down to the median brightness of the matching points are counted, because
-    faint points may be noise or stars that are not in the catalogue. The array `chosen` contains the indices
-    of the fitted points.
+    are within the gate by chance match. If fewer than half of the points match, the matching points are
+    possibly only those that lie near stars by chance. The residuals of such chance matches do not show that
+    the positions are wrong. Only points down to the median brightness of the matching points are counted,
+    because faint points may be noise or stars that are not in the catalogue. The array `chosen` contains the
+    indices of the fitted points.
     """
     agreeing = chosen[fit.agree]
     if seen.kind is not FrameKind.POINTS or fit.excess < _CONTRADICTED or not len(agreeing):

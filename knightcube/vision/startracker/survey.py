@@ -60,7 +60,7 @@ TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
 # Noise of a sum of pixels, relative to its value without correlation, below which correlation is neglected.
 _CORRELATED = 1.05
-# Length of the lower noise tail, divided by 2 sigma, below which noise counts as clipped at zero counts.
+# Ratio of the lower noise tail to 2 sigma, below which the noise is considered clipped at zero counts.
 _CUT_OFF = 0.8
 # Noise (counts) below which quantisation prevents a measurement of the noise.
 _HIDDEN = 0.5

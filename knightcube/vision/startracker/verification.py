@@ -186,7 +186,7 @@ _FEW_MISSED = 0.8
 # A larger fraction indicates a wrong fit of the lens: a foreground hides stars but does not displace them.
 # Radius of the search for nearby stars, as a fraction of the distance from image centre to corner.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Excess of log10 chance matches over the limit above which a candidate is rejected without refinement.
+# Excess of log10 of the number of chance matches over its limit, for rejection without refinement.
 _HOPELESS = 7.0
 
 
@@ -585,7 +585,7 @@ def _within(squared: FloatArray, nearest: IntArray, gate: float) -> tuple[IntArr
 
 @loop_helper
 def _stretch(direction: FloatArray, scale: float, seen: FloatArray) -> None:
-    """Write unit vectors with their tangents multiplied by `scale` to `seen` (n, 3)."""
+    """Write unit vectors, with their tangents multiplied by `scale`, to `seen` (n, 3)."""
     squared = scale * scale
     for k in range(len(direction)):
         z = direction[k, 2]
@@ -726,7 +726,8 @@ def _pair(
 def _widest_difference(seen: FloatArray, reach: float) -> float:
     """Return an upper bound on the difference between the tangents of two stars at most `reach` apart.
 
-    A gnomonic image is enlarged by at most 1 + t^2 between two stars, with the larger tangent t.
+    Between two stars, a gnomonic image is enlarged by at most 1 + t^2, where t is the larger of their
+    tangents.
     """
     lowest = 1.0
     for k in range(len(seen)):

@@ -16,10 +16,10 @@ distance from a star to the `rank`-th nearest of all brighter stars is called th
 contains a triangle if its longest side is at most the reach of each of its three stars. Each star of a
 triangle in the index is therefore one of the `rank` brightest stars in a circle that is centred on the star
 and has the longest side as its radius. Frames of any field of view, in dense and in sparse regions of the
-sky, therefore contain about the same number of triangles that are in the index. Near a cluster of bright
-stars, the reach of all stars is so short that there would be too few triangles. The sky is therefore also
-covered by circles of several radii, and the triangles of the `few` brightest stars of each circle are added
-to the index.
+sky, therefore contain about the same number of triangles of the index. Near a cluster of bright stars, the
+reach of all stars is so short that there would be too few triangles. The sky is therefore also covered by
+circles of several radii, and the triangles of the `few` brightest stars of each circle are added to the
+index.
 
 The sides of a triangle are chords of the unit sphere. The form of a triangle consists of the orientation
 (left or right) of its corners, ordered by the lengths of the opposite sides, and of the cells that contain
@@ -221,7 +221,7 @@ FINE = 256
 """Number of steps into which a cell is divided, for the stored side ratio of a triangle."""
 SIZES = 1 << 16
 OCTAVE = SIZES // 8
-"""Number of steps of a triangle's longest side per factor of two; `SIZES` steps end at the chord 1."""
+"""Number of steps of a triangle's longest side per factor of two; the chord 1 is step `SIZES`."""
 RUN_BITS = 10
 """Binary logarithm of the number of steps (see `SIZES`) in one interval of `TriangleIndex.below`."""
 # Number of boxes along each axis into which the cube around the unit sphere is divided for star searches.
@@ -333,7 +333,7 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
 
 
 def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, few: int) -> TriangleIndex:
-    """Return the index of the triangles of stars, whose unit vectors (n, 3) begin with the brightest star.
+    """Return the index of triangles of the stars with unit vectors `direction` (n, 3), the brightest first.
 
     Triangles are sorted by their longest side into b bands with the limits `sizes` (b + 1,), which are
     chords. A triangle is included only if, for each of its stars, the number of brighter stars closer than

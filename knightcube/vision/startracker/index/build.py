@@ -44,7 +44,7 @@ class IndexSettings:
             a triangle only if fewer than `density` brighter stars are within 2.5 deg of it. For larger
             triangles, the limit is higher, so that every octave of size has about the same number of
             triangles.
-        few: number of brightest stars per circle on the sky, whose triangles are always in the index.
+        few: number of brightest stars in each circle on the sky whose triangles are always in the index.
     """
 
     faintest: float = 8.5
