@@ -14,8 +14,8 @@ A dipole moment m causes the torque m x B, which has no component along the fiel
 For any scalar lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed,
 lambda is chosen so that the failed coil needs no current, which is possible unless the axis of the failed
 coil is normal to the field. If the coils cannot produce a requested torque, the function `allocate` projects
-the torque onto the space of torques that they can produce. If a current exceeds its limit, all currents are
-scaled by one factor, which preserves the direction of the torque (the idea of CMU's Argus flight software).
+the torque onto the space of torques that they can produce. If a current exceeds its limit, one factor scales
+all currents. This preserves the direction of the torque (the idea of CMU's Argus flight software).
 """
 
 from __future__ import annotations

@@ -411,10 +411,9 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Durations and steps of tables for targets without an end (first value), and for a passing object (second
-value)."""
+"""Spans of tables for targets of unlimited duration (first value) and for a passing object (second value)."""
 _COVERED = 1.25
-"""Minimum length of the prediction for a target without an end, in revolutions of the orbit."""
+"""Minimum length of the prediction for a target of unlimited duration, in revolutions of the orbit."""
 _LONGEST = 10_000.0
 """Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0
