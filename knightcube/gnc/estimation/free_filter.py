@@ -1,11 +1,11 @@
 """The navigation filter of a free satellite whose mass properties and sensor errors are not exactly known.
 
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
-gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. In
-contrast to `attitude_filter`, which replays each late sample at its time, a late attitude is propagated to
-the present with the present rate, whose error is included in the innovation. The propagated attitude is
-accurate for some seconds if the body rotates slowly enough for star images. Besides attitude and rate, the
-error state (see `error_state`) contains these blocks:
+gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
+filter does not replay late samples, unlike `attitude_filter`: a late attitude is propagated to the present
+with the present rate, and the innovation includes the error of this rate. The propagated attitude is accurate
+for some seconds if the body rotates slowly enough for star images. Besides attitude and rate, the error state
+(see `error_state`) contains these blocks:
 
 - `inertia`: errors of the inertia tensor, relative to the trace, in which Euler's equation is linear. In a
   tumble about more than one axis, the ratios of the moments of inertia and the principal axes are observable
@@ -17,13 +17,13 @@ error state (see `error_state`) contains these blocks:
 
 - `camera`: misalignment of the star camera, whose attitude is known better than the attitude of the body.
 
-- `horizon`: misalignment of the horizon cameras that measure nadir. When the body rotates, other cameras are
-  used, so this block is a Gauss-Markov process with a long correlation time.
+- `horizon`: misalignment of the horizon cameras that measure nadir. When the body rotates, different cameras
+  measure nadir, so this block is a Gauss-Markov process with a long correlation time.
 
 - `sun_camera`: misalignment of the horizon camera that measures the Sun, reset if another camera measures it.
 
-- `coil_variation`: relative variation of the dipole along each body axis, for example because the supply
-  voltage varies, as a Gauss-Markov process with a correlation time of tens of seconds.
+- `coil_variation`: relative variation of the dipole along each body axis, for example with the supply
+  voltage, as a Gauss-Markov process with a correlation time of tens of seconds.
 
 - `field_error`: error of the field model, correlated over minutes, as a Gauss-Markov process of first order
   in body axes. While the attitude is known accurately, its standard deviation is estimated by expectation
@@ -155,7 +155,7 @@ class FreeMotion:
     def __init__(self, inertia: FloatArray) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        Raises ArgumentError for an impossible tensor, with which a body in a tumble is predicted wrongly.
+        Raises ArgumentError for a physically impossible tensor.
         """
         self._assumed: FloatArray = checked_inertia("inertia", inertia)
         self.trace = float(np.trace(self._assumed))
@@ -196,8 +196,8 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s), for the equivalent white noise, of uncertain coil dipoles and of field errors of a
-body at rest."""
+"""Correlation time (s) of uncertain coil dipoles and of field errors of a body at rest, used for the
+equivalent white noise."""
 CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
@@ -290,7 +290,7 @@ def _matrix_errors(scale: float, alignment: float) -> FloatArray:
 LARGEST_ROTATION = 0.1
 """Largest rotation (rad) of the body in one integration step."""
 FINE, COARSE = math.radians(0.1), math.radians(5.0)
-"""Largest standard deviations (rad), about the least certain axis, of an attitude of the two classes."""
+"""Largest standard deviations (rad) of a FINE and of a COARSE attitude about the least certain axis."""
 RATE_START = 1e-3
 """Initial standard deviation (rad/s) of a rate that the gyro measured."""
 TORQUE_NOISE = 1e-9
@@ -310,8 +310,8 @@ INERTIA_WALK = 5e-5
 random walk represents flexible parts, which are loaded only while the body rotates, and prevents the
 uncertainty of the inertia from becoming too small."""
 MINIMUM_FIELD_ERROR = 1e-8
-"""Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
-of the magnetometer's errors."""
+"""Minimum standard deviation (T per axis) of the field model's error. The error also represents slow
+variations of the magnetometer's errors."""
 CURRENTS = 1e-7
 """Standard deviation (T per axis) of the magnetic field of auroral currents. The standard deviation of
 auroral fields is added to the measurement noise, so that field measurements in auroral zones pass the
@@ -359,7 +359,7 @@ class FreeFilter:
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
         sun_cameras: bit mask of the cameras that measured the Sun most recently; 0 if none has measured it.
-        changes: number of changes of the estimate until now.
+        changes: number of changes of the estimate so far.
         refused: number of measurements that did not pass the gate.
         newest_square: normalised square of the newest innovation.
     """
@@ -380,7 +380,7 @@ class FreeFilter:
         self.driven: FloatArray = np.zeros(3)
         # `_slope` is the derivative of the angular acceleration with respect to the states.
         self._slope: FloatArray = np.zeros((3, STATES))
-        # `_lag` (rad) is the integral of the present rate minus the past rate.
+        # `_lag` (rad) is the integral of the difference between the present and the past rate.
         self._lag: FloatArray = np.zeros(3)
         # `_given` (A m^2 s^2) is the integral of the commanded dipole times the time since `begin_mean`.
         self._given: FloatArray = np.zeros(3)
@@ -490,9 +490,9 @@ class FreeFilter:
         The coil has the unit vector `direction` (3,) in body axes; the vector `dual` (3,) is normal to the
         other coils and has the scalar product 1 with `direction`. The estimate and its copies `memories` are
         changed. The reset is necessary after the sign or the gain of the coil was corrected, because the
-        estimated matrix refers to the dipole before the correction. The error of the corrected dipole becomes
-        zero, and its correlations with other states are deleted. The settings give the new relative standard
-        deviation of the corrected dipole, which along the coil is at least `deviation`.
+        estimated matrix refers to the dipole before the correction. The error of the corrected dipole is set
+        to zero, and its correlations with other states are deleted. The settings give the new relative
+        standard deviation of the corrected dipole; the component along the coil is at least `deviation`.
         """
         self.changes += 1
         kept = np.eye(STATES)
@@ -572,9 +572,9 @@ class FreeFilter:
         row by row. The entry `camera` (3,), rad, is the rotation vector of the star camera's misalignment.
         The entries `dipole` and `sunlit_dipole` (3,), A m^2, are the residual dipole in shadow and its
         increase in sunlight. The name of each standard deviation ends with `_sigma`. The entry
-        `camera_attitude_sigma` (3,), rad, is the standard deviation of the attitude of the star camera, which
-        is smaller than the standard deviation of the attitude of the body. The standard deviations of inertia
-        and coils relative to the trace (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
+        `camera_attitude_sigma` (3,), rad, is the standard deviation of the attitude of the star camera, and
+        is smaller than that of the body. The standard deviations of inertia and coils relative to the trace
+        (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
         """
         self.motion.correct(self._constants[INERTIA])
         sigma = np.sqrt(self.covariance.diagonal())
@@ -594,7 +594,7 @@ class FreeFilter:
             found |= {name: self._constants[at].copy(), f"{name}_sigma": sigma[at]}
         rows = per_trace(found["inertia"] / self.motion.trace, found["coils"])
         variances = (rows @ self.covariance[_BODY, _BODY] @ rows.T).diagonal()
-        # Rounding can make the variance of a known ratio negative.
+        # A known ratio has zero variance, which rounding can make negative.
         ratios = np.sqrt(np.maximum(variances, 0.0))
         return found | {
             "camera_attitude_sigma": np.sqrt(self.camera_covariance.diagonal()),
@@ -639,7 +639,7 @@ class FreeFilter:
         self._lag, self._given, self._since = np.zeros(3), np.zeros(3), 0.0
 
     def impulse(self, since: float) -> FloatArray:
-        """Return the time integral (3,), A m^2 s, of the dipole until now, averaged over the start times.
+        """Return the integral (3,), A m^2 s, of the dipole until now, averaged over its start times.
 
         The start times cover the averaging interval of the gyro samples, whose middle is `since` s ago.
         """
@@ -652,8 +652,8 @@ class FreeFilter:
     ) -> bool:
         """Apply a gyro rate (3,), rad/s, with covariance (3, 3), and return whether the rate passed the gate.
 
-        If the gyro rate is an average over an interval, `change` (3,), rad/s, is the change of the rate since
-        the middle of the interval, `since` s ago, at the acceleration of the last step. The averaged rate is
+        If the gyro rate is an average over an interval whose middle is `since` s ago, `change` (3,), rad/s,
+        is the change of the rate since that middle at the acceleration of the last step. The averaged rate is
         corrected for the change of the acceleration since `begin_mean`.
         """
         check_measured(covariance, rate=rate)
@@ -755,7 +755,7 @@ class FreeFilter:
         self._decay(FIELD, dt / FIELD_MEMORY, max(self.field_error, least) ** 2 * _EYE)
 
     def _decay(self, at: slice, part: float, prior: FloatArray) -> None:
-        """Propagate a Gauss-Markov process of covariance `prior` (3, 3) by `part` of its correlation time."""
+        """Propagate a Gauss-Markov process of stationary covariance `prior` for `part` correlation times."""
         kept = math.exp(-part)
         self._constants[at] *= kept
         self.covariance[at] *= kept
@@ -802,11 +802,11 @@ class FreeFilter:
         self._decay(VARIATION, dt / COIL_MEMORY, self.layout.prior[VARIATION, VARIATION])
 
     def _curvature(self, by_inertia: FloatArray) -> FloatArray:
-        """Return the noise density (3, 3), rad^2/s^3, of second order in the error of the inertia.
+        """Return the density (3, 3), rad^2/s^3, of the noise that is quadratic in the error of the inertia.
 
         The derivative of the acceleration with respect to the error is `by_inertia` (3, 6). Without this
-        noise, which represents neglected terms of second order, the first seconds of a fast tumble make the
-        uncertainty of an unknown inertia too small.
+        noise, which represents neglected second-order terms, the uncertainty of an unknown inertia would
+        become too small in the first seconds of a fast tumble.
         """
         spread = self.covariance[INERTIA, INERTIA]
         relative = _inertia_variance(spread, self.motion)
@@ -845,7 +845,7 @@ class FreeFilter:
                 density = density + LASTING * doubt**2 * relative * mean_square * _EYE
         if square:
             across = motion.inverse @ cross_matrix(dipole)
-            # While the body rotates, the two components of the field error across the rate average out.
+            # While the body rotates, the two components of the field error normal to the rate average out.
             rotated = 1.0 + 0.25 * LASTING**2 * float(at.rate @ at.rate)
             density = density + LASTING * (1.0 + 2.0 / rotated) / 3.0 * error**2 * (across @ across.T)
         return np.asarray(density)
@@ -875,8 +875,8 @@ class FreeFilter:
 BODY: IntArray = np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA]
 BODY_NAMES, ALL_NAMES = "inertia, dipole and torques", "coils, inertia, dipole and torques"
 LEARNED = {BODY_NAMES: BODY, ALL_NAMES: np.r_[BODY, COILS]}
-"""Indices of the estimated states that the motion can contradict, by their names: without coil currents the
-states of the body (`BODY_NAMES`), and with coil currents also those of the coils (`ALL_NAMES`)."""
+"""Indices of the estimated states that the motion can contradict: without coil currents the states of the
+body (`BODY_NAMES`), with coil currents also the states of the coils (`ALL_NAMES`)."""
 # Inertia, dipoles and torques have a common scale: doubling all these states does not change the motion.
 _SCALED: FloatArray = np.zeros(STATES)
 _SCALED[LEARNED[ALL_NAMES]] = 1.0

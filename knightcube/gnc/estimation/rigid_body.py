@@ -665,7 +665,7 @@ def _folded(quadratic: FloatArray) -> FloatArray:
 
 
 def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
-    """Return the Jacobian (15, 15) of inertia and coil matrix, both divided by the trace of the inertia.
+    """Return the Jacobian (15, 15) of inertia and coil matrix, each divided by the trace of the inertia.
 
     The array `inertia` (6,) contains the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
     assumed inertia. The array `coils` (9,) contains the matrix of the coils row by row. Only the ratios of
