@@ -1,18 +1,18 @@
 """Job of the worker process `wide`: Sun and nadir in body axes from the images of the horizon cameras.
 
-The currents of the solar strings (strings of solar cells) determine which camera is read first. If no camera
-finds the Sun, the Sun direction is computed from these currents. The nadir direction is fitted to the limbs
-in all images at once. If no image shows a limb, the brightness of all images gives a coarse nadir direction,
-because the Earth may fill one camera while the others are dark. The modules of the estimators are imported at
-their first use, because the control process does not need them.
+The currents of the solar strings (strings of solar cells) determine in which image the Sun is searched first.
+If no camera finds the Sun, the Sun direction is computed from these currents. The nadir direction is fitted
+to the limbs in all images at once. If no image shows a limb, the brightness of all images gives a coarse
+nadir direction, because the Earth may fill one camera while the others are dark. The modules of the
+estimators are imported at their first use, because the control process does not need them.
 
-The spacecraft's own structure is masked in the images. A mask is configured (polygons or an image file), or
-is estimated from successive frames. While the limb moves over the image, the brightness of the scene changes
-repeatedly, whereas the brightness of the structure stays constant. `StructureMap` compares the mean
-brightness of square blocks of pixels with that in the last counted frame. A frame is counted if a quarter of
-its blocks have changed. A block whose brightness did not change in `_QUIET_FRAMES` successive counted frames
-shows the spacecraft. A block whose brightness changes is at once removed from the mask, so that a wrong mask
-does not hide a limb.
+The spacecraft's own structure is masked in the images. The mask consists of configured structure (polygons and
+an image file) and of structure estimated from successive frames. While the limb moves over the image, the
+brightness of the scene changes repeatedly, whereas the brightness of the structure stays constant.
+`StructureMap` compares the mean brightness of square blocks of pixels with that in the last counted frame. A
+frame is counted if at least a quarter of its blocks have changed. A block whose brightness did not change in
+`_QUIET_FRAMES` successive counted frames shows the spacecraft. If the brightness of an estimated block
+changes, the block is at once removed from the mask, so that a wrong mask does not hide a limb.
 """
 
 from __future__ import annotations
@@ -69,13 +69,14 @@ def polygon_mask(rows: int, columns: int, polygons: Sequence[Sequence[tuple[floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StructureMap:
-    """Blocks of one camera's images that show the spacecraft, by configuration or by estimation from frames.
+    """Blocks of one camera's images that show the spacecraft, as configured or as estimated from frames.
 
     Attributes:
         rows, columns: number of pixels of the images.
         configured: mask (m, n) of the blocks that contain spacecraft structure according to the
             configuration.
-        level: mean brightness of the blocks in the last counted frame (m, n); (0, 0) before the first frame.
+        level: mean brightness of the blocks in the last counted frame (m, n); an empty array before the first
+            frame.
         quiet: number of counted frames since the last change of each block (m, n).
     """
 
@@ -87,7 +88,7 @@ class StructureMap:
 
     @classmethod
     def of(cls, configured: BoolArray) -> StructureMap:
-        """Return a map with only the structure in the configured mask `configured` (rows, columns)."""
+        """Return a map that contains only the structure in the mask `configured` (rows, columns)."""
         blocks = np.asarray(_blocks(configured.astype(float)) > 0.0)
         rows, columns = configured.shape
         return cls(rows, columns, blocks, np.zeros((0, 0)), np.zeros(blocks.shape, dtype=np.int64))

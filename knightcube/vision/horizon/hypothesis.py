@@ -58,7 +58,7 @@ _FINE = SCALE_HEIGHT / 6.0
 _CORRELATED = 10.0
 """Correlation length (px), along the limb, of the brightness of the ground behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
-"""Standard deviation (px) of the blur by the averaging of light over a square pixel."""
+"""Standard deviation (px) of the blur due to the averaging of light over a square pixel."""
 _LEAST_SPREAD = 0.03
 """Minimum assumed standard deviation (px) of a limb position that is fitted to a brightness profile."""
 _OTHER_AIR = 500.0
@@ -146,15 +146,15 @@ _ROUND = 0.1
 """Assumed radius of curvature of coasts and other lines that are not a limb, as a fraction of the image size.
 """
 _BESIDE = 0.05
-"""Distance from the limb, as a fraction of the image size, within which edges that are not on it are counted.
+"""Distance from the limb within which edges beside the limb are counted, as a fraction of the image size.
 
-Their number determines the density of chance edges.
+The number of edges beside the limb determines the density of chance edges.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class LimbInView:
-    """Length (px) of the part of a limb in an image that should show edges, and crossings with scan lines.
+    """Length (px) of the part of a limb that should show edges in an image, and crossings with scan lines.
 
     The scan lines cross that part `crossings` times, and the whole limb in the image `all_crossings` times.
     """
@@ -249,7 +249,8 @@ class Hypothesis:
         coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 without a sunlit limb.
         night: fraction of the edges on the fitted limb at which the Sun's elevation is below `_NIGHT`.
         allowance: standard deviation of the nadir per axis, rad, due to unmodelled effects.
-        chance: log10 of the expected number of horizons that fit equally well by chance, from `log10_chance`.
+        chance: log10 of the expected number of horizons that fit equally well by chance and agree with the
+            known directions.
         breadth: ratio of the median width of the edges on the horizon to the width expected from the
             brightness profile of the atmosphere.
         not_space: why the image beyond the horizon is not space, or an empty string if it may be space.
@@ -357,7 +358,7 @@ def _night_share(view: LimbView, rays: FloatArray, sun: FloatArray | None) -> fl
 def _altitude_off(
     fit: FittedLimb, limb: LimbPoints, prior: Prior, altitudes: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the distance (sigma) of the implied altitude from prior knowledge, and the altitude, m.
+    """Return the distance (sigma) of the implied altitude from prior knowledge, and the implied altitude, m.
 
     A known altitude is compared with the altitude of a fit in which the altitude is unknown. If no altitude
     is known, the fitted altitude is compared with the range `altitudes`, m.

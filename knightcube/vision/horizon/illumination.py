@@ -1,4 +1,4 @@
-"""Comparison of images with the brightness predicted for an assumed view of the Earth, and a coarse nadir.
+"""Comparison of images with the predicted brightness of the Earth, and estimate of a coarse nadir.
 
 If the assumed view of the Earth is correct, the whole image agrees with it: sky and night side are dark, and
 the sunlit limb has edges along its entire length. A view that was fitted to the terminator instead of the
@@ -225,7 +225,7 @@ class CoarseNadir:
     """An estimated nadir (3,) in body axes, with an uncertainty of several degrees.
 
     The covariance (3, 3), rad^2, is zero along the nadir direction. The attribute `explained` is the mean
-    probability that the most likely nadir gives the samples their brightness.
+    probability of the observed brightness of the samples, given the most likely nadir.
     """
 
     direction: FloatArray
@@ -341,7 +341,7 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle (rad) from the limb within which the atmosphere or an attitude error of 1 deg may change a sample."""
+"""Angle (rad) from the limb within which samples are not used: margin for atmosphere and attitude error."""
 _DAY = DAYLIGHT + math.radians(12.0)
 """Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)

@@ -430,10 +430,10 @@ _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
     """Return the brightness of air and ground at tangent heights, and their derivatives, 1/m, as (4, n, k).
 
-    The unit of the brightness is sunlit air of infinite optical depth for air, and ground without an
-    atmosphere for ground. The k heights along each of n scan lines are (n, k), m, and the Gaussian blur of
-    each scan line is (n,), m. The blur is rounded to the nearest blur of the table; neighbouring blurs of the
-    table differ by 8 %.
+    Sunlit air of infinite optical depth has the brightness 1, and so has ground without an atmosphere above
+    it. The `heights` (n, k), m, are k tangent heights along each of n scan lines. The `blur` (n,), m, is the
+    standard deviation of a Gaussian for each scan line. It is rounded to the nearest blur of the table;
+    neighbouring blurs of the table differ by 8 %.
     """
     table = _limb_table()
     width = np.log(np.clip(blur, _SHARPEST, _BROADEST) / _SHARPEST) / math.log(_BROADEST / _SHARPEST)
@@ -563,7 +563,7 @@ _BLUR_LINES = 32
 
 
 def blur_factor(profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray) -> float:
-    """Return the factor by which the brightness profiles are more blurred than the stated `blur` (n,), m.
+    """Return the ratio of the blur of the brightness profiles to the stated `blur` (n,), m.
 
     A defocused image would displace the limb by about the excess width of its blur. The factor with the
     smallest median misfit is used if the misfit is clearly smaller than that of the stated blur; otherwise

@@ -80,7 +80,7 @@ class HorizonStatus(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NadirMeasurement:
-    """The direction to the Earth's centre from one horizon.
+    """The direction to the Earth's centre, measured from one horizon.
 
     Attributes:
         direction: unit vector (3,) towards the Earth's centre (geocentric nadir), camera axes.
@@ -240,7 +240,7 @@ def _find(
 ) -> HorizonSolution:
     """Return the result of `find_nadir`.
 
-    The reason of a refusal is determined only if this search is the last search of the image (`is_last`).
+    The reason for a refusal is determined only if this search is the last search of the image (`is_last`).
     """
     search = _search(image, knowledge, settings, is_last=False)
     found = search.solution()
@@ -394,7 +394,8 @@ def _by_field(
         # Only edges whose distance from the horizon is known for all focal lengths are compared.
         squares = np.minimum(squares[:, ~np.isnan(squares).any(axis=0)], _OFF)
         loss = squares.sum(axis=1)
-        # Ground and clouds raise the misfit and the correlation of the best fit, which divide all misfits.
+        # All misfits are divided by the misfit and the correlation of the best fit, which ground and clouds
+        # raise.
         best_fit = int(np.argmin(loss))
         on = squares[best_fit] < _OFF
         mean = float(squares[best_fit][on].sum()) / max(int(np.count_nonzero(on)), 1)
@@ -717,7 +718,7 @@ def nadir_of_cameras(
     votes = [vote for number, solution in each.items() for vote in _votes(number, solution, cameras[number])]
     group, rival = _agreed(votes)
     if rival or not group:
-        # The reasons of refusals are determined only here, because they are needed only without a nadir.
+        # The reasons for refusals are determined only here, because they are needed only without a nadir.
         each = {n: found if found.nadir is not None else searched(n, knowledge) for n, found in each.items()}
         status, reason = (HorizonStatus.AMBIGUOUS, rival) if rival else _why_none(each)
         return JointNadir(status, reason, None, (), each)
