@@ -22,7 +22,7 @@ SHAPE_ERROR = 0.1
 _RIDGE = 1e-10
 # Gradient, relative to the largest right-hand side, below which a brightness remains zero.
 _OPTIMAL = 1e-12
-# Maximum number of iterations of the fit for each brightness.
+# Maximum number of iterations of the fit, divided by the number of brightnesses.
 _ITERATIONS = 30
 
 

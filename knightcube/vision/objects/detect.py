@@ -643,10 +643,10 @@ class Judge:
     def _located(
         self, ends: FloatArray, light: StarLight, stars: Sequence[FloatArray], improvement: float
     ) -> tuple[LocatedEnds, StarLight, Explanation] | None:
-        """Return located ends of an object, model of stars, and fit of stars and object, or None.
+        """Return the located ends of an object, the model of the stars and the fit with the object, or None.
 
-        Returns None also for uncertain ends and for ends at the border of the image, because they do not show
-        whether the object moves like a star.
+        Returns None also for uncertain ends and for ends at the border of the image, because such ends do not
+        show whether the object moves like a star.
         """
         best = None
         for among_stars in (True, False):

@@ -1,9 +1,9 @@
 """Directions of possible objects in an image whose attitude is determined from the stars.
 
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
-object is also a point or a short streak. Possible objects are then areas of light away from all catalogue
-stars that are significantly above the noise, and light beside a star that is not part of the star's image. A
-tracker over several images determines which possible objects move relative to the stars.
+object is also a point or a short streak. Possible objects are then areas of light that are significantly
+above the noise and away from all catalogue stars, and light beside a star that is not part of the star's
+image. A tracker over several images determines which possible objects move relative to the stars.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration
@@ -163,7 +163,7 @@ def _fit_object(
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
 """Largest ratio of the fitted flux of a star to the flux predicted from the catalogue."""
 _LEAST_SHARE = 0.15
-"""Minimum ratio of an object's flux to adjacent stars, whose modelled images have errors of about 10 %."""
+"""Minimum ratio of an object's flux to that of adjacent stars, whose modelled images have errors of 10 %."""
 _APART = 1.0
 """Minimum distance (px) of an object from the nearest star; closer light may be the second star of a pair."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
@@ -210,7 +210,7 @@ class FramePatches:
 
     def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # The noise is computed from differences of neighbouring pixels, which contain few faint stars.
+        # The noise is computed from differences of neighbouring pixels, which faint stars hardly affect.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
@@ -227,9 +227,9 @@ class FramePatches:
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
         """Return an object whose light is merged with the light of known stars, or None if there is none.
 
-        The fit of the object starts at the brightest pixel after the stars are subtracted. The area of light
-        has its centre at `point` (2,), px, and the given `length`, px. The flux of the object is at least
-        `significance` standard deviations of its error.
+        The fit of the object starts at the pixel that is brightest after subtraction of the stars. The area
+        of light has its centre at `point` (2,), px, and the given `length`, px. The flux of the object is at
+        least `significance` times its standard deviation.
         """
         patch = self._patch(point, 0.5 * length + _patch_reach(np.zeros(2), self._psf))
         if patch is None:

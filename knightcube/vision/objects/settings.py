@@ -86,8 +86,8 @@ class ObjectSettings:
         most_corners: number of corners (peaks of the Harris response) above which a region is not examined.
         point_significance: minimum flux of a short region, in standard deviations of its noise.
         improvement: minimum decrease of chi-square when an object is added to a model of stars.
-        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars, larger
-            than `improvement` because many lines are tested.
+        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars. It is
+            larger than `improvement`, because many lines are tested.
         worst_fit: largest chi-square per pixel along the streak of an accepted object.
         streak_sigma: standard deviation, per axis, of the midpoint of a streak that is too short to locate
             its ends, px.

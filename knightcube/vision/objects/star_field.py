@@ -94,7 +94,7 @@ class StarField:
     def _fitted(
         self, found: FieldPoints, candidates: IntArray, predicted: FloatArray, sigma: float
     ) -> tuple[AttitudeFix | None, tuple[IntArray, IntArray]]:
-        """Return the attitude from the points that are stars, and the indices of these points and stars."""
+        """Return the attitude fitted to the points that match stars, and the indices of points and stars."""
         quaternion, fix = predicted, None
         none = np.zeros(0, dtype=np.int64)
         pairs = none, none

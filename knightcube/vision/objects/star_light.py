@@ -51,7 +51,7 @@ _ROUNDS = 8
 # Distance (px) beyond the assumed ends over which light is followed: minimum if an end may be far away, and
 # value if both ends are near.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
-# Difference (px) between assumed and measured end of the light above which the fit uses the measured end.
+# Distance (px) between assumed and measured end of the light above which the fit starts at the measured end.
 _FOLLOWED = 1.5
 # Maximum number of Gauss-Newton steps of a fit of the ends, and step (px) below which it has converged.
 _END_FITS, _END_CONVERGED = 3, 0.05
@@ -345,7 +345,7 @@ class StarLight:
         return self.chi_square - self.expected + outside
 
     def _with_line(self, line: FloatArray) -> tuple[FloatArray, float]:
-        """Return brightnesses (k + 1,) of k stars and an object of image `line` (p,), and chi-square."""
+        """Return brightnesses (k + 1,) of k stars and an object with image `line` (p,), and chi-square."""
         sums = equations_with(self._stars, self._target, self._sums, line)
         brightness, chi_square = brightnesses(sums[:-1], sums[-1], self._power)
         # Only rounding errors can make chi-square larger than without the object.
@@ -364,7 +364,7 @@ def region_along(segmented: Segmented, ends: FloatArray) -> int:
 
 
 def _labels_along(segmented: Segmented, ends: FloatArray) -> IntArray:
-    """Return the labels (m,) of the regions at points on the line between two ends (2, 2), px, or 0."""
+    """Return the labels (m,) of the regions, or 0, at points on the line between two ends (2, 2), px."""
     labels = segmented.regions.labels
     column, row = np.clip(np.rint(straight_path(ends)), 0, np.array(labels.shape[::-1]) - 1).T.astype(int)
     return np.asarray(labels[row, column])
@@ -477,7 +477,7 @@ def _light_along_numpy(
     tangent = np.gradient(curve, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
     near = np.rint(place).astype(np.int64)
-    # The nearest point of a curve that is not straight is found in a second step.
+    # If the curve is not straight, a second step finds the nearest point.
     ahead = np.sum((pixels - curve[near]) * tangent[near], axis=1)
     near = np.clip(near + np.rint(ahead).astype(np.int64), 0, len(curve) - 1)
     away = pixels - curve[near]
@@ -513,7 +513,7 @@ def _light_along(
     for p in range(len(pixels)):
         k = min(max(int(np.rint(places[p])), 0), m - 1)
         ahead = (pixels[p, 0] - curve[k, 0]) * tangent[k, 0] + (pixels[p, 1] - curve[k, 1]) * tangent[k, 1]
-        # The nearest point of a curve that is not straight is found in a second step.
+        # If the curve is not straight, a second step finds the nearest point.
         k = min(max(k + int(np.rint(ahead)), 0), m - 1)
         x, y = pixels[p, 0] - curve[k, 0], pixels[p, 1] - curve[k, 1]
         if abs(x * tangent[k, 0] + y * tangent[k, 1]) <= 1.0:
@@ -550,7 +550,7 @@ def _trial_starts_numpy(
 def _trial_starts(
     corners: FloatArray, middle: FloatArray, length: int, per_length: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return one point (n, 2), px, of each trial star path, and the fraction of the path at the point (n,).
+    """Return one point (n, 2), px, on the arc of each trial star path, and its fraction of the path (n,).
 
     One path begins and one path ends at each corner (k, 2), px. The other paths lie on the arc of a star
     through the `middle` (2,), px, of the region, and cover the region in equal steps. Their fractions of the

@@ -59,7 +59,7 @@ class Patch:
         signal: counts above the background (rows, columns), including the light of other regions.
         weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts; 0 if saturated.
         noise: standard deviation of a background pixel, counts.
-        corner: position (x, y) in the frame of the first pixel (2,), px.
+        corner: position (x, y) of the first pixel in the frame (2,), px.
         mask: mask of the pixels that belong to the region (rows, columns).
         beyond: counts assumed above, below, left and right of the rectangle (4,); infinite outside the frame,
             because streaks may continue there.

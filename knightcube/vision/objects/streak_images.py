@@ -111,7 +111,7 @@ def _set_circle(
             points[k, 1] = focal * (cosine * (y - v) + sine * (z * a - x * c) + v) / ahead
         else:
             points[k, 0] = points[k, 1] = math.nan
-        # Sines and cosines of successive steps are computed by the addition theorem.
+        # Sine and cosine of the next step follow from the angle-addition formulas.
         before = cosine
         cosine, sine = before * next_cosine - sine * next_sine, sine * next_cosine + before * next_sine
 
@@ -302,7 +302,7 @@ def pixels_near(points: FloatArray, reach: float, rows: int, columns: int) -> In
 def _mark_discs(
     centres: IntArray, half: IntArray, low_x: int, low_y: int, marked: BoolArray, spans: IntArray
 ) -> int:
-    """Mark discs around `centres` (m, 2), set the marked span of each row, and return the number of pixels.
+    """Mark discs around `centres` (m, 2), set the span of each row, and return the number of marked pixels.
 
     The array `half` (2 r + 1,) contains the half-width of the disc in each row.
     """
@@ -528,7 +528,7 @@ def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
     """Return coordinates (6, c) of c nodes of a path (m, 2), px, whose chord has the unit vector (`x`, `y`).
 
     The first three rows are the coordinates along and across the chord and the arc length. The next three
-    rows are the middle, slope and spacing of the points of the c - 1 intervals between nodes.
+    rows are the middle of each of the c - 1 intervals between nodes, its slope and the spacing of its points.
     """
     m = len(path)
     count = min(_NODES, m)
@@ -853,8 +853,8 @@ def spread_with_slopes(
 class _Profiles:
     """Profiles of m points on w adjacent pixels along one axis of `count` pixels.
 
-    The first of the w pixels of each point (m,) may be outside the range of the axis. The values (m, w) are
-    the integrals of the point spread function over the pixels.
+    The pixel `first` (m,) of each profile may be outside the range of the axis. The `values` (m, w) are the
+    integrals of the point spread function over the pixels.
     """
 
     count: int
