@@ -6,8 +6,8 @@ to the limbs in all images at once. If no image shows a limb, the brightness of 
 nadir direction, because the Earth may fill one camera while the others are dark. The modules of the
 estimators are imported at their first use, because the control process does not need them.
 
-The spacecraft's own structure is masked in the images. The mask consists of configured structure (polygons and
-an image file) and of structure estimated from successive frames. While the limb moves over the image, the
+The spacecraft's own structure is masked in the images. The mask consists of configured structure (polygons
+and an image file) and of structure estimated from successive frames. While the limb moves over the image, the
 brightness of the scene changes repeatedly, whereas the brightness of the structure stays constant.
 `StructureMap` compares the mean brightness of square blocks of pixels with that in the last counted frame. A
 frame is counted if at least a quarter of its blocks have changed. A block whose brightness did not change in

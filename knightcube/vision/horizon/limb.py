@@ -173,7 +173,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
     # The matrix product transforms the derivative with respect to the scaled ray into camera axes.
-    # It contains the components twice, in the orders that the cross product with the ray needs.
+    # The product contains the components twice, in the orders that the cross product with the ray needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
@@ -283,7 +283,7 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
         last = float(np.max(np.abs(step[:3])))
     factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
     # The weights include the spread of the median residual. A few large residuals can still exceed this
-    # spread, so that the covariance is multiplied by their chi-square per degree of freedom, `excess`.
+    # spread, so that the covariance is also multiplied by chi-square per degree of freedom, `excess`.
     fitted = weights[used] * residuals[used] ** 2
     excess = max(1.0, float(np.sum(fitted)) / max(len(fitted) - 3, 1))
     covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))

@@ -248,7 +248,7 @@ class StarLight:
             ends = found.ends
             if change < _LOCATED:
                 break
-            # The distance stays long as long as the light may continue beyond the shorter distance.
+            # The longer distance is kept while the light may continue beyond the shorter distance.
             ended = moved.max() < _BEYOND_LATER - 2.0 * _FOLLOWED
             beyond = _BEYOND_LATER if ended else max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         return found
@@ -432,9 +432,9 @@ def _sums_of_ends(
     """Return the normal equations (6, 5) of a fit of the brightness and the ends (2, 2), px, of a streak.
 
     The first five rows are the matrix of the equations and the last row is their right-hand side. The first
-    unknown is the brightness. The others are the displacements (x, y) of the first and of the last end, each
-    multiplied by the brightness. The further results are the sum of the squares of the weighted counts, and
-    the number of pixels used.
+    unknown is the brightness. The other unknowns are the displacements (x, y) of the first and of the last
+    end, each multiplied by the brightness. The further results are the sum of the squares of the weighted
+    counts, and the number of pixels used.
 
     The pixels (p, 2) have the counts `target` (p,) and the reciprocal standard deviations `weight` (p,). The
     `images` (3, p) are the image of the streak and its derivatives with respect to a displacement.
@@ -550,12 +550,11 @@ def _trial_starts_numpy(
 def _trial_starts(
     corners: FloatArray, middle: FloatArray, length: int, per_length: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return one point (n, 2), px, on the arc of each trial star path, and its fraction of the path (n,).
+    """Return one point (n, 2), px, on the arc of each trial star path, and its fraction (n,) of the path.
 
     One path begins and one path ends at each corner (k, 2), px. The other paths lie on the arc of a star
-    through the `middle` (2,), px, of the region, and cover the region in equal steps. Their fractions of the
-    path are below 0 or above 1 if the path does not reach the middle. The argument `length` is the length of
-    a path, px.
+    through the `middle` (2,), px, of the region, and cover the region in equal steps. The fraction is below 0
+    or above 1 if a path does not reach the middle. The argument `length` is the length of a path, px.
     """
     size = len(corners)
     wide, high = np.ptp(corners[:, 0]), np.ptp(corners[:, 1])

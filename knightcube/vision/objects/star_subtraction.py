@@ -259,10 +259,10 @@ def _brightest_path_numpy(
 def _brightest_path(
     seen: FloatArray, steps: IntArray, factor: FloatArray, beyond: FloatArray, threshold: float
 ) -> tuple[float, int, int]:
-    """Return the largest minimum of an image along a path that is moved to each pixel, and that pixel.
+    """Return the largest minimum of an image along a path, over all positions of the path, and the position.
 
     The three results are the minimum, and the column and row of the path's middle. They are minus infinity,
-    -1 and -1 if the minimum is below the threshold at all pixels.
+    -1 and -1 if the minimum is below the threshold at all positions.
 
     The path consists of the pixels `steps` (k, 2), (x, y) relative to its middle. The image (rows, columns)
     is multiplied by `factor` (k,) at these pixels. The values above, below, left and right of the image are
