@@ -181,7 +181,7 @@ class CameraMotion:
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the higher-order terms and vibration (3, m) of the rotation vector, or a derivative.
+        """Return the higher-order terms and vibration (3, m) of the rotation vector, or a time derivative.
 
         The contribution of the vibration is correct to second order in the rotation.
         """
@@ -198,7 +198,8 @@ class CameraMotion:
         return out * (time * time * time, time * time, time)[derivative]
 
     def _shaken(self, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the vibration's part (3, m) of the rotation vector at `time` (m,), and two derivatives."""
+        """Return the vibration's part (3, m) of the rotation vector at `time` (m,), and two time
+        derivatives."""
         smooth, acceleration = self.smooth, self.acceleration[:, None]
         turn = self.rate[:, None] * time + 0.5 * acceleration * time**2 + smooth.higher(time)
         rate, bent = smooth.rate_at(time) + 0.0 * turn, acceleration + smooth.higher(time, 2)

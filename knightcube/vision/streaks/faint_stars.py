@@ -34,7 +34,7 @@ from knightcube.vision.streaks.polar_grid import (
 
 # Minimum fraction of a faint star's streak that must lie on the detector.
 _LEAST_SEEN = 0.35
-# Number of grid circles between two stars from which the profiles of the stars do not overlap.
+# Minimum distance (grid circles) at which the profiles of two stars do not overlap.
 _FARTHEST = 5
 # Standard deviation (px) of a star's profile across the streak, as assumed by the filter.
 _WIDTH = 1.05
@@ -246,7 +246,10 @@ def _summits(flat: Float32Array, high: BoolArray, columns: int) -> IntArray:
 
 @loop_helper
 def _any_set(mask: BoolArray) -> bool:
-    """Return whether any element of `mask` (k,) is true; the count permits vector instructions."""
+    """Return whether any element of `mask` (k,) is true.
+
+    An early exit from the loop would prevent vector instructions.
+    """
     number = np.int32(0)
     for k in range(len(mask)):
         number += np.int32(mask[k])
@@ -466,7 +469,10 @@ def _scales(
 
 @loop_helper
 def _any_above(values: Float32Array, threshold: np.float32) -> bool:
-    """Return whether any of `values` (k,) exceeds the `threshold`; the count permits vector instructions."""
+    """Return whether any of `values` (k,) exceeds the `threshold`.
+
+    An early exit from the loop would prevent vector instructions.
+    """
     above = np.int32(0)
     for k in range(len(values)):
         above += np.int32(values[k] > threshold)
@@ -559,10 +565,10 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
 def _overlaps_numpy(
     row: FloatArray, column: FloatArray, spans: FloatArray, length: float
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the indices (e,) of both stars of each overlapping pair, and the response of one to the other.
+    """Return both indices (e,) of e overlapping pairs of stars, and the response at one due to the other.
 
-    The k stars are in ascending order of `row` (k,), and each star is also a pair with itself. The argument
-    `spans` (k, 2) is the range of columns on the detector at each star, and `length` is in samples.
+    The k stars are in ascending order of `row` (k,), and each star also forms a pair with itself. The
+    argument `spans` (k, 2) is the range of columns on the detector at each star, and `length` is in samples.
     """
     first = np.searchsorted(row, row - _FARTHEST, side="right")
     count = np.searchsorted(row, row + _FARTHEST) - first

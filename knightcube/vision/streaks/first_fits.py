@@ -79,13 +79,13 @@ _EVIDENT = 3000.0
 _WORST_FIRST = 12.0
 # Fraction of bright pixels above which the brightest regions of a frame are assumed to be blends of stars.
 _CROWDED = 0.05
-# Minimum chi-square explained by the best fit for which a frame of blended stars is not scanned completely.
+# Chi-square explained by the best fit above which even a frame of blended stars is not scanned.
 _BEYOND_CROWD = 100_000.0
 # Largest excess chi-square of a well-fitted star, as a fraction of the star's squared significance.
 _MOST_RESIDUAL = 0.01
 # Upper limit of a star's significance (standard deviations) in the chi-square that a fit explains.
 _ENOUGH = 200.0
-# Weight of the flux in overlong regions, which may be blends of two streaks, in the comparison of guesses.
+# Relative reduction of the explained chi-square if all flux is in regions longer than the guessed streaks.
 _CONTRADICTION = 0.6
 # Median chi-square per degree of freedom of a preliminary fit above which a vibration is fitted.
 _SHAKEN = 2.5
@@ -131,11 +131,11 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
 
 
 def _fits_of_guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[_FirstFit]:
-    """Yield fits of a smooth motion to the initial guesses, and then of a disturbed motion.
+    """Yield fits of a smooth motion to the initial guesses, and then fits that include a disturbance.
 
-    A fit with a vibration or with a learned profile of the PSF needs many times the work of a smooth fit. For
-    a wrong guess, it would use up the work limit of the frame, so smooth motions are fitted to all guesses
-    first.
+    A fit with a vibration or with a learned profile of the PSF needs many times the work of a smooth fit.
+    With a wrong guess, such a fit would use up the work limit of the frame, so smooth motions are fitted to
+    all guesses first.
     """
     shaken = []
     for guess in islice(_guesses(camera, regions, near), _MOST_GUESSES):
@@ -284,7 +284,10 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> _FirstFit | None:
 
 
 def _disturbed(camera: FitProblem, first: _FirstFit) -> _FirstFit:
-    """Return the fit `first` with a vibration, or with a learned profile of the PSF, if it fits better."""
+    """Return the fit `first` with a vibration if its residuals show one.
+
+    If the fit is still poor, a profile of the PSF is learned in addition.
+    """
     camera = replace(camera, growing=bool(first.fit.free[3]))
     done = with_vibration(camera, first.fit) or first.fit
     found = _judged(done, first.guess, first.ends)
@@ -310,7 +313,7 @@ def _judged(done: StreakFit, guess: MotionGuess, ends: float) -> _FirstFit:
 def with_vibration(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
     """Return a preliminary fit that includes a vibration, or None if the residuals show no vibration.
 
-    The tolerance is that of the final fit, because residuals of bright stars would look like faint stars.
+    With a tolerance larger than that of the final fit, residuals of bright stars would look like faint stars.
     """
     limits = replace(FIRST, tolerance=LAST.tolerance)
     return fit_vibration(

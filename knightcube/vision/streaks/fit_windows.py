@@ -46,7 +46,7 @@ _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is sampled to find where it crosses lines of pixels.
 _CROSSING_SAMPLES = 17
 # Ratio of a star's speeds along rows and columns at which its path is divided.
-# With a ratio of 1, all pixels on a diagonal border between two parts could be omitted.
+# With a ratio of 1, a whole diagonal of pixels could lie in the gap between two parts and be omitted.
 _DIAGONAL = 1.03
 # Number of instants at which the direction of a segment of a path is evaluated.
 _DIRECTION_INSTANTS = 7
@@ -54,7 +54,7 @@ _DIRECTION_INSTANTS = 7
 _MOST_BENT = 0.5
 # Width (px) of the gap between adjoining parts of a straight path. Pixels in the gap belong to neither part.
 _SEAM = 0.003
-# Increase of the gap width (px) between parts of a curved path, per cubed strip width and squared curvature.
+# Increase of this gap on a curved path, as a multiple of (half width of the strip)^3 (curvature)^2.
 _ARC = 0.3
 
 
@@ -208,7 +208,8 @@ def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: In
     major = np.where(falling[:, None], major[:, ::-1], major)
     sampled = np.where(falling[:, None], sampled[:, ::-1], sampled)
     within = np.clip(line, major[owner, :1], major[owner, -1:])
-    # The coordinates of successive parts are shifted apart, so that one call interpolates all parts.
+    # The coordinates of each part are shifted beyond those of the previous part, so that one call
+    # interpolates all.
     begin = np.arange(len(major)) * (float(np.ptp(major)) + 1.0 if major.size else 1.0)
     at = (within + begin[owner, None]).reshape(-1)
     times = np.interp(at, (major + begin[:, None]).reshape(-1), sampled.reshape(-1)) if len(at) else at
@@ -233,7 +234,7 @@ def _block_lines(place: FloatArray, sampled: FloatArray, field: tuple[int, int])
         major = place[n, :, axes[n]]
         low, high = min(major[0], major[-1]), max(major[0], major[-1])
         step = 1 if major[-1] >= major[0] else -1
-        # The path is between the samples `at` and `at + step` if it crosses the line.
+        # The path crosses the line between the samples `at` and `at + step`.
         at = 0 if step > 0 else count - 1
         for begin in range(first[n], last[n] + 1, LINES):
             owner[b], along_rows[b] = n, axes[n] == 0
@@ -259,7 +260,7 @@ _StripArrays = tuple[IntArray, FloatArray, IntArray, IntArray, IntArray, BoolArr
 
 
 def _strip_pixels_numpy(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field) -> _StripArrays:
-    """Return the attributes of the strips formed by `lines`, which cross the paths at the `points`.
+    """Return the attributes of `Strips` for `lines` of pixels that the paths cross at `points`.
 
     Blocks without selected pixels are omitted. Margins without selected pixels on any line are removed.
     """
@@ -370,7 +371,7 @@ def _strip_pixels(points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: 
 
 @loop_helper
 def _half_width(velocity: FloatArray, lines: _Lines, width: float) -> int:
-    """Return the number of pixels of a line on each side of a path that reach `width` px from the path."""
+    """Return the maximum number of pixels of a line within `width` px of the path on one side of the path."""
     steepest = 1.0
     for b in range(len(lines.line)):
         for i in range(lines.line.shape[1]):
@@ -393,11 +394,11 @@ def _select_near(
     bend: float,
     limits: tuple[float, float, float],
 ) -> None:
-    """Compute whether each pixel of a line is `near` the path, within `limits` along and across the path.
+    """Set `near` (k,) to whether each pixel of a line is within `limits` along and across the path.
 
-    The distances across and along the tangent of the path are `first` (px) for the first pixel, and change by
-    `slope` from pixel to pixel. The `limits` (px) are the start and the stop along the path, and the largest
-    distance across the path.
+    The pair `first` (px) contains the distances of the first pixel across and along the tangent of the path,
+    and `slope` their increments from pixel to pixel. The `limits` (px) are the start and the stop along the
+    path, and the largest distance across the path.
     """
     across, ahead = np.float32(first[0]), np.float32(first[1])
     by_across, by_ahead = np.float32(slope[0]), np.float32(slope[1])
@@ -414,7 +415,7 @@ def _select_near(
 def path_distances(
     corner: IntArray, step: IntArray, position: FloatArray, tangent: FloatArray, count: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return distances (px) across and along the path of `count` pixels on each of l lines, (count, b, l).
+    """Return distances (count, b, l), px, across and along the path, of `count` pixels on each of l lines.
 
     The first pixel of each line (`corner`) and the step to the next pixel (`step`) are those of `Strips`;
     `position` and `tangent` (b, l, 2) are the position and unit tangent at which the path crosses each line
@@ -440,8 +441,8 @@ def _speed(path: StarPaths) -> FloatArray:
 class Patches:
     """Square patches of pixels around n spots, which are short streaks or slow parts of streaks.
 
-    Each patch has p columns and p rows of the frame (n, p). The flat index in the frame (n, p, p) is 0 for a
-    pixel that is not `inside` the frame.
+    The arrays `column` (n, p) and `row` (n, p) are the p columns and p rows of each patch. The flat index in
+    the frame (n, p, p) is 0 for a pixel that is not `inside` the frame.
     """
 
     column: IntArray
@@ -478,15 +479,15 @@ class BlockPixels:
     """The values of the frame at the fitted pixels; the first axis is the index of a block of pixels.
 
     Attributes:
-        slot: index of each pixel in the list of all fitted pixels, which contains a pixel shared by several
-            stars only once. For a pixel outside the frame, `slot` is the total number of fitted pixels.
+        slot: index of each pixel in the list of all fitted pixels, in which each shared pixel occurs only
+            once. For a pixel outside the frame, `slot` is the total number of fitted pixels.
         inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
         ceiling: counts above the background at which each pixel saturates.
         gain: gain of the camera, electrons per count.
         crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
-        common: index (e,) of each of these e pixels in the list of the pixels that several stars share.
+        common: index (e,) of each of these pixels in the list of all shared pixels.
     """
 
     slot: IntArray
@@ -504,9 +505,9 @@ class StarPixels:
     """Strips of pixels along long streaks, and square patches of pixels around spots.
 
     Attributes:
-        long: indices in the scene of the a stars of `strips` (a,). A star that moves slowly on part of its
-            path also has a patch for this part.
-        spot: indices in the scene of the b stars of `patches` (b,).
+        long: index in the scene of each of the a stars with a strip (a,). A star that moves slowly on part of
+            its path also has a patch for this part.
+        spot: index in the scene of each of the b stars with a patch (b,).
         strips: pixels of the strips along long streaks.
         patches: pixels of the square patches around spots.
     """
@@ -539,9 +540,9 @@ class FitWindows(StarPixels):
     ) -> Float32Array:
         """Return the sum of the counts of all stars on each fitted pixel, as an array (m + 1,).
 
-        The first of the `images` (b, .., LINES, k) of each block and the images `spots` (n, p, p) are those
-        of stars of unit flux. The arrays `light` (n,) and `sky` (n,) contain the flux and the sky level of
-        each star. The last element of the result is the sum of the counts on pixels outside the frame.
+        The first of the `images` (b, .., LINES, k) of each block, and the images `spots` (n, p, p), show
+        stars of unit flux. The arrays `light` (n,) and `sky` (n,) contain the flux and the sky level of each
+        star. The last element of the result is the sum of the counts on pixels outside the frame.
         """
         star = self.long[self.strips.star]
         blocks = images.reshape(*images.shape[:2], math.prod(images.shape[2:])), light[star], sky[star]
@@ -674,15 +675,14 @@ def cut_windows(
 
 
 _Numbered = tuple[IntArray, IntArray, IntArray, IntArray, int]
-"""Attributes `pixels` and `slot` of `FitWindows`, `crowded` and `common` of all blocks, and `shared`."""
+"""Attributes `pixels`, `slot` and `shared` of `FitWindows`, with `crowded` and `common` of all pixels."""
 
 
 def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
     """Return the distinct fitted pixels, the index of each pixel in this list, and the shared pixels.
 
-    The pixels are given as flat indices `index` (p,) in a frame of `size` pixels, which contain repeated
-    values if windows overlap. For m distinct pixels, the returned index is m for a pixel that is not
-    `inside`.
+    The flat indices `index` (p,) of the pixels, in a frame of `size` pixels, contain repeated values if
+    windows overlap. For m distinct pixels, the returned index is m for a pixel that is not `inside`.
     """
     named = index[inside][::-1]
     # If a pixel occurs in several windows, `number` keeps the index of the first occurrence.
@@ -703,7 +703,7 @@ def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
 
 @compiled_form_of(_numbered_numpy)
 def _numbered(index: IntArray, inside: BoolArray, size: int) -> _Numbered:
-    # The bytes of `windows` are the number of windows of each pixel, at most 2, or 3 for a numbered pixel.
+    # For each pixel, `windows` is 0, 1, 2 (two or more windows), or 3 (a shared pixel that has a number).
     windows, number = np.zeros(size, dtype=np.uint8), np.empty(size, dtype=np.int32)
     for p in range(len(index)):
         windows[index[p]] += inside[p] and windows[index[p]] < 2
@@ -789,8 +789,8 @@ def star_pixels(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: f
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return start and end times of the fast part (n, 2) and of the slow part (n, 2) of each star's path.
 
-    The slow part of a path is at the end of the exposure with the smaller rate. If a path has no fast part or
-    no slow part, the start and end times of the missing part are equal.
+    The slow part of a path is at the start or the end of the exposure, whichever has the smaller rate. If a
+    path has no fast part or no slow part, the start and end times of the missing part are equal.
     """
     motion = scene.motion.smooth
     if motion.constant or not motion.rotation.any():
@@ -817,7 +817,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
 
 
 def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the pixels along each star's path, without pixels of the star's own square patch."""
+    """Return `strips` without the pixels in the square patch of the same star."""
     both = np.isin(long, spot)
     if not both.any():
         return strips

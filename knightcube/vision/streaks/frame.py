@@ -31,7 +31,7 @@ from knightcube.vision.frame import (
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 
-# Distance (px) between the pixels whose median noise variance determines the usual noise.
+# Step (pixels) at which the noise variance is sampled for the usual noise.
 _SPARSE = 97
 
 
@@ -170,8 +170,8 @@ def _region_pixels_numpy(
 ) -> _RegionPixels:
     """Return the pixels of the chosen regions, and a mask of the regions truncated by the frame border.
 
-    The arguments are the flat index and the region of each bright pixel (p,), the index of each of n regions
-    among the chosen regions (-1 for the other regions), and the counts and the shape of the frame.
+    The arrays `pixel` (p,) and `number` (p,) are the flat index and the region of each bright pixel, and
+    `rank` (n,) is the index of each region among the chosen regions, or -1 for any other region.
     """
     rows, columns = shape
     kept = np.flatnonzero(rank[number] >= 0)
@@ -221,7 +221,8 @@ def _significant(sums: Float32Array, floor: Float32Array, threshold: float) -> I
         for group in range((size + 7) // 8):
             # Most groups of eight pixels contain no bright pixel.
             if groups[group]:
-                # Each index is stored without a branch, because the processor could not predict a branch.
+                # Every index is written, but kept only for a bright pixel, which avoids an unpredictable
+                # branch.
                 for k in range(8 * group, min(8 * group + 8, size)):
                     found[count] = begin + k
                     count += bright[k] > 0
@@ -244,7 +245,7 @@ def _mark_bright(
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
 _BROAD = 25.0
-# Lower bound (px) of a region's length in its mean width, which is the region's area divided by its length.
+# Lower limit (px) of the length by which a region's area is divided to obtain its mean width.
 _LEAST_LENGTH = 40.0
 # Side length (px) of a square that fits into the image of a limb or a reflection, but not of a star.
 _SOLID = 31
@@ -304,8 +305,9 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     starlight.
 
     The fit computes the photon noise of all pixels with the same gain, although the variance of an equalised
-    pixel is inversely proportional to its response. In 119 frames with responses from 0.3 to 1, the weights
-    that follow did not make the rate inconsistent with its covariance (mean squared error 0.3 of the stated).
+    pixel is inversely proportional to its response. In 119 frames with responses from 0.3 to 1, the inexact
+    weights did not make the rate inconsistent with its covariance: the mean square error was 0.3 of the
+    stated variance.
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:
@@ -362,7 +364,7 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions, near: int = 
     """Return the standard deviation (px) of the PSF without pixel convolution, or None if unknown.
 
     The autocorrelation is measured at displacements of `near` px and three times `near` px. Pixel noise
-    affects only the displacement zero.
+    affects the autocorrelation only at zero displacement.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
     to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and along rows is also Gaussian,
@@ -386,7 +388,8 @@ def _autocorrelations_numpy(
 ) -> FloatArray:
     """Return the autocorrelations (4, count) of the first `count` regions of a frame with `columns` columns.
 
-    The displacements are `near` px and `_FARTHER` times `near` px along rows, and then along columns.
+    The four displacements are `near` px and `_FARTHER` times `near` px along rows, and the same along
+    columns.
     """
     chosen = np.flatnonzero(pixels[0] < count)
     owner, column, row = (values[chosen] for values in pixels[:3])
@@ -495,9 +498,9 @@ def prepare_frames(
 ) -> Iterator[PreparedFrame]:
     """Yield the frame for a first attempt, and a binned frame for a second attempt if the PSF seems blurred.
 
-    The first frame is binned for the configured point-spread width or for a much larger measured width. The
-    autocorrelation of a ring decreases faster at small displacements than that of a Gaussian of the same
-    width. A large width is therefore measured again, at larger displacements.
+    The first frame is binned for the configured point-spread width or, if it is much larger, for the measured
+    width. The autocorrelation of a ring-shaped PSF decreases faster at small displacements than that of a
+    Gaussian of the same width. A large width is therefore measured again, at larger displacements.
     """
 
     def prepared(sigma: float) -> PreparedFrame:

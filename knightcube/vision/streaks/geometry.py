@@ -93,9 +93,9 @@ def sensitivities_and_velocity(
     """Return derivatives (m, 2, 8) of star positions at `time` (m,), and velocities (m, 2), px per exposure.
 
     The derivatives are with respect to rate (3), acceleration (3) and the star's position at mid-exposure
-    (2). Derivatives of a star's position with respect to the rate and the star's position at mid-exposure are
-    exact. The derivatives with respect to the acceleration have an error of second order in the rotation
-    angle, and are zero unless the acceleration is fitted (`growing`).
+    (2). The derivatives with respect to the rate and to the position at mid-exposure are exact. The
+    derivatives with respect to the acceleration have an error of second order in the rotation angle, and are
+    zero unless the acceleration is fitted (`growing`).
     """
     view, terms, ideal, time = _ideal_arguments(pinhole, motion, stars, time)
     if motion.vibration.exists:
@@ -468,7 +468,7 @@ _UNEVEN = 0.05
 _INSTANTS = 65
 # Largest uncertainty (px per exposure) of the navigation filter's motion that the fit accepts.
 _MOST_VAGUE = 3.0
-# Ratio of the error of a fitted mean rate to the error of the navigation filter's rate.
+# Error of a fitted mean rate that a `Course` causes, as a fraction of the rate error of the `Course`.
 _COURSE_SHARE = 0.15
 
 
@@ -480,7 +480,8 @@ class Course:
     example of a step of the rate, are better known from the navigation filter and are not fitted.
 
     The `terms` (k, 3), rad, are the coefficients of t, t^2, ... in the rotation vector since mid-exposure, in
-    camera axes. The standard deviation `sigma`, rad, is that of the rate, multiplied by the exposure.
+    camera axes. The attribute `sigma`, rad, is the standard deviation of the rate multiplied by the exposure
+    time.
     """
 
     terms: FloatArray
@@ -604,7 +605,7 @@ def exposure_bounds(
     times[:] = _EXPOSURE
     if shutter.delay_per_row == 0.0:
         return times
-    # The end time and the row in which the streak ends are found by fixed-point iteration.
+    # Each end time and the row of the star at that time are found by fixed-point iteration.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]
@@ -658,7 +659,7 @@ def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> t
 
 
 def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the absolute differences (n,), at most pi, between azimuths (n,) and others (n,), all in rad."""
+    """Return the absolute differences (n,), at most pi, between `azimuth` (n,) and `other` (n,), rad."""
     return np.asarray(np.abs(np.remainder(azimuth - other + np.pi, 2.0 * np.pi) - np.pi))
 
 

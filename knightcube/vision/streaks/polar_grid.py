@@ -123,7 +123,8 @@ def _samples(
     """Return samples (r, c) of the 3 x 3 sums `flat`, and a mask (r, c) of the samples on the detector.
 
     The samples are rounded to integer multiples of 1/`per_count`, so that their sums are fast and exact. The
-    3 x 3 sums must be zero along the border of the frame. The other arguments are described in `_sum_along`.
+    3 x 3 sums must be zero along the border of the frame. The other arguments are described in
+    `_sum_along_numpy`.
     """
     view, shape = camera
     last = np.int32(shape[0] - 1), np.int32(shape[1] - 1)
@@ -161,9 +162,9 @@ def _border(pinhole: Pinhole) -> FloatArray:
 def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> IntArray:
     """Return groups of circles with the range of azimuths in which they cross the detector.
 
-    Each row (4,) of the result contains the indices of the first circle of a group, the circle after the
-    last, the first azimuth, and the azimuth after the last. If the circles are complete, a margin of `room`
-    samples is included on both sides of the detector.
+    Each row (4,) of the result contains four indices of a group: first circle, last circle + 1, first azimuth
+    and last azimuth + 1. If the circles are complete, a group that crosses the detector within `room` samples
+    of the azimuth pi includes all azimuths.
     """
     local = _border(pinhole) @ grid.frame.T
     polar, azimuth = np.arccos(np.clip(local[:, 2], -1.0, 1.0)), np.arctan2(local[:, 1], local[:, 0])
@@ -190,7 +191,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> IntArray:
 _BOX = 3.0
 # Largest permitted running sum of samples, in units of the rounding step.
 _HIGHEST = 2.0**30
-# Number that rounds a sample (float32) to an integer if it is added and then subtracted in double precision.
+# Number whose addition and subtraction in double precision rounds a sample (float32) to an integer.
 _ROUND = np.float64(1.5 * 2.0**52)
 
 
@@ -258,8 +259,7 @@ def _sum_along_numpy(
     """Compute the running sums `response` and their numbers of samples `count` (r, c), and `span` (r, 2).
 
     The direction of a sample is the sum of a vector from `turning` (3, c) for its azimuth and a vector from
-    `rising` (3, r) for its circle. Each row of `parts` (g, 4) contains the indices of the first circle of a
-    group, the circle after the last, the first azimuth and the azimuth after the last.
+    `rising` (3, r) for its circle. The rows of `parts` (g, 4) are those of `_groups`.
     """
     width, full, per_count, unit = limits
     before, after, columns = width // 2, width - width // 2, response.shape[1]
@@ -337,7 +337,7 @@ def _sum_along(
 
 @loop_helper
 def _range_on_detector(index: Int32Array) -> tuple[int, int, int]:
-    """Return the first sample on the detector, the sample after the last, and the number on the detector."""
+    """Return first index and last index + 1 of the samples on the detector, and their number."""
     seen = np.int32(0)
     for k in range(len(index)):
         seen += np.int32(index[k] > 0)
@@ -351,7 +351,10 @@ def _range_on_detector(index: Int32Array) -> tuple[int, int, int]:
 
 @loop_helper
 def _count_samples(out: Int32Array, begin: int, width: int, many: int) -> None:
-    """Set `out` (m,) to the number of the samples 0 to `many` in consecutive windows of `width` samples."""
+    """Set `out` (m,) to the number of samples in each of m windows of `width` samples.
+
+    The window k starts at the index `begin` + k, and the samples have the indices 0 to `many` - 1.
+    """
     first, size, end = np.int32(begin), np.int32(width), np.int32(many)
     for k in range(len(out)):
         place = first + np.int32(k)
@@ -360,7 +363,7 @@ def _count_samples(out: Int32Array, begin: int, width: int, many: int) -> None:
 
 @loop_helper
 def _subtract(out: Any, total: Int32Array, width: int, unit: Any) -> None:
-    """Set `out` (m,) to the differences between cumulative sums that are `width` samples apart, in `unit`."""
+    """Set `out` (m,) to `unit` times the differences of cumulative sums that are `width` samples apart."""
     ahead = total[width:]
     for k in range(len(out)):
         out[k] = (ahead[k] - total[k]) * unit

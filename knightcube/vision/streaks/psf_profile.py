@@ -28,17 +28,17 @@ _WIDTHS = (0.5, 0.7, 1.0, 1.3)
 _FIRST = PsfProfile(_WIDTHS, (0.0, 0.0, 1.0, 0.0))
 # Minimum ratio of fitted to configured width for which a profile is learned.
 _LEAST_WIDER = 1.05
-# Number of fits of the motion, each with a better profile.
+# Number of fits of the profile, each followed by a fit of the motion.
 _ROUNDS = 3
-# Number of solutions for the shares, each with the pixel noise that follows from the previous solution.
+# Number of solutions for the shares; the pixel noise is computed from the shares before each solution.
 _SOLUTIONS = 3
 # Residual (standard deviations) above which a pixel contains flux of a star that is not in the scene.
 _FOREIGN_SIGMAS = 5.0
-# Part of this residual limit, as a fraction of the brightest modelled counts of the pixel.
+# Addition to this limit, as a fraction of the largest counts at the pixel with any single Gaussian as PSF.
 _FOREIGN_SHARE = 0.5
-# Model error of a pixel, as a fraction of its counts, so that no single bright star determines the shares.
+# Model error of a pixel, as a fraction of its counts, which limits the weight of bright stars.
 _MODEL_ERROR = 0.02
-# Smallest and largest accepted ratio of the flux with the new and with the previous profile.
+# Smallest and largest accepted ratio of the flux with the new profile to the flux with the previous profile.
 _LIKELY_FLUX = (0.3, 3.0)
 # Distance (px) below which two streaks may be the two lines of one double streak.
 _DOUBLE = 8.0
@@ -72,7 +72,7 @@ def fit_profile(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
 
 
 def _without_doubles(scene: StreakScene) -> StreakScene:
-    """Return the scene without the fainter of two neighbouring streaks, which may be lines of one streak."""
+    """Return the scene without the fainter of each two streaks that may be the two lines of one streak."""
     near = np.linalg.norm(scene.stars[:, None] - scene.stars, axis=2) < _DOUBLE
     return scene.select(~(near & (scene.light > scene.light[:, None])).any(axis=1))
 
@@ -80,7 +80,7 @@ def _without_doubles(scene: StreakScene) -> StreakScene:
 def _shares(camera: FitProblem, scene: StreakScene, windows: FitWindows) -> FloatArray | None:
     """Return the shares (k,) of the k Gaussians that fit the pixels of all stars best.
 
-    The sum of the shares is the ratio of the flux of the stars to their flux in `scene`. Returns None if the
+    The sum of the shares is the ratio of the stars' new flux to their flux in `scene`. Returns None if the
     pixels do not determine the shares, or if this ratio is implausible.
     """
     lights = gaussian_lights(camera.pinhole, camera.shutter, scene, windows)

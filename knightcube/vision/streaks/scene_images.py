@@ -19,8 +19,7 @@ from knightcube.vision.streaks.geometry import GAUSSIAN, Shutter, StreakScene
 ModelImages = tuple[Float32Array, FloatArray, FloatArray]
 """Images that are combined to model long streaks, images of spots, and the derivatives of these images."""
 
-# Index of the image of the sky level, which is the only image that does not depend on the PSF, and index of
-# the derivative with respect to the width.
+# Indices of the sky image, the only image independent of the PSF, and of the width derivative.
 _SKY, _BY_WIDTH = 6, 5
 # Index of the derivative with respect to the width among the derivatives of a spot.
 _SPOT_BY_WIDTH = 8
@@ -86,7 +85,7 @@ def model_images(
 
 
 def _share(scene: StreakScene, part: StreakScene, images: ModelImages, share: float) -> ModelImages:
-    """Return the images of one Gaussian of the PSF with its `share` of the flux.
+    """Return the images of one Gaussian of the PSF, scaled by its `share` of the flux.
 
     A change of the scene's width changes the widths of all Gaussians in proportion.
     """
@@ -113,6 +112,6 @@ def _gaussian_images(
 
 
 def _gaussian_scenes(scene: StreakScene) -> list[StreakScene]:
-    """Return the `scene` with each Gaussian of its PSF instead of the PSF."""
+    """Return one copy of `scene` for each Gaussian of its PSF, with this Gaussian as PSF."""
     widths = scene.profile.widths
     return [replace(scene, width=width * scene.width, profile=GAUSSIAN) for width in widths]

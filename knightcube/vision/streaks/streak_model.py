@@ -23,7 +23,7 @@ c(t).
 
 In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
 per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with
-coefficients for each block of pixels. One basis image is n/w^2 m multiplied by the distance along the path
+coefficients for each block of pixels. One basis image is (n/w^2) m multiplied by the distance along the path
 from the centre of the block, with a correction at the streak ends. This image describes a linear change of
 c_n within a block of pixels.
 
@@ -133,7 +133,8 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # The path near the patch is extended by one sample; a path that is never near is divided completely.
+    # The part near the patch is extended by one sample on each side. A path that is never near is divided as
+    # a whole.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -168,13 +169,13 @@ def profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArr
 IMAGES = 7
 """Number of images that are combined into the counts and derivatives of a block of pixels."""
 QUADRATIC_IMAGES = 2
-"""Number of images of displacements that are quadratic along the path, which follow the other images."""
+"""Number of images for displacements that are quadratic along the path, stored after the other images."""
 
 # Number of blocks computed in one step, small enough for their pixels to fit into the processor's cache.
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths) along a path from a pixel to the path's crossing of the pixel's line.
+# Largest distance along a path (point-spread widths) between a pixel and the crossing of its line of pixels.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in units of the exposure time.
 _STEP = 1e-4
@@ -193,10 +194,10 @@ def images(
 ) -> Float32Array:
     """Return images (b, count, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The argument `width` is the width w of the PSF, px. The last of several images of each block is not
-    initialised; the calling function sets it. If `count` is 1, only the counts of the stars are computed. If
-    `count` is IMAGES + QUADRATIC_IMAGES + 1, the images describe displacements that are quadratic along the
-    path within a block, otherwise linear displacements.
+    The argument `width` is the width w of the PSF, px. If `count` is 1, only the counts of the stars are
+    computed. Otherwise, the last image of each block is not initialised; the calling function sets it. With
+    IMAGES + 1 images, displacements are linear along the path within a block; with QUADRATIC_IMAGES more
+    images, they are quadratic.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
@@ -313,11 +314,11 @@ def _endless(lines: _Crossings, count: int, width: float) -> tuple[Float32Array,
 
 
 def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Shutter, width: float) -> None:
-    """Remove the counts before and after the exposure from the image of an infinite streak, `out[:, 0]`.
+    """Remove from the image of an infinite streak, `out[:, 0]`, the counts beyond the streak ends.
 
     The images of the streak ends, `out[:, 3:5]`, and the effect of the ends on the derivative `out[:, 5]`
-    with respect to the width are computed as well. `along` (b, LINES, k), px, is the distance of
-    each pixel from the centre of its block of pixels, measured along the path.
+    with respect to the width are computed as well. The argument `along` (b, LINES, k), px, is the distance
+    along the path of each pixel from the centre of its block.
     """
     out[:, 3:6] = out[:, IMAGES:] = 0.0
     crossing, centre, speed, gained = lines.time, lines.centre, lines.speed, lines.gained
@@ -406,13 +407,13 @@ def _draw(
             _draw_moments(drawn, pixels, width)
 
 
-# Rows of the values of each pixel in `_draw`: distances (px) across the path and ahead of the crossing, the
-# curvature of the path, the acceleration along the path divided by the squared speed, and the distance (px)
-# of the crossing from the centre of the block.
+# Rows of `values` in `_draw`: distances (px) of a pixel across the path and ahead of the crossing, curvature
+# of the path, acceleration along the path divided by the squared speed, and distance (px) of the crossing
+# from the centre of the block.
 _ACROSS, _AHEAD, _BEND, _THINNING, _SHIFT = range(5)
 _Five = tuple[float, float, float, float, float]
-# Constant and quadratic coefficients of the profile's factor, distance (px) along the path, exponent and
-# factor of the profile, and distance (point-spread widths) from a streak end.
+# Further rows: constant and quadratic coefficients of the profile's factor, distance (px) along the path,
+# exponent and factor of the profile, and distance (point-spread widths) from a streak end.
 _CONSTANT, _QUADRATIC, _ALONG, _EXPONENT, _FACTOR, _DISTANCE = range(5, 11)
 _VALUES = 11
 
@@ -423,8 +424,8 @@ def _set_line(
 ) -> None:
     """Set the distances of the pixels of the line `i`, and the values that all pixels of the line share.
 
-    The distances across and along the path from the crossing are `first` (px) for the first pixel, and change
-    by `each` from pixel to pixel.
+    The pair `first` (px) contains the distances of the first pixel from the crossing, across and along the
+    path, and `each` their increments from pixel to pixel.
     """
     across, ahead = np.float32(first[0]), np.float32(first[1])
     by_across, by_ahead = np.float32(each[0]), np.float32(each[1])
@@ -513,9 +514,11 @@ def _reaches_end(of_lines: FloatArray, width: float, sign: float, later: float) 
 
 @loop_helper
 def _from_end(pixels: Float32Array, of_lines: FloatArray, width: float, sign: float, later: float) -> None:
-    """Compute the distances of all pixels from one streak end, in point-spread widths, and exponents.
+    """Compute the distances of all pixels from one streak end, in point-spread widths, and Gaussian
+    exponents.
 
-    The arguments are described in `_reaches_end`; the delay increases by `later` from pixel to pixel.
+    The arguments are described in `_reaches_end`, except that the delay increases by `later` from pixel to
+    pixel.
     """
     scale, half = np.float32(sign / width), np.float32(-0.5)
     for i in range(len(of_lines)):
@@ -626,7 +629,7 @@ def _mixtures_numpy(
     The derivatives `change` (m, 2, 8) and the velocities (m, 2) are given at four groups of instants: shortly
     before and shortly after the star crosses the centre of each block, and at the starts and the stops of
     exposures. If `quadratic` is True, the crossings of the centres are a fifth group. The array `spread` (b,)
-    contains, for each block, the index of its start and stop among all starts and stops.
+    contains the index of each block's start among the starts, which is also that of its stop among the stops.
     """
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]

@@ -51,7 +51,7 @@ class LikelihoodSettings:
             let a score test decide.
         line_time: delay between the exposures of successive rows, s. The line time is positive for a rolling
             shutter and 0 for a global shutter. If the line time is None, it is unknown, and the fit assumes 0
-            with a standard deviation of 30 us. State the line time of a slower shutter.
+            with a standard deviation of 30 us. The line time of a slower rolling shutter must be stated.
         threshold_sigmas: threshold of the 3 x 3 sums for bright regions, in standard deviations.
         most_stars: maximum number of bright stars that determine the motion.
         most_neighbours: maximum number of fainter stars that are fitted because they overlap bright stars.
@@ -171,10 +171,11 @@ class FrameMotion:
     Attributes:
         status: outcome of the frame. With the status `rate`, the rate is known; with `ambiguous`, the rate is
             known except for its sign; otherwise no rate was found.
-        checksum: checksum of some rows. Any two exposures of a working sensor have different checksums.
+        checksum: checksum of every fourth row of the frame. Any two exposures of a working sensor have
+            different checksums.
         exposure: exposure time, s.
-        length: median length of the used streaks, otherwise of all streaks or regions found, px; NaN if none
-            is found.
+        length: median length, px, of the used streaks, or of all streaks or regions found if none is used;
+            NaN if none is found.
         endpoints: both ends (x, y) of each of the streaks found (found, 2, 2), px. If a rate was found, the
             first ends of all streaks correspond to the same instant. With the status `rate`, the first end of
             each streak is earlier than its second end.
@@ -198,7 +199,7 @@ class FrameMotion:
 
     @property
     def found(self) -> int:
-        """The number of streaks with two ends."""
+        """The number of streaks found."""
         return len(self.endpoints)
 
     @property
@@ -239,8 +240,8 @@ class MotionResult(FrameMotion):
         rate_model: fitted model of the rate, `constant` or `accelerating`.
         acceleration: fitted angular acceleration (3,), rad/s^2, or None if it was not fitted.
         reason: one-line reason why no rate was found. If a rate was found, `reason` is empty.
-        course: rotation estimated by the navigation filter, from which the fit took the higher-order terms;
-            None if the fit took no such terms.
+        course: rotation estimated by the navigation filter if the fit took its higher-order terms, otherwise
+            None.
         line_time_sigma: standard deviation of the delay between the exposures of successive rows, s.
     """
 
@@ -284,7 +285,7 @@ class MotionResult(FrameMotion):
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 
     def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
-        """Return the displacements (m, 2), px, of the stars `chosen` by a line time error of one sigma.
+        """Return the displacements (m, 2), px, of the stars `chosen` due to a line time error of one sigma.
 
         The delay of a star is proportional to the distance of its row from `middle_row`. If the line time is
         exactly known, an empty array (0, 2) is returned.

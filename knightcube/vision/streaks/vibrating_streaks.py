@@ -1,9 +1,9 @@
 """Model of the counts of the streaks of a vibrating camera, with derivatives.
 
 If the camera vibrates, the path of a star bends and its speed changes within a few px, which the arcs of
-`streak_model` do not describe. In this module, a streak is a sum of Gaussians at instants of the exposure, as
-the spots of `streak_model` are, each integrated over every pixel. The instants near a block of pixels are the
-nodes of a Gauss-Legendre quadrature over the time during which the star may light the block.
+`streak_model` do not describe. In this module, a streak is modelled like a spot in `streak_model`: as a sum
+of Gaussians at instants of the exposure, each integrated over every pixel. The instants for a block of pixels
+are the nodes of a Gauss-Legendre quadrature over the time during which the star is near the block.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.streak_model import IMAGES, profile
 
-# Number of images of displacements along the path, which follow the images of `streak_model`.
+# Number of images for displacements along the path, stored after the images of `streak_model`.
 _ALONG_IMAGES = 2
 # Distance (point-spread widths) beyond which the light of a Gaussian is neglected.
 _BEYOND = 5.0
@@ -51,7 +51,7 @@ Rotations = Callable[[FloatArray], FloatArray]
 
 
 class _Instants(NamedTuple):
-    """Instants at which the stars of b blocks of pixels light their blocks: i nodes of a quadrature.
+    """Instants at which the star of each of b blocks of pixels is near its block: i nodes of a quadrature.
 
     The instants have the `time` (b, i), in exposures since mid-exposure, and the `weight` (b, i) in the
     integral over the exposure. The positions `place` of the stars include the vibration, the unit tangents
@@ -72,10 +72,9 @@ def images(
 ) -> Float32Array:
     """Return images (b, IMAGES + 3, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The first IMAGES images have the same meaning as in `streak_model`. The next two are the derivative of the
-    counts with respect to a displacement along the path, and the same derivative with the displacement
-    multiplied by the distance along the path from the centre of the block. The last image of each block is
-    not initialised.
+    The first IMAGES images have the same meaning as in `streak_model`. The next two are the derivatives of
+    the counts with respect to a constant displacement along the path, and to a displacement proportional to
+    the distance along the path from the centre of the block. The last image of each block is not initialised.
     """
     shape = strips.index.shape
     out = np.empty((shape[0], IMAGES + _ALONG_IMAGES + 1, *shape[1:]), dtype=np.float32)
@@ -206,8 +205,8 @@ def _sums_numpy(
     """Return weighted sums (b, d + 2, LINES, k) of Gaussians of unit flux, integrated over every pixel.
 
     The Gaussians with the standard deviation `sigma` (px) are at i positions `place` (b, i, 2), with a
-    `weight` (b, i). The sums are the counts of the `count` pixels k of each line, their derivative with
-    respect to `sigma`, and their derivatives with respect to d displacements `moved` (b, d, i, 2). The
+    `weight` (b, i). The d + 2 sums are the counts of the k = `count` pixels of each line, their derivative
+    with respect to `sigma`, and their derivatives with respect to d displacements `moved` (b, d, i, 2). The
     attributes `corner` and `step` of the blocks are described in `Strips`. A Gaussian is the product of a
     function of the coordinate along the lines of pixels and a function of the coordinate across the lines.
     """
