@@ -198,8 +198,7 @@ class CameraMotion:
         return out * (time * time * time, time * time, time)[derivative]
 
     def _shaken(self, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the vibration's part (3, m) of the rotation vector at `time` (m,), and two time
-        derivatives."""
+        """Return the vibration's part (3, m) of the rotation vector at `time` (m,), and two derivatives."""
         smooth, acceleration = self.smooth, self.acceleration[:, None]
         turn = self.rate[:, None] * time + 0.5 * acceleration * time**2 + smooth.higher(time)
         rate, bent = smooth.rate_at(time) + 0.0 * turn, acceleration + smooth.higher(time, 2)

@@ -178,7 +178,7 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return a mask (judged,) of the stars, among the first `judged`, that seem to be segments of streaks.
+    """Return a mask (judged,) of those of the first `judged` stars that seem to be segments of streaks.
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
     on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.
@@ -280,7 +280,7 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y in the vector of shared parameters and one star's parameters.
+# Indices of rate, acceleration, x and y in the vector of the shared parameters, then those of one star.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 # Last step of a joint fit (standard deviations) above which the fit has not converged.
 _UNSETTLED = 2.0
@@ -444,8 +444,8 @@ def estimate_rate(
         camera: pinhole model or calibrated lens.
         exposure: exposure time, s.
         prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
-            the rotation. If its component along the measured rate is at most three standard deviations, the
-            status is `ambiguous`.
+            the rotation. If its component along the measured rate is at most `settings.sign_sigmas` standard
+            deviations, the status is `ambiguous`.
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         settings: gain, saturation, point spread and line time of the camera, and limits of the fit.
 
@@ -645,7 +645,7 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
 def _candidate(
     camera: FitProblem, seen: MotionResult, first: StreakFit
 ) -> tuple[StreakFit | None, _Candidate]:
-    """Return the joint fit that starts from the fit `first`, or None if it fails, and its motion.
+    """Return the joint fit that starts from the fit `first` (None if it fails), and the resulting motion.
 
     A learned profile of the PSF multiplies the work of each evaluation of the model. The work of a fit with
     such a profile is therefore limited separately.

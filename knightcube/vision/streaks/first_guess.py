@@ -108,10 +108,10 @@ def scan_angles(
 
 
 _Best = tuple[FloatArray, IntArray, FloatArray, FloatArray]
-"""Results of the search for boxes of w lengths along the circles of n regions, each (w, n).
+"""Best boxes for each of w box lengths and each of n regions: four arrays (w, n).
 
-The arrays are explained chi-square, first sample, sum of the samples, and number of samples within the frame,
-for the best position of each box. A box is an interval of samples on a circle.
+A box is an interval of samples on the circle of a region. The arrays are the explained chi-square, the index
+of the first sample, the sum of the samples, and the number of samples within the frame.
 """
 
 
@@ -133,7 +133,7 @@ class _Boxes:
     step: float
 
     def best(self, widths: IntArray) -> _Best:
-        """Return the box that explains most chi-square, for each region and each length in `widths` (w,)."""
+        """Return the box that explains most of chi-square, for each of `widths` (w,) and each region."""
         return _best_boxes(self.total, self.exist, self.variance, self.middle, widths)
 
 
@@ -176,7 +176,7 @@ def _best_boxes(
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return cumulative sums, along circles, of samples limited to a multiple of their region's median."""
+    """Return cumulative sums of samples along `circles`; each sample is at most `_CAP` times a median."""
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
@@ -248,7 +248,7 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Proportional part of the standard error of a region's length, as a fraction of the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of two rankings, with and without contradicting regions.
+# Maximum number of rotation angles from each of two rankings: by votes minus contradictions, and by votes.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) between the circles on which two fragments of one streak lie.
 _SAME_CIRCLE = 2.0
@@ -264,7 +264,7 @@ _LEAST_GROWTH = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGuess:
-    """An initial guess of the motion, and of the stars: centres (n, 2), px, and fluxes (n,), counts.
+    """Initial guess of motion and stars: centres `stars` (n, 2), px, and fluxes `light` (n,), counts.
 
     The attribute `contradicted` is the fraction of the flux in regions too long for the rotation angle.
     """
@@ -307,7 +307,7 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
 def _likeliest_axis_numpy(
     leaders: FloatArray, equation: FloatArray, flow: FloatArray, tolerance: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Return the best rotation axis (3,) that a pair of `leaders` proposes, or zeros if no pair proposes any.
+    """Return the best rotation axis (3,) proposed by a pair of `leaders`, or zeros if all pairs are parallel.
 
     The `leaders` (k, 3) are equation vectors. The equation vectors `equation` (n, 3), image-flow matrices
     `flow` (n, 2, 3), standard errors `tolerance` (n,), rad, and the `weight` (n,) belong to the regions that
@@ -408,7 +408,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     pixels = regions.column, regions.row, regions.light, regions.owner
     (mean, square, height), (low, high), bounds = _arcs(pixels, frame, reference, view)
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
-    # The variance of the brightness along a uniform arc is length^2 / 12 plus the variance of the PSF.
+    # The second moment of brightness along a uniform arc is length^2 / 12 plus the variance of the PSF.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     arcs = height, mean + reference, bounds[0] + reference, bounds[1] + reference, width
     at_border = _at_border(regions, pinhole, low), _at_border(regions, pinhole, high)
@@ -606,7 +606,7 @@ def _stars_of_angle(
     reach = np.abs(guess.last - guess.first)
     one = guess.cut_first ^ guess.cut_last
     cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # The centre of a truncated streak is computed from its end in the frame. Regions are 2 px longer.
+    # The centre of a truncated streak is computed from its end in the frame. Its region extends 2 px farther.
     past = 2.0 / guess.speed
     middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)
     middle = np.where(whole, guess.middle - growth / 12.0 * angle, middle)
@@ -625,7 +625,7 @@ _FRAME_FACTOR = 1.1
 _FRAME_SHORTEST = 5
 # Factor by which the search for the rotation angle reduces the number of circles.
 _SPARSE = 2
-# Minimum significance (standard deviations) of a possible streak against the samples on both sides of it.
+# Minimum significance (standard deviations) of a possible streak above the samples on both sides of it.
 _LEAST_SIGMAS = 5.0
 # Upper limit of the significance (standard deviations) of one possible streak in the sum over all streaks.
 _FRAME_ENOUGH = 40.0
@@ -633,7 +633,7 @@ _FRAME_ENOUGH = 40.0
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
     """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
-    # The grid is sampled as for a rotation by one radian.
+    # The sampling of the grid is that for a rotation of one radian.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
     held = cumulative_sums(frame.sums, pinhole, grid)

@@ -87,8 +87,8 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px) above which a star without effect on the motion makes the first iteration reselect pixels.
-# Later iterations ignore the displacements of such stars, which are often poorly known.
+# Displacement (px) of a star without effect on the motion after which the first iteration selects pixels
+# again. Later iterations ignore the displacements of such stars, which are often poorly known.
 _FAINT_DRIFT = 3.2
 # Change of the angular acceleration, as a fraction of the rotation, above which pixels are selected again.
 _GROWN = 0.1
@@ -96,7 +96,7 @@ _GROWN = 0.1
 SETTLED = 0.4
 # Largest ratio of the lengths of a step and the preceding step that counts as progress of the fit.
 _LEAST_PROGRESS = 0.7
-# Number of iterations after which the set of pixels excluded as outliers no longer changes.
+# Number of iterations after which the set of pixels excluded as outliers is fixed.
 _LOOKS = 1
 # Probability of a false alarm of the score test for a changing rate.
 _BY_CHANCE = 1e-4
@@ -184,10 +184,10 @@ class FitProblem:
 class StreakFit:
     """A fitted scene with the solution and the normal equations of the last step.
 
-    The normal equations are those of the scene `before` the last step. The last step of the shared
-    parameters, in standard deviations, is 0 if the fit is converged. The mask `free` (SHARED,) selects the
-    fitted parameters among the shared parameters. The stars `hidden` were subtracted from the frame instead
-    of fitted; None if the fit did not subtract stars.
+    The normal equations are those of the scene `before` the last step. The attribute `last_step` is the last
+    step of the shared parameters, in standard deviations, or 0 if the fit is converged. The mask `free`
+    (SHARED,) selects the fitted parameters among the shared parameters. The stars `hidden` were subtracted
+    from the frame instead of fitted; None if the fit did not subtract stars.
     """
 
     scene: StreakScene
@@ -355,8 +355,8 @@ _LEAST_VALID = 0.7
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
-# Lower limit of a star's speed in the expected intensity, as a fraction of the mean speed.
-# The PSF keeps the intensity finite at points at which the star is nearly at rest.
+# Lower limit of the star's speed from which the intensity is predicted, as a fraction of the mean speed. The
+# PSF keeps the intensity finite at points at which the star is nearly at rest.
 _SLOW = 0.5
 # Minimum intensity beyond a streak end that counts as a trail, as a fraction of the mean intensity.
 _TRAIL = 0.08
@@ -483,7 +483,7 @@ _FramePixels = tuple[Float32Array, Float32Array, BoolArray]
 def _band_means_numpy(
     position: FloatArray, velocity: FloatArray, frame: _FramePixels, shape: tuple[int, int], samples: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return means and standard errors (n,) of `brightness` for positions and velocities (2, n * samples).
+    """Return the result of `brightness`, given the positions and velocities (2, n * samples) of all samples.
 
     The argument `shape` contains the numbers of columns and rows of the frame.
     """
@@ -540,11 +540,11 @@ _EDGE_SIGNIFICANCE = 5.0
 _CAP = 2.0
 # Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3
-# Error (px) of the length of a streak above which this length counts as wrong.
+# Length error (px) above which the length of a streak counts as wrong.
 _LEAST_OFF = 4.0
 # Difference (px) between the length errors of two streaks below which these errors count as equal.
 _ALIKE = 3.0
-# Minimum ratio of the numbers of streaks with a wrong and with the correct length, for a correction.
+# Minimum number of equal length errors per correct length for a correction of the rotation angle.
 _MORE = 2
 # Largest relative change of the rate for which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5
@@ -631,9 +631,9 @@ _FAR = 6.0
 _MOST_REPEATS = 2
 # Error of the modelled counts of a subtracted star on a pixel, as a fraction of these counts.
 _SUBTRACTION_ERROR = 0.35
-# Maximum total number of pixels in all fit windows, counted once per window, for memory and time.
+# Maximum total number of pixels in all fit windows, counted once per window, to limit memory and time.
 _MOST_PIXELS = 60_000
-# Fraction of the maximum number of pixels for a fit of only the brightest streaks and their neighbours.
+# Fraction of this number for the brightest streaks in a fit of only these and their neighbours.
 _BRIGHTEST_SHARE = 0.5
 # Minimum number of bright streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10
@@ -846,8 +846,9 @@ def _subtract_numpy(
 ) -> None:
     """Subtract stars from the frame's `signal`, and add the squared errors of their model to its `floor`.
 
-    The `images` (b, l, k) of stars of unit flux, multiplied by the flux `light` (b,) of the star of each
-    block, are the modelled counts on the `pixels`, which are the attributes `index` and `inside` of `Strips`.
+    The modelled counts are the `images` (b, l, k) of stars of unit flux, multiplied by the flux `light` (b,)
+    of the star of each block. The pair `pixels` contains the attributes `index` and `inside` of `Strips` or
+    `Patches`.
     """
     index, inside = pixels
     counts, at = (images * light.astype(np.float32)[:, None, None])[inside], index[inside]

@@ -121,8 +121,9 @@ def evaluate(
     """Return the normal equations of `scene` on the pixels of its fit windows.
 
     The residual limit `clip` for outlier pixels is in standard deviations. The flag `growing` states whether
-    the angular acceleration is fitted, and `tested` whether a score test needs its derivatives. For the
-    score test, derivatives that are linear within a block of pixels suffice; for the fit, they do not.
+    the angular acceleration is fitted, and `tested` whether a score test needs the derivatives with respect
+    to it. For the score test, derivatives that are linear within a block of pixels suffice; for the fit, they
+    do not.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows, growing)
@@ -152,9 +153,9 @@ def evaluate(
 def _matrices_numpy(geometry: FloatArray, light: FloatArray, trusted: BoolArray) -> FloatArray:
     """Return the coefficients (b, IMAGES, SHARED + ALONE) that combine images into derivatives of the counts.
 
-    The coefficients `geometry` (b, IMAGES, 8) are those of `streak_model.coefficients`. The arrays `light`
-    (b,) and `trusted` (b,) are the flux of the star of each block, and whether it contributes to the fit of
-    the shared parameters.
+    The coefficients `geometry` (b, IMAGES, 8) are those of `streak_model.coefficients`. The array `light`
+    (b,) is the flux of the star of each block, and `trusted` (b,) states whether this star contributes to the
+    fit of the shared parameters.
     """
     out = np.zeros((*geometry.shape[:2], SHARED + ALONE))
     out[:, :, :6] = geometry[:, :, :6] * light[:, None, None]
@@ -189,8 +190,8 @@ def _add(
 ) -> None:
     """Add the contributions of blocks of pixels, in the order of their stars, to the normal equations.
 
-    The last of the `images` of each block of pixels is filled with the residuals of the modelled counts
-    `total` of all fitted pixels.
+    The last of the `images` of each block is overwritten by the residuals, which follow from the modelled
+    counts `total` of all fitted pixels.
     """
     blocks, count = images.shape[:2]
     if not blocks:
@@ -256,10 +257,10 @@ def _sum_products_numpy(
 
     The weights (b, p), and the residuals in the last of the `images` (b, i + 1, p), are computed from the
     modelled counts `total` of all fitted pixels. Products of the residual with the other images give the
-    gradient, and the squared residual gives chi-square. The pair `of_blocks` contains the star of each block
-    (b,), and coefficients (b, i, SHARED + ALONE). The derivatives of the modelled counts with respect to the
-    parameters are linear combinations of the images with these coefficients. The coefficients of images that
-    are zero on a block of pixels are set to zero.
+    gradient, and the squared residual gives chi-square. The pair `of_blocks` contains the star (b,) of each
+    block, and the coefficients (b, i, SHARED + ALONE) that combine the images into derivatives of the
+    modelled counts with respect to the parameters. If an image is zero on a block of pixels, its coefficients
+    are set to zero.
     """
     star, matrix = of_blocks
     weight[:], images[:, -1] = residuals(total, of_pixels, limits)
@@ -360,7 +361,7 @@ def _multiply_images(
 def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
     """Add the products `gram` of images to the gradient and the information matrix of one star.
 
-    The coefficients `matrix` (i, SHARED + ALONE) of images that are zero are set to zero.
+    If an image is zero, its row of the coefficients `matrix` (i, SHARED + ALONE) is set to zero.
     """
     images = len(matrix)
     row = np.empty(_PARAMETERS)
@@ -383,7 +384,7 @@ def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, 
 def _spot_images(
     scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
 ) -> Float32Array:
-    """Return derivatives (n, SHARED + ALONE + 1, p, p) of n spots of p x p pixels with respect to parameters.
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the counts of n spots on p x p pixels each.
 
     The last element along the second axis is an uninitialised buffer for the residuals.
     """
@@ -420,7 +421,7 @@ class Solution:
 
     @property
     def joint(self) -> FloatArray:
-        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of the shared and each star's own parameters."""
+        """The covariance (n, SHARED + ALONE, SHARED + ALONE), for each star, of shared and own parameters."""
         kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
         joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
         joint[:, :SHARED, :SHARED] = self.covariance
@@ -465,11 +466,11 @@ _SINGULAR = 1e10
 def _eliminated_numpy(
     information: FloatArray, kept: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return three attributes of `EliminatedEquations`, and a measure of how singular the equations are.
+    """Return the attributes `own`, `gain` and `inner` of `EliminatedEquations`, and a measure of singularity.
 
     The arguments are the information of `Evaluation` and the indices `kept` (k,) of the fitted parameters.
-    The attributes are `own`, `gain` and `inner`. The last returned value is the largest element of `inner`
-    for parameters scaled to a unit information, or infinity.
+    The measure of singularity is the largest element of the inverse of the information matrix scaled to a
+    unit diagonal, or infinity.
     """
     alone = information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
@@ -526,9 +527,9 @@ def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, Fl
 
 @loop_helper
 def _inverted(matrix: FloatArray) -> float:
-    """Replace an information matrix (k, k) by its inverse, and return how singular the matrix is.
+    """Replace an information matrix (k, k) by its inverse, and return a measure of its singularity.
 
-    The returned measure of singularity is that of `_eliminated_numpy`.
+    The measure is that of `_eliminated_numpy`.
     """
     count, size = len(matrix), 0.0
     scale, pair = np.empty(count), np.zeros((count, 2 * count))
@@ -569,7 +570,7 @@ def _invert(pair: FloatArray) -> None:
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
     """Return the step of all parameters towards maximum likelihood, or None if the equations are singular.
 
-    The coupling of stars by shared pixels is included by at most `rounds` conjugate-gradient iterations.
+    At most `rounds` conjugate-gradient iterations account for the coupling of stars by shared pixels.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
@@ -647,7 +648,7 @@ def _solution_numpy(
 
 
 def _without_coupling(eliminated: EliminatedEquations, right: FloatArray, shared: int) -> FloatArray:
-    """Return the solution of the equations without coupling of stars, with `shared` shared parameters."""
+    """Return the solution of the uncoupled equations, whose first `shared` parameters are common to all."""
     kept, own, gain, inner = eliminated
     alone = right[shared:].reshape(gain.shape[0], -1)
     step = inner @ (right[kept] - np.einsum("nij,nj->i", gain, alone))
@@ -695,10 +696,10 @@ def solution(
 ) -> FloatArray:
     """Return the vector of parameters (s + n a,) that solves the coupled normal equations.
 
-    The arguments are the information of `Evaluation`, the shared pixels of strips and of patches, the number
-    of shared pixels (`common`), the solution without coupling (`eliminated`), the mask (s,) of the fitted
-    shared parameters, the right-hand side (s + n a,), and the maximum number of iterations. If `rounds` is 0,
-    the coupling is neglected.
+    The array `information` is that of `Evaluation`, `crowds` are the shared pixels of strips and of patches,
+    and `common` is their number. The mask `free` (s,) selects the fitted shared parameters, and `right` (s +
+    n a,) is the right-hand side. At most `rounds` iterations start from the solution of `eliminated`, which
+    neglects the coupling; if `rounds` is 0, this solution is returned.
     """
     x, image, z = np.empty_like(right), np.empty_like(right), np.empty_like(right)
     light = np.empty(len(crowds[0][3]) + len(crowds[1][3]), dtype=np.float32)
@@ -793,7 +794,7 @@ def _multiply(
 def _add_changes(crowd: SharedPixels, vector: FloatArray, light: Float32Array, change: FloatArray) -> None:
     """Set `light` (e,) to the change of each star's counts due to the parameter step `vector` (n, s + a).
 
-    The changes of all stars on the same pixel are added to `change`.
+    The sum over all stars that share a pixel is added to the element of `change` for this pixel.
     """
     star, matrix, first, slot, _, images = crowd
     light[:] = 0.0
@@ -813,7 +814,7 @@ def _add_changes(crowd: SharedPixels, vector: FloatArray, light: Float32Array, c
 
 @loop_helper
 def _add_coupling(crowd: SharedPixels, change: FloatArray, light: Float32Array, out: FloatArray) -> None:
-    """Add the effect of other stars to the product `out` (n, s + a); `light` is overwritten."""
+    """Add the coupling of the stars to their uncoupled products `out` (n, s + a); `light` is overwritten."""
     star, matrix, first, slot, weight, images = crowd
     for e in range(len(slot)):
         light[e] = weight[e] * (change[slot[e]] - light[e])
@@ -834,13 +835,13 @@ def _add_scaled(total: Any, factor: Any, values: Any) -> None:
         total[k] += factor * values[k]
 
 
-# Ratio of a star's Fisher information to the largest of any star, below which the star is ignored.
+# Ratio of a star's Fisher information to the largest of all stars below which the star is ignored.
 _NOTHING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEquations:
-    """Each star's normal equations for k fitted shared parameters, after elimination of its own parameters.
+    """Normal equations of each star for k shared parameters, after elimination of the star's own parameters.
 
     The attribute `kept` (k,) contains the indices of the fitted parameters. The equations consist of the
     information matrix (n, k, k) and the gradient (n, k) of the log-likelihood of each star (`score`).

@@ -514,8 +514,7 @@ def _reaches_end(of_lines: FloatArray, width: float, sign: float, later: float) 
 
 @loop_helper
 def _from_end(pixels: Float32Array, of_lines: FloatArray, width: float, sign: float, later: float) -> None:
-    """Compute the distances of all pixels from one streak end, in point-spread widths, and Gaussian
-    exponents.
+    """Compute the distance (point-spread widths) of each pixel from one streak end, and Gaussian exponents.
 
     The arguments are described in `_reaches_end`, except that the delay increases by `later` from pixel to
     pixel.

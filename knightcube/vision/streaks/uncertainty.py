@@ -54,8 +54,8 @@ _LEAST_SENSITIVITY = 0.02
 class Displacement:
     """RMS displacement (px) of streaks, or of their ends, that would cause the residuals of the fit.
 
-    The significant part `shown` is computed after two standard deviations of chi-square are subtracted, and
-    the upper limit `chance` from chi-square plus one standard deviation.
+    The significant displacement `shown` follows from the excess chi-square minus two standard deviations of
+    chi-square, and the upper limit `chance` from the excess plus one standard deviation.
     """
 
     shown: float
@@ -146,13 +146,13 @@ def correct(
     described: int,
     counted: FloatArray | None = None,
 ) -> CalibrationCorrection | None:
-    """Return the joint solution for shared parameters and calibration errors; None for singular equations.
+    """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
 
     The information (n, k, k) and the score (n, k) are described in `StarEquations`. The argument `spread` is
-    the ratio of the variance of the stars' scatter to the variance of their noise. Each of m calibration
-    errors of one standard deviation changes each star's estimate by `apparent` (n, k, m); the first
-    `described` errors have a specified standard deviation. The estimated errors are in addition to the errors
-    `counted` (m,), in standard deviations, which the fit has already corrected.
+    that of `_LensEffect`. Each of m calibration errors of one standard deviation changes each star's estimate
+    by `apparent` (n, k, m); the first `described` errors have a specified standard deviation. The fit has
+    already corrected the errors `counted` (m,), in standard deviations, and only the remaining errors are
+    estimated.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -193,8 +193,9 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
     """Return the apparent rate changes (n, 3, m), rad per exposure, of n stars due to m calibration errors.
 
     Each calibration error has the size of its standard deviation. Exactly known calibration parameters
-    are omitted. The last of the m errors is the error of the line time. A streak determines the position
-    of its path perpendicular to the path, and its ends determine the length.
+    are omitted. If the errors are independent and the line time is uncertain, the last of the m errors is the
+    error of the line time. A streak determines the position of its path perpendicular to the path, and its
+    ends determine the length.
     """
     errors = _error_root(camera)
     n = len(scene.stars)
@@ -225,7 +226,7 @@ def _error_root(camera: FitProblem) -> FloatArray:
     """Return a root (5, m) of the covariance of the calibration errors, one column per independent error.
 
     The rows are relative focal length, centre x and y (px), distortion at the corner, and line time (s). If
-    the errors are independent, the last column is the error of the line time.
+    the errors are independent and the line time is uncertain, the last column is the error of the line time.
     """
     known = camera.settings.knowledge
     if known.covariance is not None:
@@ -273,9 +274,9 @@ class _PathLight(NamedTuple):
     """Sums over the pixels of a streak that determine chi-square for any intensity along its path.
 
     The distances along the path (k,), px, are counted from the point at which the image of the star is at
-    rest. A pixel has the counts d, the weight w and the value g of the PSF profile across the path. The sums
-    of w g^2 (`square`), w g d (`cross`) and w g (`plain`) extend over the pixels nearest to each point of the
-    path, the sums of w, w d and w d^2 (`moments`) over all pixels.
+    rest. A pixel has the counts d, the weight w and the value g of the PSF profile across the path. The
+    arrays `square`, `cross` and `plain` are the sums of w g^2, w g d and w g over the pixels nearest to each
+    point of the path. The `moments` are the sums of w, w d and w d^2 over all pixels.
     """
 
     places: FloatArray
@@ -348,7 +349,7 @@ def _path_light(
 
 
 def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
-    """Return the chi-square (s, l) of a streak for reversing motions.
+    """Return the chi-square (s, l) of a streak for s x l reversing motions.
 
     The motion reverses once. The array `shares` (s,) contains ratios of the durations before and after the
     reversal, and `lengths` (l,) the path lengths, px. Flux of the star and sky level are fitted to the pixels
@@ -377,7 +378,7 @@ _TORQUE_STEP = 0.031
 # Upper limit (px) of this error. If the acceleration is so large (3 px or more) that the error exceeds the
 # limit, other checks mostly reject the frame.
 _MOST_OF_STEP = 0.1
-# Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
+# Number of stars up to which their agreement cannot be tested, and the factor of the variance in this case.
 _UNCHECKED = (2, 4.0)
 # Relative differences between fitted and configured PSF variance that are neglected if the fitted PSF is
 # narrower or wider than configured. The second limit is small, because a fast vibration makes streaks wider.
@@ -395,7 +396,7 @@ _LEARNED_SHARE = 0.5
 _END_SHOWN = 1.5
 # Ratio of the uncertainty of the streak ends to the upper limit of their displacement.
 _END_CHANCE = 0.5
-# Ratio of the streak ends' error (px) to the vibration across (px) or along (brightness fraction) streaks.
+# Error of the streak ends (px) per vibration across the streaks (px) or along them (fraction of brightness).
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
@@ -403,7 +404,7 @@ _MOST_LENSES = 3
 _SMALL_ERROR = 0.2
 # Relative uncertainty of the rotation due to lens errors above which the lens is always corrected.
 _WORTHWHILE = 0.002
-# Ratio of covariance to noise covariance above which model errors are the cause (three sigma).
+# Ratio of covariance to noise covariance (three sigma) above which the excess counts as model error.
 _BEYOND_NOISE = 9.0
 
 
@@ -454,14 +455,15 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     vibration, fast = vibration_covariance(camera, whole.scene, residuals)
     common_motion = find_common_motion(camera, whole.scene, residuals)
     if fast > 0.0:
-        # The covariance of the unresolved vibration replaces the limits on the motion common to all streaks.
+        # The covariance of the unresolved vibration includes the motion common to all streaks.
         common_motion = CommonMotion()
     end = _end_uncertainty(residuals, whole, settings, result.misfit)
     shaken = _END_COMMON * max(common_motion.across, common_motion.along)
     ends = float(np.sqrt(2.0) * np.hypot(end, shaken) / result.length)
     # If the fit did not converge, the uncertainty includes its last step.
     covariance = noise * spread * (1.0 + last.last_step**2)
-    # An error common to all streak ends changes the rotation angle; the axis is assumed to be as uncertain.
+    # An error common to all streak ends changes the rotation angle. The axis is assigned the same
+    # uncertainty.
     longer = ends**2 * float(rotation @ rotation)
     unmodelled = longer + max(0.0, float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
@@ -488,7 +490,7 @@ class _LensEffect:
     deviations.
 
     Attributes:
-        spread: ratio of the variance of the stars' scatter to the variance of their noise.
+        spread: ratio of the variance of the stars' estimates to the variance due to noise alone.
         seen: whether the calibration errors estimated from the stars are significant.
     """
 
@@ -506,9 +508,9 @@ def _corrected_lens(
 ) -> tuple[FitProblem, StreakFit, _LensEffect]:
     """Return camera and fit after a correction of the lens, and the effect of the remaining errors.
 
-    The estimates of lens errors that cause large displacements of streaks are too small. The fit is repeated
-    with the corrected lens until the correction is small. The lens is corrected if the stars show a
-    significant lens error, or if the lens errors cause most of the uncertainty.
+    If a lens error displaces the streaks far, its estimate is too small. The fit is therefore repeated with
+    the corrected lens until the correction is small. The lens is corrected if the stars show a significant
+    lens error, or if the lens errors cause most of the uncertainty.
     """
     first = lens = _lens_effect(camera, whole, exposure, None)
     if not lens.seen and np.trace(lens.described) < _WORTHWHILE**2 * np.sum(whole.scene.motion.rotation**2):
@@ -586,7 +588,7 @@ _LEAST_EFFECTIVE = 2.0
 
 
 def _scatter(equations: StarEquations, scene: StreakScene) -> float:
-    """Return the ratio of the variance of the stars' scatter to the variance of their noise."""
+    """Return the ratio of the variance of the stars' estimates to the variance due to noise alone."""
     return max(disagreement(*estimates_of(equations, scene)), contradiction(equations))
 
 
@@ -600,12 +602,13 @@ def disagreement(change: FloatArray, deviation: FloatArray) -> float:
     # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # Without excess scatter, the largest of several reduced chi-squares exceeds 1 by one standard deviation.
+    # Without excess scatter, the largest of several reduced chi-squares is about 1 plus one standard
+    # deviation.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
 
 
 def contradiction(alone: StarEquations) -> float:
-    """Return chi-square per degree of freedom of the differences of all stars' estimates from their solution.
+    """Return the chi-square per degree of freedom of all stars' estimates relative to their joint solution.
 
     In contrast to `disagreement`, this test uses all combinations of parameters that a star determines, each
     with the noise of that star.

@@ -2,9 +2,9 @@
 
 A vibration displaces the stars across their paths and changes their speed, and thereby the intensity, along
 their paths. The residuals of a fit without vibration show the displacements and the changes of intensity as
-functions of time. The vibration is modelled as a sum of few sinusoids of the camera's rotation vector. The
-initial value of each frequency is the trial frequency that decreases chi-square most. Gauss-Newton steps
-improve frequencies and amplitudes, and the motion and the stars are fitted again between the steps.
+functions of time. The rotation vector of the vibration is modelled as a sum of few sinusoids. The initial
+value of each frequency is the trial frequency that decreases chi-square most. Gauss-Newton steps improve
+frequencies and amplitudes, and the motion and the stars are fitted again between the steps.
 
 In the search for a frequency, the residuals in one time bin depend linearly on 12 numbers: the rotation
 vector, its time derivative, and the rotation vectors at the start and the end of the exposure, which move the
@@ -35,7 +35,7 @@ from knightcube.vision.streaks.vibrating_streaks import Rotations
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Part of this residual limit, as a fraction of the brightest modelled pixel of the same line.
+# Addition to this limit, as a fraction of the largest modelled counts of the star on the same line of pixels.
 _FOREIGN_SHARE = 0.6
 
 
@@ -45,7 +45,7 @@ class StreakResiduals:
 
     Attributes:
         strips: pixels of the blocks.
-        star: index in the scene of the star of each block (b,).
+        star: index in the scene of each block's star (b,).
         time: time at which the star crosses each line of pixels (b, LINES), in exposure times since
             mid-exposure.
         images: images that are combined to model a streak, on lines of k pixels (b, IMAGES, LINES, k).
@@ -72,16 +72,15 @@ class StreakResiduals:
         return self.sums_of_lines(2)
 
     def sums_of_lines(self, rows: int) -> LineSums:
-        """Return the sums over each line of pixels for the first `rows` of the four `_ROTATION_IMAGES`."""
+        """Return the sums over each line of pixels for the first `rows` images of `_ROTATION_IMAGES`."""
         return LineSums(*_line_sums(self.images, self.weight, self.residual, rows))
 
 
 class LineSums(NamedTuple):
     """Sums over the pixels of each of l lines of products of r images, see `_ROTATION_IMAGES`.
 
-    The arrays contain the weighted products of two images `gram` (l, r, r), the weighted products of image
-    and residual `score` (l, r), the weighted squared residuals `squares` (l,), and the number of fitted
-    pixels `used` (l,).
+    The array `gram` (l, r, r) contains the weighted products of two images, `score` (l, r) those of image and
+    residual, `squares` (l,) the weighted squared residuals, and `used` (l,) the number of fitted pixels.
     """
 
     gram: FloatArray
@@ -90,7 +89,7 @@ class LineSums(NamedTuple):
     used: IntArray
 
 
-# Images whose products with the residuals determine the rotation, the rate, and the rotations at both ends.
+# Indices of the images for the rotation, its rate, and the rotations at start and end of the exposure.
 _ROTATION_IMAGES = (1, 0, 3, 4)
 
 
@@ -170,9 +169,9 @@ def _chosen_residuals_numpy(
 ) -> tuple[Float32Array, Float32Array]:
     """Return weights and residuals of the blocks `chosen` (c,), see `StreakResiduals`.
 
-    The array `light` (c,) is the flux of the star of each chosen block. The modelled counts `total` of all
-    fitted pixels, the attributes `pixels` of all blocks, and the `gain` are those of
-    `normal_equations.residuals`. Pixels that contain flux of another star get the weight 0.
+    The array `light` (c,) is the flux of the star of each chosen block. The arguments `total`, `pixels` (of
+    all blocks) and `gain` are described in `normal_equations.residuals`. Pixels that contain flux of another
+    star get the weight 0.
     """
     slot, inside, signal, floor, ceiling = pixels
     own = slot[chosen], inside[chosen], signal[chosen], floor[chosen], ceiling[chosen]
@@ -291,7 +290,7 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
 _FINE_BINS, _RANGE = 512, 0.56
 # Highest frequency (cycles per exposure) that the time bins resolve, with two bins per cycle.
 _HIGHEST = _FINE_BINS / (4.0 * _RANGE)
-# Prior standard deviation (px) of a vibration, and of the errors of position, rate and acceleration.
+# Prior standard deviations (px): of a vibration, and of each error of position, rate and acceleration.
 _USUAL, _LOOSE = 1.0, 10.0
 # Lowest frequency of a vibration, and step between trial frequencies, in cycles per exposure.
 _LOWEST, _GRID = 0.75, 0.2
@@ -303,7 +302,7 @@ _UNRESOLVED = (2.2, 6.0)
 _SPECTRUM = 4096
 # Minimum decrease of chi-square by an unresolved vibration. Noise decreased it by at most 33 in 190 frames.
 _LEAST_UNRESOLVED = 36.0
-# Minimum decrease of chi-square by a fitted sinusoid, and the same as a fraction of the excess chi-square.
+# Minimum decrease of chi-square by a fitted sinusoid: absolute, and as a fraction of the excess chi-square.
 _LEAST_GAIN, _LEAST_SHARE = 60.0, 0.2
 # Maximum number of sinusoids, and minimum difference (cycles per exposure) between their frequencies.
 _MOST_SINUSOIDS, _LEAST_APART = 2, 1.0
@@ -315,7 +314,7 @@ _MOST_DETUNED = 0.3
 _LARGEST = 2.5
 # Error of the streak ends due to motions other than the sinusoids, as a fraction of their amplitudes.
 _MODEL_ERROR = 0.02
-# Instants at which the changes of a vibration are compared, in exposure times since mid-exposure.
+# Instants at which the change of a vibration by a step is evaluated, in exposure times since mid-exposure.
 _SAMPLES = np.linspace(-0.5, 0.5, 257)
 # Start and end of the exposure, relative to mid-exposure and in units of the exposure time.
 _ENDS = np.array([-0.5, 0.5])
@@ -354,7 +353,7 @@ def fit_vibration(
 def _converged(
     camera: FitProblem, fit: StreakFit, again: Callable[[StreakScene], StreakFit | None]
 ) -> StreakFit | None:
-    """Return `fit` after steps of its vibration, each followed by a fit of motion and stars.
+    """Return `fit` after Gauss-Newton steps of its vibration, each followed by a fit of motion and stars.
 
     Returns None if a fit does not succeed, or if no long streak shows the vibration.
     """
@@ -375,7 +374,7 @@ def _converged(
 
 
 def _excess(fit: StreakFit) -> float:
-    """Return chi-square minus the number of pixels of the fit before its last step."""
+    """Return chi-square minus the number of pixels, both before the last step of the fit."""
     return float(np.sum(fit.evaluation.chi2 - fit.evaluation.pixels))
 
 
@@ -431,7 +430,7 @@ def _unresolved_amplitude(sums: _RotationSums, known: Vibration, length: float) 
         return 0.0
     angular = 2.0 * np.pi * frequency[:, None]
     value, slope = (np.fft.rfft(sums.score[:, i].T, _SPECTRUM)[:, chosen].T for i in (0, 1))
-    # The transform of the slope's gradient corresponds to the derivative of a complex exponential.
+    # The derivative of exp(-i w t) with respect to time is -i w exp(-i w t), with `angular` as w.
     score = value - 1j * angular * slope
     parts = np.stack([score.real, score.imag], axis=-1)
     constant, square = (0.5 * sums.information[:, i, :, i].sum(axis=0) for i in (0, 1))
@@ -453,7 +452,7 @@ def _median_length(camera: FitProblem, scene: StreakScene) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RotationSums:
-    """Normal equations of rotation, rate, and rotations at start and end, in each of b time bins.
+    """Normal equations of b time bins for the rotation, its rate, and the rotations at both exposure ends.
 
     The equations consist of the Fisher information (b, 4, 3, 4, 3) and the gradient (b, 4, 3) of the
     log-likelihood (`score`). The attribute `time` (b,) contains the middles of the bins, in exposure times
@@ -474,14 +473,14 @@ class _RotationSums:
         return np.asarray(functions.reshape(len(functions), -1) @ self.score.reshape(-1, 3)).reshape(-1)
 
     def joint_information(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Return the information (3n, 3m) of n functions `first` (n, b, 4) and m `second` (m, b, 4)."""
+        """Return the joint information (3n, 3m) of functions `first` (n, b, 4) and `second` (m, b, 4)."""
         n, m = len(first), len(second)
         half = np.einsum("fbi,bikjl->fklbj", first, self.information, optimize=True)
         whole = half.reshape(9 * n, -1) @ second.reshape(m, -1).T
         return np.asarray(whole.reshape(3 * n, 3, m).transpose(0, 2, 1).reshape(3 * n, 3 * m))
 
     def information_of_pairs(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Return the information (n, 3, 3) between the functions of `first` (n, b, 4) and of `second`."""
+        """Return the joint information (n, 3, 3) of pairs of functions in `first` and `second` (n, b, 4)."""
         products = (first[..., None] * second[..., None, :]).reshape(len(first), -1)
         return (products @ self.information.transpose(0, 1, 3, 2, 4).reshape(-1, 9)).reshape(-1, 3, 3)
 
@@ -491,7 +490,7 @@ def _rotation_sums(
 ) -> _RotationSums:
     """Return the normal equations of a common rotation of the stars as a function of time.
 
-    Of the four rotations and rates of each time bin, the first `rows` are computed. The weight of a star is
+    The equations contain the first `rows` of the four quantities of `_RotationSums`. The weight of a star is
     limited by the scatter of its residuals, which includes model errors.
     """
     time, star = left.time.reshape(-1), np.repeat(left.star, LINES)
@@ -517,9 +516,9 @@ def _binned_equations_numpy(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information (bins, r, 3, r, 3) and the gradient (bins, r, 3) of `_RotationSums`.
 
-    The arrays `gram` (l, r, r) and `score` (l, r) are the information and the gradient of the displacements
-    of l lines of pixels, and `place` (l,) is the time bin of each line. The matrices `design` (l, r, 3) are
-    the derivatives of each line's r displacements with respect to the three components of a rotation.
+    The arrays `gram` (l, r, r) and `score` (l, r) are the information and the gradient of the r displacements
+    of each of l lines of pixels, and `place` (l,) is the time bin of each line. The matrices `design` (l, r,
+    3) are the derivatives of each line's r displacements with respect to the three components of a rotation.
     """
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(bins))
@@ -647,7 +646,7 @@ def _improved(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> 
     sine, cosine = amplitudes + step[smooth : smooth + 6 * k].reshape(2, k, 3)
     detuned = np.clip(step[smooth + 6 * k :], -_MOST_DETUNED, _MOST_DETUNED)
     frequency = np.maximum(vibration.frequency + detuned, _LOWEST)
-    # The derivatives of the rotation over the exposure with respect to all parameters; zero for the width.
+    # The derivative of the rotation over the exposure with respect to the width is zero.
     begin, end = _rotations(vibration)(_ENDS).transpose(2, 1, 0)
     rotation = np.insert(end - begin, smooth - 1, 0.0, axis=1)
     total = rotation @ _solved(matrix, rotation.T)
@@ -657,7 +656,7 @@ def _improved(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> 
 
 
 def _rotations(vibration: Vibration) -> Rotations:
-    """Return the rotations by a change of rate, of acceleration, and of each parameter of a `vibration`.
+    """Return a function of time for the rotations due to changes of rate, acceleration and `vibration`.
 
     The parameters of k sinusoids are the amplitudes of the sines (k, 3) and of the cosines (k, 3), and the
     frequencies (k,).
