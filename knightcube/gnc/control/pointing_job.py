@@ -219,7 +219,7 @@ def _task(
 def _slow_enough(
     wish: SlewRequest, task: SlewTask, fastest: float, near: SlewPath | None = None
 ) -> SlewPath | None:
-    """Return a path of a task on which the body is slower than `fastest` rad/s, or None if none is found.
+    """Return a path of a task with body rates below `fastest` rad/s, or None if none is found.
 
     The duration is increased if necessary. The search starts from `near`, the path of a similar task.
     """

@@ -79,7 +79,7 @@ class SweepCost:
         state: quadratic weights (n, 6, 6) of the errors.
         control: quadratic weights (n, controls) of the controls.
         state_slope, control_slope: linear weights of the errors (n, 6, columns) and of the controls (n,
-            controls, columns). Each of the columns of the linear weights belongs to one source of errors.
+            controls, columns). Each column of the linear weights belongs to one source of errors.
     """
 
     state: FloatArray

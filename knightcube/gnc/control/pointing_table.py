@@ -294,13 +294,12 @@ class PointingWeights:
     """Weights of errors and dipole moment, each given as the magnitude that has a cost of one.
 
     Attributes:
-        turn: rotation error about one axis that has a cost of one, rad.
-        rate: rate error about one axis that has a cost of one, rad/s.
-        dipole: dipole moment along one axis that has a cost of one, A m^2.
+        turn: rotation error about one axis, rad.
+        rate: rate error about one axis, rad/s.
+        dipole: dipole moment along one axis, A m^2.
         fastest: rate above which the cost increases steeply while the body approaches the attitude law (see
             `pointing_path.EXCESS`), rad/s.
-        roll: rotation error (rad) about the unit vector `axis` (3,) that has a cost of one, or None if
-            all axes have the same cost.
+        roll: rotation error about the unit vector `axis` (3,), rad, or None if all axes have the same cost.
     """
 
     turn: float

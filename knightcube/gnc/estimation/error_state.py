@@ -191,8 +191,8 @@ def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: Fl
     If no measurement depends on the common scale, the vector of the scaled states is itself the unobservable
     direction in state space. The correction `change` (n,) of the error state changes the unobservable
     direction, so the covariance is adjusted to the new direction. Without the adjustment of the covariance,
-    each correction would reduce the uncertainty of the scale. The states with the common scale are the slice
-    `at` of the error state, and had the `values` (m,) before the correction.
+    each correction would reduce the uncertainty of the scale. The slice `at` of the error state contains the
+    states with the common scale, whose values before the correction are `values` (m,).
     """
     along = values / (values @ values)
     covariance += np.outer(change, along @ covariance[at])

@@ -221,7 +221,7 @@ def correct(
     *,
     considers_age: bool = False,
 ) -> Correction:
-    """Correct a state by an innovation whose normalised square is at most `gate`.
+    """Correct a state by an innovation if its normalised square is at most `gate`.
 
     Above `rate_gate`, only the rate is corrected. If `considers_age` is true, the age of the inertial unit's
     samples is not corrected. The gain may then differ from the optimal gain, because the covariance update is
