@@ -11,12 +11,12 @@ the predicted field is rotated so that its direction and change agree with the m
 unknown, the measured field is assumed to continue to rotate at the present rate. In an orbit near the
 equator, however, the field's direction only oscillates by some 20 deg. In contrast to B-dot control, this
 detumbler also removes a spin along the field as soon as the field has rotated. The coils stay off until
-`TRUSTED` consecutive samples, also from outside the pauses, agree with the prediction of the filter and the
-standard deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no
+`TRUSTED` consecutive samples, also samples outside the pauses, agree with the prediction of the filter and
+the standard deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no
 sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
 
 The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
-obeys h' = m x B, where m is the dipole moment and B the field. The equation contains neither the inertia nor
+obeys h' = m x B, where m is the dipole moment and B the field. This equation contains neither the inertia nor
 the attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum magnitude L and the
 direction of -B x y, where the costate y is a constant vector. The momentum can be reduced to at most r within
 the time T if and only if every vector y satisfies the inequality
@@ -26,8 +26,8 @@ the time T if and only if every vector y satisfies the inequality
 The minimum time is the smallest T for which every vector y satisfies this inequality, and the planned costate
 is the vector y for which both sides are equal. For this costate, A(y) y is parallel to h, where A is the
 integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The costate is found by iteratively reweighted least
-squares: in each iteration, A is computed with the last costate, and the next costate from A. Momentum along
-the field can be removed only after the field has rotated, so the plan may first add momentum across the
+squares: in each iteration, A is computed from the previous costate, and the next costate from A. Momentum
+along the field can be removed only after the field has rotated, so the plan may first add momentum across the
 field. The plan leaves a residual momentum r, because the removal of the last momentum along a slowly rotating
 field would take most of the time.
 
@@ -69,10 +69,10 @@ STEEP = 12.0
 of |B x y| divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would
 then reverse the coil currents when B x y is small."""
 FLAT = 0.02
-"""Lower bound of |B x y| (field B, costate y), as a fraction of the largest |B x y|, which keeps the weights
-of the iteration finite."""
+"""Lower bound of |B x y| (field B, costate y), as a fraction of the largest |B x y|. The bound keeps the
+weights of the iteration finite."""
 FINENESS = 60
-"""Number of steps into which the search for the minimum time divides the minimum time."""
+"""Ratio of the minimum time to the tolerance of the search for this time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,8 +80,8 @@ class MomentumPlan:
     """A plan that removes the momentum in minimum time.
 
     Attributes:
-        costate: scaled costate y (3,), inertial axes, A m^2/T, which is zero for a body at rest. The
-            commanded dipole moment in the field B is -B x y, clipped at the limit of each coil.
+        costate: scaled costate y (3,), inertial axes, A m^2/T, or zero for a body at rest. The commanded
+            dipole moment in the field B is -B x y, clipped at the limit of each coil.
         horizon: time until the body is at rest, s.
     """
 
@@ -244,7 +244,7 @@ class _FieldPreview:
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return the matrix A(y) (3, 3) of the first `count` instants: it maps a costate to the next one."""
+        """Return A(y) (3, 3) of the first `count` instants, which maps the next costate to the momentum."""
         weight = self.reach / self.across(y, count)
         return np.asarray((weight @ self.effect[:count]).reshape(3, 3) + self.rest * _IDENTITY)
 
@@ -264,9 +264,9 @@ BOUNDED = 0.02
 SILENT_PERIODS = 2
 """Number of coil pauses without an accepted sample after which the coils are switched off again."""
 DRIFT = 0.015
-"""Largest rotation error (rad) that one standard deviation of the rate may cause in a driven phase. The
-direction of a measured field has about the same error, so the predicted field is nearly as accurate as a
-measured field."""
+"""Largest rotation error (rad) that one standard deviation of the rate may cause in a driven phase. The error
+of a measured field's direction is about as large, so the predicted field is nearly as accurate as a measured
+field."""
 SHORTEST = 9
 """Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
 OLDEST_NS = 100_000_000
@@ -283,12 +283,12 @@ prediction over 1,500 s, the first time step is 1 s and the last time step 15 s.
 LEFT = 0.9
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
-"""Ratio of the momentum to the residual momentum of a plan, and duration (s), that define the last phase of
-detumbling. A momentum below 4 times (FEW) the residual momentum of a plan is removed within 5 s (SOON) if the
-momentum along the field is small."""
+"""Largest momentum in the last phase of detumbling, as a multiple of the residual momentum of a plan, and
+duration (s) of this phase. A momentum below 4 times (FEW) the residual momentum is removed within 5 s (SOON)
+if its component along the field is below the residual momentum."""
 KNOWN, KNOWN_SHARE = 2e-3, 0.1
-"""The upper bounds of rate and energy are set when the standard deviation of the least certain rate component
-is below this, in rad/s (first value) or as a fraction of the rate (second value)."""
+"""Standard deviation of the least certain rate component below which the upper bounds of rate and energy are
+set, in rad/s (first value) or as a fraction of the rate (second value)."""
 _SECOND = 1e-9
 _ROUNDING = 1e-9
 """Rounding error of a scalar product that should be zero, divided by the lengths of both vectors."""
@@ -301,11 +301,12 @@ class FieldDetumblerSettings:
     """Settings of the field detumbler.
 
     Attributes:
-        limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
+        limit: dipole limit (A m^2) along each body axis, one number for all axes or an array (3,).
         horizon: duration of the field prediction, about a quarter of an orbit, s.
         replan: time between momentum plans, s.
-        gentle: initial rate up to which the upper bound of the rate equals the initial rate, rad/s.
-        spin_up: ratio of the upper bound of the rate to the initial rate if the latter is above `gentle`.
+        gentle: largest initial rate that is itself the upper bound of the rate, rad/s.
+        spin_up: ratio of the upper bound of the rate to the initial rate if the initial rate is above
+            `gentle`.
         slow: rate below which a body counts as detumbled, rad/s.
     """
 
@@ -345,9 +346,9 @@ class FieldDetumbler:
     ) -> None:
         """Create a detumbler whose rate filter has not started.
 
-        The function `expected` predicts the field at `braking.instants` after a given time, in the body axes
-        at that time or, if the attitude is unknown, in inertial axes. The function `expected` returns None
-        while the orbit is unknown.
+        The function `expected` predicts the field at `braking.instants` after a given time. The axes are the
+        body axes at that time or, if the attitude is unknown, inertial axes. The function `expected` returns
+        None while the orbit is unknown.
         """
         self._schedule = schedule
         self._braking = braking
