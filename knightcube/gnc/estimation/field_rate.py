@@ -49,16 +49,16 @@ LARGEST_ROTATION = 0.15
 COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
 """Longest time (s) and largest rotation (rad) of the body in one propagation step of the covariance."""
 _LINEARISED = 0.2
-"""Noise of the gyroscopic torque as a fraction of its uncertainty due to the inertia, while the rate is
-known. The noise represents products of errors, which the linearised filter neglects."""
+"""Noise of the gyroscopic torque, as a fraction of the uncertainty of this torque due to the inertia, while
+the rate is known. The noise represents products of errors, which the linearised filter neglects."""
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _SPINS = ((0.0, 0.5), (-1.5, 0.25), (1.5, 0.25))
-"""Initial spins about the field, and their probabilities. Each spin is given by its square, with the sign of
-the spin, in units of the variance of the spin. With `_SPIN_VARIANCE`, the spins have the mean and variance
-of the normal distribution that they represent."""
+"""Initial spins about the field, and their probabilities. The first value of each pair is s |s| / v, with the
+spin s and the prior variance v of the spin. Together with `_SPIN_VARIANCE`, the initial estimates have the
+mean and variance of the normally distributed prior."""
 _SPIN_VARIANCE = 0.25
-"""Variance of the spin of each initial estimate, as a fraction of the variance of the spin."""
+"""Spin variance of each initial estimate, as a fraction of the prior variance of the spin."""
 _TEMPER = 4.0
 """Divisor of the log-likelihoods from which the probabilities of the estimates are computed. A filter that is
 linearised about a wrong estimate has correlated innovations, so its likelihoods overstate the evidence."""
@@ -138,11 +138,11 @@ class FieldRate:
 
     The filter is linearised about an estimate, and the spin about the field is unknown at first. If it
     started with only one estimate, the filter could therefore converge to a wrong rate that predicts the
-    field almost as well as the true rate. The filter begins with three estimates of different spins, and
-    discards those that predict the field less well, or that have converged to the rate of another estimate.
-    The properties return the most probable estimate, and its covariance includes the differences to the
-    other estimates. For a body as slender as a rod whose moments of inertia have the ratio 50, the filter may
-    still keep a wrong rate. A gyro rate (`measure_rate`) excludes a wrong rate.
+    field almost as well as the true rate. The filter begins with three estimates of different spins. An
+    estimate is discarded if another estimate predicts the field much better, or if both have converged to the
+    same rate. The properties return the most probable estimate, whose covariance includes the differences to
+    the other estimates. For a body as slender as a rod whose moments of inertia have the ratio 50, the filter
+    may still keep a wrong rate. A gyro rate (`measure_rate`) excludes a wrong rate.
 
     Attributes:
         restarts: number of restarts after failed predictions.
@@ -390,7 +390,7 @@ class FieldRate:
 
 
 class FieldNoise:
-    """The noise of the magnetometer, estimated from the strength of the field, which no rotation changes.
+    """The noise of the magnetometer, estimated from the field strength, which is independent of rotations.
 
     The strength changes slowly, so the second differences of consecutive samples contain only noise. Their
     median is followed, because outliers hardly affect it.
@@ -516,8 +516,8 @@ class _Estimate:
         """Set the fractional uncertainty of the gyroscopic torque from the uncertainty of the inertia.
 
         Without noise for this torque, the covariance of the linearised filter would become too small while
-        the inertia is poorly known. The least certain combination of the tensor's elements is omitted,
-        because it is the common scale of the elements, which does not affect the gyroscopic acceleration.
+        the inertia is poorly known. The least certain combination of the tensor's elements is omitted: it is
+        the common scale, which does not affect the gyroscopic acceleration.
         """
         unknown = float(np.linalg.eigvalsh(self.covariance[INERTIA, INERTIA])[-2])
         self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)
