@@ -171,8 +171,8 @@ class HorizonCameraJob:
 class MeasuredDirection:
     """A direction (3,) in body axes, its covariance (3, 3), rad^2, and the cameras that measured it.
 
-    If `cameras` is empty, the Sun was estimated from the solar strings, or the nadir from the brightness of
-    the images.
+    If `cameras` is empty, a Sun direction was estimated from the solar strings, and a nadir from the
+    brightness of the images.
     """
 
     direction: FloatArray

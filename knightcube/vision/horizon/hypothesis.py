@@ -1,11 +1,11 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
-The significance of a horizon is an upper bound on the expected number of equally good horizons that other
-edges, such as coasts and the borders of clouds, form by chance. The density of chance edges is estimated from
-the number of edges beside the limb. A coast or cloud border that is tangent to the limb and has the radius of
-curvature R stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the
-same segment of a coast or cloud are not independent. The test therefore counts limb segments of the length 2
-sqrt(2 g R) instead of scan lines.
+Other edges, such as coasts and the borders of clouds, can form a horizon by chance. The significance of a
+horizon is an upper bound on the expected number of equally good chance horizons. The density of chance edges
+is estimated from the number of edges beside the limb. A coast or cloud border that is tangent to the limb and
+has the radius of curvature R stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan lines
+that cross the same segment of a coast or cloud are not independent. The test therefore counts limb segments
+of the length 2 sqrt(2 g R) instead of scan lines.
 """
 
 from __future__ import annotations

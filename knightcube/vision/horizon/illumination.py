@@ -311,7 +311,7 @@ def _sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, d
     """Return the sine of the Sun's elevation at the points where rays meet the surface of a sphere.
 
     The cosines are those of the angles between each ray and nadir, between each ray and the Sun (`ahead`),
-    and between nadir and the Sun (`below`). The camera's distance from the centre is in radii of the sphere.
+    and between nadir and the Sun (`below`). The camera's `distance` from the sphere's centre is in its radii.
     """
     depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
     return np.asarray((distance * cosine - depth) * ahead - distance * below)

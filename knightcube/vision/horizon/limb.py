@@ -389,7 +389,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
-    """Return the solution of normal equations for unknowns of different units, or None if singular."""
+    """Return the solution of normal equations for unknowns of different units; None if it is not unique."""
     diagonal = normal.diagonal()
     if not diagonal.min() > 0.0:
         return None

@@ -344,7 +344,7 @@ _PART = 0.6
 _HOPELESS = 4.0
 # Margin (standard deviations of the PSF) beyond the distance at which a star's profile equals the noise.
 _DIM_SIGMAS = 2.0
-# Minimum distance (px) from the image border of the ends of a streak or region that is inside the image.
+# Minimum distance (px) from the image border at which streak ends and regions count as inside the image.
 _BORDER_PX = 2
 # Largest standard deviation (px) of the ends of an object's streak.
 _VAGUE_PX = 3.0
@@ -479,7 +479,7 @@ class Judge:
         return other >= self.objects.point_significance * noise * float(np.sqrt(count + 1.0))
 
     def _pixels_of(self, label: int) -> IntArray:
-        """Return the pixels (x, y) of a region (m, 2), row by row."""
+        """Return the pixels (m, 2), (x, y), of a region, row by row."""
         regions = self.segmented.regions
         return pixels_of_region(regions.labels, regions.boxes[np.searchsorted(regions.label, label)], label)
 

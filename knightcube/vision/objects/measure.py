@@ -63,7 +63,7 @@ class Trails:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPatch:
-    """A rectangle of the image around a possible object, whose first pixel is at `corner` (x, y), px.
+    """A rectangle of the image around a possible object; its first pixel is at `corner` (x, y), px.
 
     The pixels `light` (rows, columns) are in counts above the sky level, and saturate at `ceiling` counts.
     The standard deviations of a background pixel (counts) and of the PSF (px) are `noise` and `psf`. The gain

@@ -1,4 +1,4 @@
-"""Test whether stars explain the light of a region, and location of the ends of an object's streak.
+"""Test of whether stars explain the light of a region, and location of the ends of an object's streak.
 
 The test compares two hypotheses by chi-square: that the light of the region comes from stars only, or from
 stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
@@ -213,8 +213,8 @@ class StarLight:
 
         The light is followed along the path of the streak beyond both `ends` (2, 2), px, but not into other
         regions. The path is straight relative to the stars if `among_stars` is true, otherwise straight in
-        the image. The initial ends are the ends of the most likely interval of uniform brightness without
-        light outside. Ends and brightness are then fitted to the pixels, from which known stars are
+        the image. The initial ends are those of the most likely interval with uniform brightness inside and
+        no light outside. Ends and brightness are then fitted to the pixels, from which known stars are
         subtracted.
         """
         beyond = max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))

@@ -66,7 +66,7 @@ class Regions:
         return select(self, chosen, "labels")
 
     def is_significant(self, sigmas: float, background: Background) -> BoolArray:
-        """Return the mask (n,) of the regions whose flux is at least `sigmas` standard deviations."""
+        """Return the mask (n,) of the regions whose flux is at least `sigmas` times its background noise."""
         return np.asarray(self.flux >= sigmas * background.typical_noise * np.sqrt(self.area))
 
     def __len__(self) -> int:
@@ -206,7 +206,7 @@ def _pixels_of_region_numpy(labels: Image, box: IntArray, label: int) -> IntArra
 
 @compiled_form_of(_pixels_of_region_numpy)
 def pixels_of_region(labels: Image, box: IntArray, label: int) -> IntArray:
-    """Return the pixels (x, y) of the region with a given `label` (m, 2), row by row.
+    """Return the pixels (m, 2), (x, y), of the region with a given `label`, row by row.
 
     The labels (rows, columns) and the bounding box (4,) are those of `Regions`.
     """
@@ -341,7 +341,7 @@ def _corners_of_regions(
         height, width = boxes[number, 1] - boxes[number, 0], boxes[number, 3] - boxes[number, 2]
         size = (height + 2 * _PADDING) * (width + 2 * _PADDING)
         largest, most = max(largest, size), most + size // 4
-    # Peaks of the response are not adjacent, so that a region has fewer peaks than a quarter of its pixels.
+    # Peaks of the response are not adjacent, so that there is less than one peak for every four pixels.
     corners, counts, total = np.empty((most, 2)), np.zeros(len(label), dtype=np.int64), 0
     scratch = np.empty((5, largest), dtype=np.float32)
     for number in range(len(label)):
@@ -627,7 +627,7 @@ def _separable(image: Image, down: FloatArray, across: FloatArray) -> FloatArray
 
 
 def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntArray:
-    """Return the pixels (x, y) in `mask` with a larger response than all eight neighbours, (n, 2).
+    """Return the pixels (n, 2), (x, y), in `mask` with a larger response than all eight neighbours.
 
     Pixels at the border of the image, and pixels below `relative` times the largest response in the mask, are
     excluded.
@@ -666,7 +666,7 @@ def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> 
 def find_corners(
     response: FloatArray, mask: BoolArray, relative: float, half_width: int, intensity: FloatArray
 ) -> FloatArray:
-    """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its cornerness (`response`).
+    """Return the corners (n, 2), px, of a region, which are the peaks of its cornerness (`response`).
 
     The position of a corner is the centre of intensity around the peak, computed in the image `intensity`.
     This image is the cornerness or, as in Sease, the frame. In the frame, the centres lie up to 2 px inside

@@ -265,7 +265,7 @@ def _shifted(count: int, step: int) -> slice:
 
 @compiled_form_of(_pixels_near_numpy)
 def pixels_near(points: FloatArray, reach: float, rows: int, columns: int) -> IntArray:
-    """Return the pixels (x, y) within about `reach` px of any of the points (m, 2), row by row, as (p, 2)."""
+    """Return the pixels (p, 2), (x, y), within about `reach` px of any of the points (m, 2), row by row."""
     r = math.ceil(reach)
     centres = np.empty(points.shape, dtype=np.int64)
     count, low_x, low_y, high_x, high_y = 0, columns + r, rows + r, -r, -r
