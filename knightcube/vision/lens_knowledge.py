@@ -192,7 +192,7 @@ def step(
         free, coupling = inverse @ (turn.T @ misfit), inverse @ (turn.T @ lens)
         turns.append((free, coupling))
         decrease += float(free @ (turn.T @ misfit))
-        beyond = lens - turn @ coupling  # effect of the lens parameters that a rotation cannot compensate
+        beyond = lens - turn @ coupling  # part of the lens effect that a rotation cannot compensate
         information += beyond.T @ beyond
         gradient += beyond.T @ misfit
     gradient += prior @ (expected - fit.parameters)
@@ -401,8 +401,8 @@ class LensKnowledge:
     ) -> LensKnowledge:
         """Return the lens parameters of a camera as configured, before its first frame.
 
-        The largest relative error of the focal length is `scale_error`. The line time of the shutter, s, may
-        be unknown, and `psf_sigma` is the standard deviation of the point spread function, px.
+        The largest relative error of the focal length is `scale_error`. The line time of the shutter, s, is
+        None if it is unknown. The standard deviation of the point spread function, px, is `psf_sigma`.
         """
         lens = Lens.of(camera)
         line_sigma = accuracy.line_time

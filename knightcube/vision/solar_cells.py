@@ -189,7 +189,7 @@ def _fitted_direction(
 
 
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the currents of strings, as fractions of the peak currents, and their derivatives.
+    """Return the currents of strings as fractions of the peak currents, and their derivatives by `cosines`.
 
     The argument `cosines` (...) contains the cosines of the angles between the Sun and the normals of the
     strings. The current is 0 if the Sun is behind the string.
@@ -268,8 +268,8 @@ class KnownDirections:
 class StringFix:
     """An attitude (4,), inertial to body axes, from the magnetic field and the solar strings.
 
-    The covariance (3, 3), rad^2, is in body axes. The standard deviation of the rotation about the field
-    direction `axis` (3,), body axes, is `about`, rad.
+    The covariance (3, 3), rad^2, is in body axes. The rotation about the field direction `axis` (3,), body
+    axes, has the standard deviation `about`, rad.
     """
 
     quaternion: FloatArray

@@ -1,4 +1,4 @@
-"""Star tracker as a single class, which returns the attitude from an image, or the reason for a failure.
+"""Star tracker as a single class that returns the attitude from an image, or the reason for a failure.
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
@@ -157,7 +157,7 @@ class StarSolution:
         return self.frame.fix is not None
 
     def __repr__(self) -> str:
-        """Return one line of text: status, pointing, uncertainty and number of stars, or the reason."""
+        """Return one line of text: status, pointing, uncertainty and star count, or reason for failure."""
         if not self:
             return f"<StarSolution {self.status}: {self.reason}>"
         right_ascension, roll = round(self.right_ascension_deg, 4) % 360.0, round(self.roll_deg, 3) % 360.0
@@ -282,7 +282,8 @@ class StarTracker:
                 predicted positions, which is faster than a search of the whole sky. If the search near the
                 predicted positions does not succeed, the whole sky is searched.
             attitude_sigma: standard deviation of the predicted attitude about each axis, rad.
-            rate: predicted angular velocity (3,), camera axes, rad/s; gives the sign of a measured rate.
+            rate: predicted angular velocity (3,), camera axes, rad/s, which determines the sign of a measured
+                rate.
             rate_sigma: standard deviation of each component of the predicted rate, rad/s.
 
         Raises:
@@ -350,7 +351,7 @@ class StarTracker:
         )
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
-        """Return the camera for an image of `shape`, and the range of scale (see `camera_of_field`)."""
+        """Return the camera for an image of `shape`, and the limits of its scale (see `camera_of_field`)."""
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)

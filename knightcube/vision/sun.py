@@ -178,7 +178,7 @@ class SunSolution:
         return self.sun is not None
 
     def __repr__(self) -> str:
-        """Return one line of text: status, direction and uncertainty, or the reason."""
+        """Return one line of text: status, direction and uncertainty, or the reason why no Sun was found."""
         if self.sun is None:
             return f"<SunSolution {self.status.value}: {self.reason}>"
         direction = ", ".join(f"{value:.5f}" for value in self.sun.direction)
@@ -522,7 +522,7 @@ _LAST_STEP = 1e-2
 _MOST_CORRELATED = 0.9
 """Largest assumed correlation between the errors of neighbouring points."""
 _TUKEY = 4.685
-"""Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
+"""Cut-off of Tukey's biweight (standard deviations), for 95 % efficiency with Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
 """Minimum ratio of the number of points on a smaller circle to that on the best circle.
 
@@ -585,7 +585,7 @@ def fit_circle(points: FloatArray, scale: float) -> Circle | None:
 
 
 def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return distances (n,) of points from a circle (x, y, radius), and their derivatives (n, 3)."""
+    """Return distances (n,) from a circle (x, y, radius), and their derivatives (n, 3) by its parameters."""
     offset = points - solution[:2]
     length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-12)
     slopes = np.concatenate([-offset / length[:, None], np.full((len(points), 1), -1.0)], axis=1)

@@ -127,7 +127,7 @@ def _bottom_up(header: dict[str, str], name: str) -> bool:
 
 
 def rows_reversed(path: Path) -> bool:
-    """Return whether `read_image` reverses the rows of a file: a FITS file with ROWORDER = 'BOTTOM-UP'."""
+    """Return whether `read_image` reverses the rows, as in FITS files with ROWORDER = 'BOTTOM-UP'."""
     content = _fits_content(path)
     return bool(content) and _bottom_up(_first_image(content, str(path))[0], str(path))
 

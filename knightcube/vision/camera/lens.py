@@ -345,7 +345,7 @@ class Lens:
         return np.stack([right, self.p1 * (square + 2.0 * y * y) + self.p2 * cross], axis=-1)
 
     def _pixels(self) -> FloatArray:
-        """Return the symmetric matrix (2, 2) that maps distorted tangents to non-square pixels."""
+        """Return the symmetric matrix A (2, 2) of pixels that are not square."""
         return np.array([[1.0 + self.aspect, self.shear], [self.shear, 1.0 - self.aspect]])
 
     def _radial_rays(self, stretched: FloatArray) -> FloatArray:
@@ -633,7 +633,7 @@ def _image_motion_numpy(
     image = (whole * away + _tangential_numpy(away, away, terms)) @ pixels + np.array(terms[2:4])
 
     def along(step: FloatArray) -> FloatArray:
-        """Return the derivative of the distortion along a step (m, 2)."""
+        """Return the directional derivative (m, 2) of the distortion for the displacements `step` (m, 2)."""
         closing = np.einsum("ij,ij->i", away, step)[:, None]
         radial = whole * step + 2.0 * slope * closing * away
         return np.asarray(radial + 2.0 * _tangential_numpy(away, step, terms))

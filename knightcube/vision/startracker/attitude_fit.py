@@ -99,7 +99,8 @@ class StarMatch:
             unknown.
         distortion: fitted distortion of the lens: displacement of a star in the image corner, relative to its
             distance from the optical axis; 0 if the stars matched without distortion.
-        from_lens: part (3, 3) of the covariance of `fix` due to the uncertainty of `distortion`, rad^2.
+        from_lens: part (3, 3), rad^2, of the covariance of `fix` that is due to the uncertainty of
+            `distortion`.
         mirrored: whether the stars were identified in the mirrored field (`StarField.mirrored`). For a
             mirrored field, `fix` is the attitude of the mirrored field.
     """
@@ -448,7 +449,7 @@ _DISTORTION_SETTLED = 1e-6
 _GATE_SIGMAS = 8.0
 # Minimum half-width of the gate within which a star matches a guide star, relative to the corner's tangent.
 _GATE_SHARE = 0.004
-# Residual above which a star is excluded from the final fit, in standard deviations of all residuals.
+# Residual above which a star is excluded from the final fit, in standard deviations of the residuals.
 _OUTLIER = 4.0
 # Median of the square root of chi-square with 2 degrees of freedom (the Rayleigh distribution).
 _RAYLEIGH_MEDIAN = 1.1774
@@ -465,7 +466,8 @@ class DistortedFit:
         distortion: radial distortion: displacement of a star in the image corner, relative to its distance
             from the optical axis.
         seen: unit vectors to all observed points, corrected for the distortion (n, 3), camera frame.
-        from_lens: part (3, 3) of the attitude covariance due to the uncertainty of the distortion, rad^2.
+        from_lens: part (3, 3), rad^2, of the attitude covariance that is due to the uncertainty of the
+            distortion.
     """
 
     observed: IntArray
@@ -520,7 +522,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Too large residuals increase the covariance from the stars, but not the variance of the prior.
+    # Residuals that are too large increase the covariance from the stars, but not the variance of the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2

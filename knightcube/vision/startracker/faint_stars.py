@@ -74,7 +74,8 @@ _BRIGHTNESS_ERROR, _UNSEEN = 0.35, 0.1
 # Distances (px) from the frame's edge, and from the points of the pair, within which a star is omitted.
 # Distance (px) within which the same pixels are possibly counted for two predicted stars.
 _EDGE, _BESIDE, _OVERLAPPING = 4, 10, 5.0
-# Standard deviation (px) of a predicted position, and side (px) of the square whose highest light is used.
+# Standard deviation (px) of a predicted position.
+# Side (px) of the square around a position, of which the highest signal is used.
 _PLACE_SIGMA, _SQUARE = 0.5, 3
 
 

@@ -47,11 +47,11 @@ from knightcube.vision.startracker.verification import VerificationSettings, not
 def scale_steps(field: StarField, tolerance: float) -> FloatArray:
     """Return the image scales (2 s + 1,) at the s + 1 limits and s middles of s steps, in ascending order.
 
-    Side ratios in a step differ from the ratios in its middle by at most `tolerance`. At a field angle of
-    tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2 / 2 across the radius.
-    The ratio of two sides of a triangle at the field-angle tangent t therefore depends on their directions by
-    up to t^2 / 2. The number of steps is computed for a triangle half-way between the image centre and a
-    corner.
+    Side ratios in a step differ from those in the middle of the step by at most `tolerance`. At a field angle
+    of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2 / 2 across the
+    radius. The ratio of two sides of a triangle at the field-angle tangent t therefore depends on their
+    directions by up to t^2 / 2. The number of steps is computed for a triangle half-way between the image
+    centre and a corner.
     """
     lowest, highest = field.scale
     half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -66,8 +66,8 @@ class TriangleMatches:
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint16.
         star: indices of the guide stars at the corresponding corners (k, 3), uint16.
-        scale: factor on the observed tangents that makes the longest sides of both triangles equal, as
-            `OCTAVE` times its binary logarithm (k,), int32.
+        scale: factor (k,) on the observed tangents that makes the longest sides of both triangles equal. The
+            int32 value is the factor's binary logarithm times `OCTAVE`.
     """
 
     observed: npt.NDArray[np.uint16]

@@ -65,7 +65,7 @@ _APART = 2 * _HALF_OF_FIRST + 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """The first fits of n stars, each with a free width (n,) of its Gaussian, px, and the windows fitted.
+    """The first fits of n stars, each with a free `width` (n,), px, of its Gaussian, and the fitted windows.
 
     The standard deviation of each width is `error` (n,), px. The mask `hot` (n,) marks hot pixels.
     """
@@ -511,7 +511,7 @@ def _fitted(
     freedom = np.maximum(found.used - found.covariance.shape[1], 1)
     excess = found.chi2 / freedom
     excess = np.where(excess > 1.0 + 3.0 * np.sqrt(2.0 / freedom), excess, 1.0) * targets.correlation**2
-    # The pixels of overlapping stars must determine several stars, so that overlap increases the covariance.
+    # The pixels must determine the parameters of several stars, so that overlap increases the covariance.
     excess = excess / (1.0 - pairs.overlap) ** 2
     covariance = found.covariance[:, :2, :2] * excess[:, None, None] + _FLOOR**2 * np.eye(2)
     flux_sigma = _flux_sigma(found, windows, spread.noise) * targets.correlation

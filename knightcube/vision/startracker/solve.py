@@ -547,7 +547,7 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
         return solution
     measured = float(np.median(width))
     doubt = SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
-    # The measured width includes the averaging over a pixel, whose variance is subtracted.
+    # The measured width includes the averaging over a pixel; the variance due to averaging is subtracted.
     psf_sigma = math.sqrt(max(measured**2 - PIXEL_VARIANCE, 0.0))
     return replace(solution, psf_sigma=psf_sigma).wider(np.diag([doubt**2, doubt**2, 0.0]))
 

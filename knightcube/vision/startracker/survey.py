@@ -51,7 +51,7 @@ from knightcube.vision.frame import (
 )
 
 KERNEL_NORM = 6.0
-"""Noise of the smoothed frame for white noise of 1 count per pixel, the root sum square of the kernel."""
+"""Noise of the smoothed frame for white noise of 1 count per pixel: the root sum square of the kernel."""
 _BAND = 32
 # Number of pixels of a row that are first compared with their limit without branches.
 _SEGMENT = 64
@@ -299,7 +299,7 @@ def _smoothed_above_numpy(pixels: Image, limit: FloatArray) -> tuple[IntArray, F
         np.add(once[:-1], once[1:], out=twice)
         np.add(twice[:, :-1], twice[:, 1:], out=wide)
         np.add(wide[:, :-1], wide[:, 1:], out=smooth)
-        # Only a few rows of blocks have weights that are not zero in a band of rows.
+        # In a band of rows, only a few rows of blocks have weights that are not zero.
         weight = down[first : first + count]
         near = np.flatnonzero(weight.any(axis=0))
         np.matmul(weight[:, near], across[near], out=bound)
@@ -383,10 +383,10 @@ def _tails(sample: Image, level: FloatArray, noise: FloatArray) -> tuple[FloatAr
     """Return the length of each block's upper noise tail, and a mask of the blocks with clipped noise.
 
     In a normal distribution, 2.3 % of the pixels of a block exceed the mean by more than two standard
-    deviations, and 2.3 % are below the mean by more than two standard deviations. If a sky is clipped at zero
-    counts, its moments underestimate the noise. For each block, the median over the 3 x 3 blocks around it is
-    used, because a few stars hardly change the median. A textured foreground has a long tail, whereas the sky
-    beside it has no long tail. The length of the upper noise tail is relative to that of a normal
+    deviations, and 2.3 % are below the mean by more than two standard deviations. If the sky is clipped at
+    zero counts, its moments underestimate the noise. For each block, the median over the 3 x 3 blocks around
+    it is used, because a few stars hardly change the median. A textured foreground has a long tail, whereas
+    the sky beside it has no long tail. The length of the upper noise tail is relative to that of a normal
     distribution, and is at least 1.
     """
     (rows, columns), (down, across) = sample.shape, level.shape

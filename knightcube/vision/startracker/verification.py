@@ -106,7 +106,7 @@ class Chance:
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
         if matched <= observed * chance:
             return math.log10(self.fields * expected)
-        # The mean square distance of two points of a unit square is 1/3.
+        # The mean square distance of two random points in a unit square is 1/3.
         ring = 2.0 * math.pi / 3.0 * expected * (self.scales + 2.0 * gate * math.sqrt(3.0 * self.spread))
         lost = observed - matched
         ways = math.lgamma(observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
@@ -364,7 +364,7 @@ def _most_expected(observed: int) -> int:
 def _settle(matcher: _Matcher, first: _Matching, start: Refinement) -> tuple[_Matching, Refinement] | None:
     """Return the matched stars and the attitude after repeated matching and refinement.
 
-    Refinement of the attitude and matching alternate until the matched stars no longer change. `first` is the
+    Matching and refinement of the attitude alternate until the matched stars no longer change. `first` is the
     matching at the attitude `start`. Returns None if the refinement diverges, if too few stars match, or if
     the fitted scale is not possible.
     """

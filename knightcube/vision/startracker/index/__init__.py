@@ -204,7 +204,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the lowest star index in each star's group (count,); stars of `pairs` (p, 2) form groups."""
+    """Return the lowest star index in the group of each star (count,); the stars of a pair share a group."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])

@@ -113,7 +113,7 @@ _REFERENCE_SIZE = float(np.deg2rad(2.5))
 
 
 def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
-    """Return the sky index of the star catalogue, in some seconds.
+    """Return the sky index of the star catalogue, which is computed in some seconds.
 
         sky = build(replace(IndexSettings.of_field(fov), faintest=6.5))
 
