@@ -147,8 +147,8 @@ class CoilMap:
     def working(self, used: BoolArray, assumed: float = 0.5) -> CoilMap:
         """Return the map of the coils `used` (n,), with the limits and the heating power of these coils.
 
-        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed,
-        whose dipole moment is the fraction `assumed` of the weakest coil's dipole moment. To produce the same
+        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed. Its
+        dipole moment is the fraction `assumed` of the dipole moment of the weakest coil. To produce the same
         torque without a dipole moment along the normal, the allocation adds a dipole moment along the
         magnetic field, which causes no torque. Raises UsageError if all working coils are parallel.
         """

@@ -383,7 +383,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
 
 
 def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, FloatArray]:
-    """Return attitude (4,) and rate (3,) after `LEAD` s, for a constant rate error relative to the path."""
+    """Return attitude (4,) and rate (3,) after `LEAD` s at a constant rate error relative to the path."""
     now, then = running.since, running.since + LEAD
     path = running.path.references(np.array([now, then]))
     error = multiply(job.quaternion, conjugate(path.quaternion[0]))
@@ -393,7 +393,7 @@ def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, Flo
 
 
 def _narrowed(cone: Cone, path: SlewPath, start: FloatArray) -> Cone:
-    """Return an exclusion cone, narrowed if a path or an initial attitude `start` (4,) is inside it."""
+    """Return an exclusion cone, narrowed until a path and an initial attitude `start` (4,) are outside."""
     room = min(
         float(cone.clearance(path.quaternion, path.times).min()),
         float(cone.clearance(start[None], np.zeros(1))[0]),

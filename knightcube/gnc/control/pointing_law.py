@@ -63,11 +63,11 @@ class PointingLaw:
         return float(times[0]), float(times[-1])
 
     def reference(self, time: float) -> AttitudeReference:
-        """Return the planned motion at a time (s), which is clamped to the times of the table."""
+        """Return the planned motion at a time (s) clamped to the table's times."""
         return self._table.path.at(time)
 
     def wanted(self, time: float) -> AttitudeReference:
-        """Return the motion commanded by the attitude law at a time (s), clamped to the table's times."""
+        """Return the motion commanded by the attitude law at a time (s) clamped to the table's times."""
         return self._table.wanted.at(time)
 
     def command(
