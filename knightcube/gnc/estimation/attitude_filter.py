@@ -69,7 +69,8 @@ from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody
 _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
 """Largest accepted mean innovation of the gyro, in standard deviations, by the number of averaged samples. A
 strong coil fault is detected in one gyro sample, a weak coil fault only in the mean of many samples. In
-flights without a fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
+flights without a fault, the mean innovations of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard
+deviations."""
 _SUMS = {count: limit * math.sqrt(count) for count, limit in _DEPARTURES.items()}
 """Largest accepted sum of innovations of the gyro, in standard deviations, by the number of samples."""
 _BEFORE_NS = 500_000_000

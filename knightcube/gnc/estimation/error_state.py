@@ -147,8 +147,8 @@ def propagated(
 ) -> FloatArray:
     """Return the covariance (n, n) after a step of `seconds`, in which only attitude and rate have dynamics.
 
-    The first six states are attitude and rate. The argument `flow` (6, k) contains the rows of the error
-    dynamics F for attitude and rate, and the columns for the first k states. The spectral density of the
+    The first six states are attitude and rate. The argument `flow` (6, k) is the part of the error dynamics F
+    with the rows for attitude and rate and the columns for the first k states. The spectral density of the
     angular acceleration is `density` (3, 3), rad^2/s^3. The random walks of the first k states have the
     variances `walks` (k,) per second. States beyond the first k do not change. The transition matrix is I + F
     dt + (F dt)^2 / 2.

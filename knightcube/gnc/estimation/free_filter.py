@@ -150,7 +150,7 @@ class FilterEnvironment:
 
 
 class FreeMotion:
-    """Euler's equation of a satellite in orbit, whose inertia differs from the assumed inertia."""
+    """Euler's equation of an orbiting satellite whose inertia differs from the assumed inertia."""
 
     def __init__(self, inertia: FloatArray) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
@@ -307,7 +307,7 @@ COIL_WALK = 1e-4
 """Random walk per sqrt(s) of the elements of the coils' matrix, for example due to temperature."""
 INERTIA_WALK = 5e-5
 """Random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular rate in rad/s. The
-random walk represents flexible parts, which are loaded only while the body rotates, and prevents the
+random walk represents flexible parts, which are loaded only while the body rotates. It also prevents the
 uncertainty of the inertia from becoming too small."""
 MINIMUM_FIELD_ERROR = 1e-8
 """Minimum standard deviation (T per axis) of the field model's error. The error also represents slow
@@ -369,7 +369,7 @@ class FreeFilter:
     ) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        The prior of the slowly varying states is `slow`, or by default that of the settings.
+        The prior of the slowly varying states is `slow`, whose default is the prior of the settings.
         """
         self.motion = FreeMotion(inertia)
         self.layout = settings.error_state(inertia)

@@ -2,7 +2,7 @@
 
 The attitude error is a small rotation about the body axes (Lefferts, Markley and Shuster 1982). Each
 correction applies the estimated error to the quaternion and then rotates the covariance to the corrected axes
-(the reset of Markley and Crassidis 2014, section 6.2.4). The rate is a state of the filter that is propagated
+(the reset of Markley and Crassidis 2014, section 6.2.4). The rate is a state of the filter and is propagated
 by Euler's equation, because the plant model predicts the rate more accurately than the gyro measures it. Past
 attitudes that later measurements need are appended to the state (stochastic cloning, Roumeliotis and Burdick
 2002).
@@ -152,7 +152,7 @@ def _mean_rate(state: FilterState, measurement: MeanRateMeasurement, size: int) 
     x, y, z = measurement.rate.tolist()
     square = px * px + py * py + pz * pz
     angle = math.sqrt(square)
-    # The factor 1/p^2 - (1 + cos p) / (2 p sin p) is within 1e-6 of its limit 1/12 below 0.03 rad.
+    # For p below 0.03 rad, the factor 1/p^2 - (1 + cos p) / (2 p sin p) is within 1e-6 of its limit 1/12.
     second = 1.0 / 12.0 if angle < 0.03 else 1.0 / square - 0.5 / (angle * math.tan(0.5 * angle))
     by_error = np.array(skew((px, py, pz)))
     by_error = (_EYE + 0.5 * by_error + second * (by_error @ by_error)) / span

@@ -691,7 +691,7 @@ _INDICES = np.arange(3)
 
 @functools.lru_cache(maxsize=256)
 def whitenings(counts: tuple[int, ...], independent: float, variance: float, walk: float) -> FloatArray:
-    """Return matrices (w, m, m), each of which whitens the newest differences of bins, as `_whitening` does.
+    """Return matrices (w, m, m) like that of `_whitening`, one for each number of newest differences.
 
     `counts` contains the number of differences for each matrix, and m is the first of these numbers. The
     elements for earlier differences are zero. The other arguments are those of `_whitening`.
