@@ -23,7 +23,7 @@ _ENDS = np.array([-0.5, 0.5])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vibration:
-    """Small rotation of a vibrating camera, a sum of k sinusoids of the time in units of the exposure.
+    """Vibration of the camera: a small rotation vector that is a sum of k sinusoids.
 
     The contribution of a sinusoid to the rotation vector at the time t is `sine` sin(2 pi `frequency` t) +
     `cosine` (cos(2 pi `frequency` t) - 1), which is zero at mid-exposure. The frequencies (k,) are in cycles
@@ -41,7 +41,7 @@ class Vibration:
 
     @property
     def amplitude(self) -> FloatArray:
-        """The amplitudes (k,), rad, of the sinusoids, exact for a vibration about a fixed axis."""
+        """The amplitudes (k,), rad, of the sinusoids; they are exact for a vibration about a fixed axis."""
         return np.asarray(np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1)))
 
     def with_frequency(self, frequency: float) -> Vibration:
@@ -68,8 +68,8 @@ class Vibration:
 class CameraMotion:
     """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
-    The vibration turns the camera after the smooth motion, about axes that are fixed in the camera. The
-    smooth motion is described by its rate (3,), rad per exposure, and angular acceleration (3,) at
+    The rotation of the vibration is applied after that of the smooth motion, about axes fixed in the camera.
+    The smooth motion is described by its rate (3,), rad per exposure, and angular acceleration (3,) at
     mid-exposure, and by the known coefficients `higher_terms` (k, 3), rad, of t^3, t^4, ... in the rotation
     vector.
     """
@@ -117,7 +117,7 @@ class CameraMotion:
         return CameraMotion(-self.rate, self.acceleration, higher, self.vibration.reversed())
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
-        """Return this motion with its mean rate replaced by `rotation` (3,) or its negative."""
+        """Return this motion with the mean rate `rotation` (3,) or its negative, whichever is nearer."""
         sign = -1.0 if self.rotation @ rotation < 0.0 else 1.0
         return replace(self, rate=self.rate + sign * rotation - self.rotation)
 
@@ -181,7 +181,7 @@ class CameraMotion:
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the higher-order terms and vibration (3, m) of the rotation vector, or a time derivative.
+        """Return higher-order terms plus vibration (3, m) of the rotation vector, or their time derivative.
 
         The contribution of the vibration is correct to second order in the rotation.
         """

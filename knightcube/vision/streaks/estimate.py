@@ -482,9 +482,9 @@ def estimate_motion(
     """Return the mean rate over one exposure with its covariance, and the stars of the frame `pixels`.
 
     The camera `pinhole` has the shape of the frame (rows, columns). The exposure, the settings and the prior
-    rate are described in `estimate_rate`. The camera is frozen if the checksum of the frame equals the
-    checksum `previous_checksum` of the previous frame. The `prior_course` is the rotation as a function of
-    time during the exposure, as estimated by the navigation filter; None if unknown.
+    rate are described in `estimate_rate`. The status is `frozen` if the checksum of the frame equals
+    `previous_checksum`, that of the previous frame. The `prior_course` is the rotation as a function of time
+    during the exposure, as estimated by the navigation filter; None if unknown.
 
     Raises ArgumentError for an invalid frame, exposure or prior. If the frame yields no rate, the attributes
     `status` and `reason` of the result state the cause.

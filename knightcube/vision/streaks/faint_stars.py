@@ -58,7 +58,7 @@ _NEIGHBOURS = sorted(
 
 # Number of entries of the table `_PROFILE` per px of distance from the star.
 _PER_PX = 50.0
-# Table of the filter response to a star, as a fraction of its maximum, by distance of a circle from the star.
+# Table of the filter response to a star, relative to its maximum, on circles at increasing distance.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 
@@ -133,8 +133,8 @@ def standing_peaks(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the peaks of stars, the strongest first, as fractional grid rows and columns.
 
-    The significance (r, c) of a peak is above `sigmas`. A peak is omitted if stronger peaks cause most of its
-    response. The argument `span` (r, 2) is the range of columns on the detector, as in `RunningSums`, and
+    A peak of `significance` (r, c) must exceed `sigmas`. A peak is omitted if stronger peaks cause most of
+    its response. The argument `span` (r, 2) is the range of columns on the detector, as in `RunningSums`, and
     `length` is the length of a streak in samples.
     """
     row, column = _local_maxima(significance, significance > np.float32(sigmas))
@@ -146,7 +146,7 @@ def standing_peaks(
 def _unshaded_numpy(
     row: IntArray, column: IntArray, value: FloatArray, spans: FloatArray, length: float, sigmas: float
 ) -> BoolArray:
-    """Return a mask (k,) of the peaks, the strongest first, that are not caused by stronger peaks.
+    """Return a mask (k,) of the peaks that stronger peaks do not cause; the strongest peak comes first.
 
     The arguments are grid indices and heights `value` of the peaks, the ranges `spans` (k, 2) of columns on
     the detector, the streak length in samples, and the minimum height.
@@ -289,7 +289,7 @@ def _vertex(left: float, own: float, right: float) -> float:
     return min(max(0.5 * (left - right) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
 
 
-# Ratio of the noise of a sample to the step to which samples are rounded.
+# Noise of a sample divided by the rounding step of the samples.
 _ROUNDING = 30.0
 # Number of passes of the search for stars, of which the first uses second differences.
 _PASSES = 3
@@ -371,7 +371,7 @@ def _less_boxes_numpy(sums: Image, shape: tuple[int, int], pixels: IntArray, tak
     out, (rows, columns) = sums.copy(), shape
     for down in (-columns, 0, columns):
         for beside in (-1, 0, 1):
-            # Sums that would cross the edge of the frame belong to border pixels, which are set to zero.
+            # A neighbour beyond an edge maps to another border pixel; border pixels are set to zero below.
             out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
     framed = out.reshape(rows, columns)
     framed[[0, -1]] = 0
@@ -390,7 +390,7 @@ def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Ima
     last = len(sums) - columns - 2
     for p in range(len(pixels)):
         at, light = pixels[p], taken[p]
-        # Sums that would cross the edge of the frame belong to border pixels, which are set to zero.
+        # A neighbour beyond an edge maps to another border pixel; border pixels are set to zero below.
         if columns < at <= last:
             for middle in (at - columns, at, at + columns):
                 out[middle - 1] -= light

@@ -1,9 +1,9 @@
 """Preliminary fits of the motion to the brightest streaks, in descending order of likelihood.
 
 Initial guesses follow from the lengths of the bright regions or from a scan of the rotation angle. Each guess
-is fitted to the brightest stars. A fit is convincing if its residuals are small and most of its streaks end
-in the frame where the model ends. If no guess leads to a convincing fit, a vibration or a profile of the
-point spread function (PSF) is fitted in addition, and then the whole frame is scanned for the angle.
+is fitted to the brightest stars. A fit is convincing if its residuals are small and most streaks in the frame
+end where their models end. If no guess leads to a convincing fit, a vibration or a profile of the point
+spread function (PSF) is fitted in addition, and then the whole frame is scanned for the angle.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ _CROWDED = 0.05
 _BEYOND_CROWD = 100_000.0
 # Largest excess chi-square of a well-fitted star, as a fraction of the star's squared significance.
 _MOST_RESIDUAL = 0.01
-# Upper limit of a star's significance (standard deviations) in the chi-square that a fit explains.
+# Upper limit of a star's significance in the explained chi-square, in standard deviations.
 _ENOUGH = 200.0
 # Relative reduction of the explained chi-square if all flux is in regions longer than the guessed streaks.
 _CONTRADICTION = 0.6
@@ -91,7 +91,7 @@ _CONTRADICTION = 0.6
 _SHAKEN = 2.5
 # Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
 _CALM = 2.0
-# Fraction of streak ends that a fit with a wrong rotation angle can match by matching one end per streak.
+# Fraction of streak ends that even a fit with a wrong rotation angle matches, at about one per streak.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -156,7 +156,7 @@ def _fits_of_guesses(camera: FitProblem, regions: BrightRegions, near: float | N
 def _likelier(
     camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
 ) -> StreakFit | None:
-    """Return a fit from a scan of the whole frame that explains more chi-square than the fit `done`.
+    """Return a fit that explains more chi-square than the fit `done`, from a scan of the whole frame.
 
     Returns None if the scan finds no better fit, if few pixels of the frame are bright, or if the fit `done`
     already explains enough chi-square.
@@ -252,7 +252,7 @@ class _FirstFit:
     """Fit of the motion to the brightest stars, starting from the initial guess `guess`.
 
     Attributes:
-        ends: the smaller of the fractions of confirmed streak ends and of unbroken streaks.
+        ends: fraction of confirmed streak ends, or of unbroken streaks if that is smaller.
         explained: chi-square that the fit explains.
         convincing: whether the fit is accepted without comparison with other fits.
         shaken: whether the residuals may show a vibration or another profile of the PSF.

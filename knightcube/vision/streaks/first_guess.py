@@ -76,7 +76,7 @@ class Circles:
 
 
 ScannedAngle = tuple[float, FloatArray, FloatArray]
-"""Trial rotation angle, rad, and positions (n, 2), px, and fluxes (n,), counts, of the stars found by it."""
+"""Rotation angle, rad, with positions (n, 2), px, and fluxes (n,), counts, of the stars found with it."""
 
 
 def scan_angles(
@@ -133,7 +133,7 @@ class _Boxes:
     step: float
 
     def best(self, widths: IntArray) -> _Best:
-        """Return the box that explains most of chi-square, for each of `widths` (w,) and each region."""
+        """Return the boxes that explain the most chi-square, for each of `widths` (w,) and each region."""
         return _best_boxes(self.total, self.exist, self.variance, self.middle, widths)
 
 
@@ -176,7 +176,10 @@ def _best_boxes(
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return cumulative sums of samples along `circles`; each sample is at most `_CAP` times a median."""
+    """Return cumulative sums of samples along `circles`, each limited to `_CAP` times a median.
+
+    The median is that of the samples around the centroid of the region.
+    """
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
@@ -236,7 +239,7 @@ def _refined_angle(
 
 # Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Sine of the angle between the equation vectors of two regions below which no rotation axis is proposed.
+# Sine of the angle between the equation vectors of two regions below which they propose no rotation axis.
 _PARALLEL = 1e-9
 # Standard error of a region's orientation multiplied by the region's length (rad px).
 _SIDE_ERROR = 1.2
@@ -449,7 +452,7 @@ def motion_by_course(
 
 
 def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
-    """Return the relative change of the rate over the exposure from the asymmetry of the regions.
+    """Return the relative change of the rate over the exposure, estimated from the asymmetry of the regions.
 
     If the rate increases linearly from zero, the distance between the centroid and the midpoint of a streak
     is a sixth of the streak's length. The relative change is positive if the rate increases in magnitude

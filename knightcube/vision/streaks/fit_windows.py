@@ -505,9 +505,9 @@ class StarPixels:
     """Strips of pixels along long streaks, and square patches of pixels around spots.
 
     Attributes:
-        long: index in the scene of each of the a stars with a strip (a,). A star that moves slowly on part of
-            its path also has a patch for this part.
-        spot: index in the scene of each of the b stars with a patch (b,).
+        long: index in the scene of each star with a strip (a,). A star that moves slowly on part of its path
+            also has a patch for this part.
+        spot: index in the scene of each star with a patch (b,).
         strips: pixels of the strips along long streaks.
         patches: pixels of the square patches around spots.
     """

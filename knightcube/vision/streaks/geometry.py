@@ -43,7 +43,7 @@ class StarPaths:
 
 
 PointsAtLines = tuple[FloatArray, FloatArray, FloatArray]
-"""Position, velocity and acceleration, each (2, b, LINES), of a star at each pixel line of b blocks."""
+"""Position, velocity and acceleration, each (2, b, LINES), of stars at the lines of b blocks of pixels."""
 
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
@@ -376,7 +376,7 @@ def _any_turn(q: float) -> tuple[float, float]:
 
 @loop_helper
 def _turned(turn: _Vector, trig: tuple[float, float], v: _Vector) -> _Vector:
-    """Return an inertially fixed direction in the axes of the camera after the rotation `turn`."""
+    """Return the inertially fixed direction `v` in camera axes after the rotation `turn`."""
     about = _product(v, turn)
     along = trig[1] * _inner(turn, v)
     still = 1.0 - trig[1] * _inner(turn, turn)
@@ -435,7 +435,7 @@ def _pixels(view: _View, there: FloatArray) -> FloatArray:
 
 
 def _rotated(rotation: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray) -> FloatArray:
-    """Return inertially fixed directions `v` (3, m) in the axes of the camera after `rotation`."""
+    """Return the inertially fixed directions `v` (3, m) in camera axes after `rotation`."""
     a, sine, cosine = rotation
     along = (a * a.T) @ v if a.shape[1] == 1 else a * np.sum(a * v, axis=0)
     out = (v - along) * cosine

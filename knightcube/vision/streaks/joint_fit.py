@@ -544,7 +544,7 @@ _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 # Difference (px) between the length errors of two streaks below which these errors count as equal.
 _ALIKE = 3.0
-# Minimum number of equal length errors per correct length for a correction of the rotation angle.
+# Minimum ratio of consistently wrong to correct streak lengths for a correction of the rotation angle.
 _MORE = 2
 # Largest relative change of the rate for which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5

@@ -43,7 +43,7 @@ WIDTH = 6
 SATURATION_MARGIN = 3.0
 """Margin (standard deviations) between modelled counts and saturation below which a pixel is excluded.
 
-A selection by measured instead of modelled counts would be biased by their noise."""
+A selection by measured counts, instead of modelled counts, would be biased by noise."""
 # Allowance for model errors in the exclusion of outliers, as a fraction of a pixel's modelled counts.
 _UNRESOLVED = 0.1
 # Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.

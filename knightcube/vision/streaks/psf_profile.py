@@ -34,7 +34,7 @@ _ROUNDS = 3
 _SOLUTIONS = 3
 # Residual (standard deviations) above which a pixel contains flux of a star that is not in the scene.
 _FOREIGN_SIGMAS = 5.0
-# Addition to this limit, as a fraction of the largest counts at the pixel with any single Gaussian as PSF.
+# Addition to this limit, as a fraction of the pixel's largest modelled counts for any single Gaussian.
 _FOREIGN_SHARE = 0.5
 # Model error of a pixel, as a fraction of its counts, which limits the weight of bright stars.
 _MODEL_ERROR = 0.02

@@ -223,7 +223,7 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
 
 
 def _error_root(camera: FitProblem) -> FloatArray:
-    """Return a root (5, m) of the covariance of the calibration errors, one column per independent error.
+    """Return a square root (5, m) of the covariance of calibration errors, one column per independent error.
 
     The rows are relative focal length, centre x and y (px), distortion at the corner, and line time (s). If
     the errors are independent and the line time is uncertain, the last column is the error of the line time.

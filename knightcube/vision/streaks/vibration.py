@@ -386,7 +386,7 @@ def _too_large(camera: FitProblem, fit: StreakFit) -> bool:
 def vibration_covariance(
     camera: FitProblem, scene: StreakScene, left: StreakResiduals
 ) -> tuple[FloatArray, float]:
-    """Return the covariance (3, 3), rad^2, that vibrations add, and the amplitude of an unresolved one, rad.
+    """Return the covariance (3, 3), rad^2, added by vibrations, and the amplitude (rad) of an unresolved one.
 
     The covariance applies to the rotation over the exposure. It includes the displacement of the streak ends
     by a fast vibration that is not fitted but is significant in the spectrum of the residuals. The amplitude
