@@ -251,7 +251,7 @@ class Craft(Section, frozen=True, kw_only=True):
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by a minimum-time plan of the angular momentum in the measured magnetic field.
 
-    The noise `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. The noise
+    The noise `field_noise` is that of a magnetometer sample, T per axis; the bias is estimated. The noise
     `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques, and is computed by default
     (`OrbitConfig.torque_noise`). The plan (`knightcube.gnc.control.field_detumbler`) covers `horizon` s and
     is renewed every `replan` s. A body that starts slower than `gentle` rad/s should not exceed its initial

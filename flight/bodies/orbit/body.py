@@ -241,6 +241,7 @@ class SatelliteEstimation(BodyEstimation):
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
         self.feed: ReadingFeed = OrbitFeed(self.orbit_filter)
+        self.detumbler = _detumbler(config, self.orbit_filter, self.environment)
         self.coil_monitor = _coil_monitor(config, self.environment)
         self._coils, self._errors = config.coils.map(), description_errors(config)
         self._field_bias = config.inertial_unit.accuracy.field_bias
@@ -285,13 +286,15 @@ class SatelliteEstimation(BodyEstimation):
         return found
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Pass a correction of the coils to the filter, which resets the learned matrix of these coils."""
+        """Pass a correction of the coils to the filters, which reset the learned matrix of these coils."""
+        self.detumbler.renew_coils()
         self.orbit_filter.correct_coils(change, deviations)
         self._renew_redundant_coils()
 
     def coils_used(self, used: BoolArray) -> None:
         """Accept the flags (n,) of the coils in use, and reset the learned matrix of redundant coils."""
         self._used = used
+        self.detumbler.renew_coils()
         self._renew_redundant_coils()
 
     def _renew_redundant_coils(self) -> None:
@@ -316,6 +319,7 @@ class SatelliteEstimation(BodyEstimation):
     def magnetometer_changed(self) -> None:
         """Discard the learned errors of the magnetometer that was used before."""
         self.orbit_filter.renew_magnetometer()
+        self.detumbler.renew_magnetometer()
 
     def is_accurate(self, estimate: Estimate) -> bool:
         """Return whether the rate of an estimate is accurate enough to decide that the body is detumbled."""
@@ -388,8 +392,7 @@ class SatelliteControl(BodyControl):
         )
         self.targets = PointingTargets(timed, paths, config.looks_for_objects())
         self.tracker = _tracker(config, filter_, environment)
-        detumbler = _detumbler(config, filter_, environment)
-        self.detumbling = self.field_detumbling = FieldDetumblingLaw(detumbler, coils)
+        self.detumbling = self.field_detumbling = FieldDetumblingLaw(estimation.detumbler, coils)
         self.sun_acquisition = estimation.sun_acquisition
 
     def follows_objects(self) -> bool:

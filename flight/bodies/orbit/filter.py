@@ -186,7 +186,7 @@ class OrbitFilterSettings:
         """Settings of the filter that estimates the rate from the magnetometer if the gyro is silent."""
         return FieldRateSettings(
             inertia=self.inertia,
-            field_sigma=math.hypot(self.field_noise, self.free.magnet[0]),
+            field_sigma=self.field_noise,
             torque_walk=math.sqrt(self.unknown_psd),
             errors=self.free.errors,
         )
@@ -631,12 +631,14 @@ class OrbitFilter:
         before.
         """
         self._close()
+        self._by_field.renew_coils()
         self._replay.correct_coils(change, deviations)
         self._dipoles.unknown_ns = max(self._dipoles.unknown_ns, self.measured_ns)
 
     def renew_coils(self, covariance: FloatArray, used: BoolArray) -> None:
         """Reset the learned matrix to a covariance (9, 9), because the coils `used` (n,) are in use now."""
         self._close()
+        self._by_field.renew_coils()
         self._shares = self._settings.coils.linear_shares(used)
         self._replay.renew_coils(covariance)
 

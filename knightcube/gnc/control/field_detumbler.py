@@ -15,6 +15,10 @@ detumbler also removes a spin along the field as soon as the field has rotated. 
 the standard deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no
 sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
 
+The filter also estimates the bias of the magnetometer and the matrix of the coils, so a dead or reversed coil
+falsifies neither the rate nor the plan. If the field usually changes within the pauses, the field of the
+coils decays more slowly than configured, and the pauses become longer.
+
 The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
 obeys h' = m x B, where m is the dipole moment and B the field. This equation contains neither the inertia nor
 the attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum magnitude L and the
@@ -54,7 +58,14 @@ from typing import NamedTuple
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, cross_matrix, cross_product
-from knightcube.astro.quaternion import compose, inverse, matrix, times
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    compose,
+    from_rotation_vector,
+    inverse,
+    matrix,
+    times,
+)
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.estimation.error_state import check_amounts
@@ -121,13 +132,22 @@ def momentum_plan(
     return MomentumPlan(costate * (STEEP * limit / mean), float(times[long - 1] + spans[long - 1]))
 
 
-def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatArray) -> FloatArray:
+_NO_DIPOLE: FloatArray = np.zeros(3)
+_IDENTITY: FloatArray = np.eye(3)
+
+
+def braking_dipole(
+    costate: FloatArray, field: FloatArray, limit: float | FloatArray, coils: FloatArray = _IDENTITY
+) -> FloatArray:
     """Return the dipole moment (3,), A m^2, that a plan commands in a field (3,), T, body axes.
 
     Each component is clipped separately at the limit of its body axis, because each coil removes momentum
-    independently of the other coils.
+    independently of the other coils. The matrix C (3, 3) from the commanded dipole moment m to the actual
+    dipole moment is `coils`. The torque C m x B in the field B reduces the momentum along the costate y at
+    the rate m . C' (y x B).
     """
-    return np.asarray(np.minimum(np.maximum(cross_product(costate, field), -limit), limit))
+    wanted = coils.T @ cross_product(costate, field)
+    return np.asarray(np.minimum(np.maximum(wanted, -limit), limit))
 
 
 def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArray:
@@ -269,6 +289,9 @@ of a measured field's direction is about as large, so the predicted field is nea
 field."""
 SHORTEST = 9
 """Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
+PAUSES, DECAYING, LARGEST_CHANGE = 8, 4.0, 25.0
+"""Number of coil pauses over which the normalised square of the field change within a pause is averaged, mean
+above which the pauses become longer, and largest square that is used. Noise causes a mean of 1."""
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 CHANGED = 30.0
@@ -292,8 +315,6 @@ set, in rad/s (first value) or as a fraction of the rate (second value)."""
 _SECOND = 1e-9
 _ROUNDING = 1e-9
 """Rounding error of a scalar product that should be zero, divided by the lengths of both vectors."""
-_NO_DIPOLE: FloatArray = np.zeros(3)
-_IDENTITY: FloatArray = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -334,6 +355,24 @@ class FieldPrediction(NamedTuple):
     in_body_axes: bool
 
 
+class _Pause(NamedTuple):
+    """The first field after a driven phase, with the estimates at that time.
+
+    Attributes:
+        time_ns: time of the first field, ns.
+        field: first field (3,) T without the estimated bias, body axes.
+        rate: estimated body rate (3,), rad/s.
+        bias: estimated bias (3,) of the magnetometer, T.
+        square: normalised square of the change from the first to the newest field of the pause, 1 for noise.
+    """
+
+    time_ns: int
+    field: FloatArray
+    rate: FloatArray
+    bias: FloatArray
+    square: float = 1.0
+
+
 class FieldDetumbler:
     """A detumbler that accepts magnetometer samples and computes the dipole moment of each cycle."""
 
@@ -357,7 +396,8 @@ class FieldDetumbler:
         self._sigma, self._sigma_of = math.inf, self._filter.covariance
         # A residual momentum causes the fastest rotation about the axis of the smallest moment of inertia.
         self._rest = LEFT * braking.slow * float(np.linalg.eigvalsh(settings.inertia)[0])
-        self._pause_ns = schedule.settle_ns + schedule.measure_ns
+        self._settle_ns = schedule.settle_ns  # longer if the coil field decays more slowly than configured
+        self._unsettled = 1.0  # mean normalised square of the field change within a pause
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -374,15 +414,24 @@ class FieldDetumbler:
         self._fastest = self._most_energy = math.inf
         self._initial_known = False
         self._act_ns = self._shortest_ns
+        self._pause: _Pause | None = None
         self._filter.restart()
+
+    def renew_coils(self) -> None:
+        """Forget the estimated matrix of the coils, because the coils or their assumed signs have changed."""
+        self._filter.renew_coils()
+
+    def renew_magnetometer(self) -> None:
+        """Estimate the rate again, because a different magnetometer is read from now on."""
+        self._filter.restart()
+        self._distrust()
 
     def listens(self, time_ns: int) -> bool:
         """Return whether the coils were off and their field had decayed at `time_ns`."""
-        schedule = self._schedule
-        if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
+        if not self.trusted and time_ns - self._driven_ns >= self._settle_ns:
             return True
         phase_ns = (time_ns - self._begun_ns) % (self._pause_ns + self._act_ns)
-        return time_ns >= self._begun_ns and schedule.settle_ns <= phase_ns < self._pause_ns
+        return time_ns >= self._begun_ns and self._settle_ns <= phase_ns < self._pause_ns
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,), T, measured at `time_ns`, or ignore it if the coils disturbed the measurement.
@@ -395,6 +444,7 @@ class FieldDetumbler:
             return
         if age_ns < 0:
             self._advance(time_ns)
+        self._watch_decay(time_ns, field)
         starts, revisions = self._filter.restarts, self._filter.revisions
         accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
         if accepted:
@@ -428,6 +478,8 @@ class FieldDetumbler:
             now_ns - phase_ns
         )  # the duration of the driven phase varies, so time is counted from the last pause
         acting = phase_ns >= self._pause_ns
+        if acting:
+            self._judge_decay()
         self._commanded_ns = now_ns
         self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
         return self._dipole
@@ -442,6 +494,34 @@ class FieldDetumbler:
     def next_pause_ns(self) -> int:
         """Time (ns) of the next coil pause for a field measurement, as planned at the last command."""
         return self._begun_ns + self._pause_ns + self._act_ns
+
+    def _watch_decay(self, time_ns: int, field: FloatArray) -> None:
+        """Compare a field (3,) T with the first field after a driven phase, rotated with the body rate."""
+        found, pause = self._filter, self._pause
+        if not found.started or not np.isfinite(field).all():
+            return
+        if pause is None:
+            self._pause = _Pause(time_ns, field - found.bias, found.rate, found.bias)
+            return
+        rotation = from_rotation_vector((time_ns - pause.time_ns) * _SECOND * pause.rate)
+        change = field - pause.bias - attitude_matrix(rotation) @ pause.field
+        square = float(change @ change) / (6.0 * found.field_sigma**2)
+        self._pause = pause._replace(square=square)
+
+    def _judge_decay(self) -> None:
+        """End a pause, and lengthen the pauses if the coil field usually decays during the measurement."""
+        pause, schedule = self._pause, self._schedule
+        if pause is None:
+            return
+        self._pause = None
+        self._unsettled += (min(pause.square, LARGEST_CHANGE) - self._unsettled) / PAUSES
+        if self._unsettled > DECAYING and 2 * self._settle_ns < schedule.act_ns:
+            self._settle_ns += max(schedule.settle_ns, schedule.measure_ns)
+            self._unsettled = 1.0
+
+    @property
+    def _pause_ns(self) -> int:
+        return self._settle_ns + self._schedule.measure_ns
 
     @property
     def _shortest_ns(self) -> int:
@@ -490,9 +570,10 @@ class FieldDetumbler:
     def _braking_dipole(self, now_ns: int) -> FloatArray:
         found, braking = self._filter, self._braking
         field, rate, momentum = found.field, found.rate, found.momentum
-        dipole = braking_dipole(self._costate(now_ns), field, braking.limit)
+        coils = found.coil_matrix
+        dipole = braking_dipole(self._costate(now_ns), field, braking.limit, coils)
         speed, energy = math.sqrt(float(rate @ rate)), 0.5 * float(rate @ momentum)
-        sigma, works = self.rate_sigma, cross_product(field, rate)
+        sigma, works = self.rate_sigma, coils.T @ cross_product(field, rate)
         if not self._initial_known:
             if sigma >= max(KNOWN, KNOWN_SHARE * speed):
                 return without_growth(dipole, [works])
@@ -503,7 +584,7 @@ class FieldDetumbler:
         upper = speed + sigma
         grows = [works] if energy * upper**2 >= self._most_energy * speed**2 else []
         if upper >= self._fastest:
-            grows.append(cross_product(field, found.inverse @ rate))
+            grows.append(coils.T @ cross_product(field, found.inverse @ rate))
         return without_growth(dipole, grows)
 
     def _costate(self, now_ns: int) -> FloatArray:

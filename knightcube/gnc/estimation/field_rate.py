@@ -5,13 +5,16 @@ field direction therefore gives all three components of the rate, including the 
 spin exactly along the field is observable only after the field direction has changed. In a polar orbit, the
 field direction rotates by about two revolutions per orbit. A gyro sample shows a spin along the field
 immediately. The states, in body axes, are the rate w, the field B, the inertial time derivative v of the
-field, and the errors j of the six elements of the inertia tensor. In a fast tumble, an error of a few per
-cent of the inertia is the largest error of the torque model. The equations of motion are
+field, the errors j of the six elements of the inertia tensor, the bias b of the magnetometer, and the matrix
+C from the commanded to the actual dipole moment of the coils. In a fast tumble, an error of a few per cent of
+the inertia is the largest error of the torque model. The equations of motion are
 
-    J(j) w' = m x B - w x J(j) w,    B' = v - w x B,    v' = -w x v,    j' = 0.
+    J(j) w' = C m x B - w x J(j) w,    B' = v - w x B,    v' = -w x v,    j' = 0,    b' = 0,    C' = 0.
 
-The dipole moment m of the coils is known, so the coils may be driven between field measurements. The filter
-also integrates the rotation since its start, so the initial body axes can serve as an inertial frame.
+The commanded dipole moment m is known, so the coils may be driven between field measurements. The matrix C
+shows weak, dead and reversed coils. The bias is observable while the body rotates, because the field rotates
+in body axes and the bias does not. The filter also integrates the rotation since its start, so the initial
+body axes can serve as an inertial frame.
 """
 
 from __future__ import annotations
@@ -39,11 +42,19 @@ from knightcube.astro.quaternion import (
     times,
 )
 from knightcube.compiled import compiled_floats, loop_helper
-from knightcube.gnc.estimation.error_state import Weighed, check_amounts, updated, weigh
-from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
+from knightcube.gnc.estimation.error_state import Weighed, check_amounts, slices, updated, weigh
+from knightcube.gnc.estimation.rigid_body import (
+    BodyErrors,
+    by_inertia,
+    by_matrix,
+    inertia_covariance,
+    tensor,
+)
 
-RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 15)
-SIZE = 15
+SIZES = {"rate": 3, "field": 3, "change": 3, "inertia": 6, "bias": 3, "coils": 9}
+"""Number of elements of each block of states by name, in order."""
+RATE, FIELD, CHANGE, INERTIA, BIAS, COILS = slices(SIZES)
+SIZE = COILS.stop
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
 COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
@@ -66,13 +77,19 @@ _EQUAL = 0.1
 """Normalised square of the difference of two rates below which the less probable estimate is discarded."""
 _CURVATURE = 1.0
 """Correlation time (s) of the gyroscopic acceleration that is of second order in the error of the rate."""
-_NOISE_STEP = 1.05
-"""Factor by which each sample changes the estimated median of the field noise."""
+_NOISE_STEPS = 0.2, 0.02
+"""Change of the logarithm of the estimated field noise at the first sample, and after many samples. In
+between, the change is inversely proportional to the number of samples."""
 _NOISIER = 1.2
 """Least ratio of the estimated to the configured field noise at which the estimate is used."""
+_NOISE_RESTART = 2.0
+"""Ratio of the estimated field noise to the noise at the start of the filter, above which the filter
+restarts. The covariances of a filter that assumed too little noise are too small."""
 _IMPROBABLE = 25.0
 """Largest difference of two estimates' log-likelihoods at which the less probable estimate is kept."""
 _EYE: FloatArray = np.eye(SIZE)
+_BY_FIELD: FloatArray = _EYE[FIELD] + _EYE[BIAS]
+"""Jacobian (3, n) of a field measurement."""
 _NONE: Vector = (0.0, 0.0, 0.0)
 
 
@@ -82,14 +99,18 @@ class FieldRateSettings:
 
     Attributes:
         inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
-        field_sigma: standard deviation of a field measurement per axis, including constant errors, T. If the
-            strength of the field varies more from sample to sample, a larger standard deviation is used.
+        field_sigma: standard deviation of the noise of a field measurement, T per axis. If the strength of
+            the field varies more from sample to sample, a larger standard deviation is used.
         rate_start: initial standard deviation of the rate along the field, rad/s.
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
         torque_walk: random walk of the rate per axis due to unmodelled torques, rad/s per sqrt(s).
         errors: largest errors of the body's description; only the errors of the inertia are used.
         inertia_walk: random walk of the inertia, relative to its trace, per sqrt(s).
+        bias: initial standard deviation (T per axis) and random walk (T per sqrt(s)) of the magnetometer's
+            bias.
+        coils: initial standard deviation and random walk per sqrt(s) of each element of the matrix from the
+            commanded to the actual dipole. The standard deviation covers coils that are dead or reversed.
         gate_sigma: gate threshold in standard deviations; a measurement is rejected if its innovation is less
             probable than a one-dimensional deviation of this size.
         refusals: number of consecutively rejected measurements after which the filter restarts (field
@@ -107,6 +128,8 @@ class FieldRateSettings:
     torque_walk: float
     errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
     inertia_walk: float = 1e-5
+    bias: tuple[float, float] = (2e-6, 1e-9)
+    coils: tuple[float, float] = (0.4, 3e-3)
     gate_sigma: float = 5.0
     refusals: int = 5
     longest_gap: float = 0.2
@@ -155,6 +178,7 @@ class FieldRate:
         self._unknown = _Estimate(settings, _NONE, _NONE, np.zeros((SIZE, SIZE)), 0.0)
         self.restarts = self.revisions = 0
         self._is_reset = False  # whether the filter is unchanged since the last reset
+        self._start_sigma = settings.field_sigma  # noise of the field at the start of the filter
         self._noise = FieldNoise(settings.field_sigma, settings.longest_gap)
         self.restart()
 
@@ -206,8 +230,29 @@ class FieldRate:
         return np.array(times(self._best.inertia_rows, self._best.rate))
 
     @property
+    def bias(self) -> FloatArray:
+        """Estimated bias (3,) of the magnetometer in body axes, T."""
+        return self._best.bias
+
+    @property
+    def field_sigma(self) -> float:
+        """Estimated standard deviation of a field measurement per axis, T."""
+        return self._noise.sigma
+
+    @property
+    def coil_matrix(self) -> FloatArray:
+        """Estimated matrix (3, 3) from the commanded to the actual dipole moment of the coils, body axes."""
+        return self._best.coils
+
+    def renew_coils(self) -> None:
+        """Forget the estimated matrix of the coils, because the coils or their assumed signs have changed."""
+        for estimate in self._estimates:
+            estimate.renew_coils()
+        self._set_covariance()
+
+    @property
     def covariance(self) -> FloatArray:
-        """Covariance (15, 15) of the rate, the field, its derivative and the inertia.
+        """Covariance (27, 27) of rate, field, field derivative, inertia, magnetometer bias and coil matrix.
 
         After `advance`, the covariance may be older than the state by up to `COVARIANCE_STEP`.
         """
@@ -235,10 +280,12 @@ class FieldRate:
             return False
         self._is_reset = False
         self._noise.add(math.sqrt(float(field @ field)))
+        if self._estimates and self._noise.sigma > _NOISE_RESTART * self._start_sigma:
+            self._restart_counted(self._gyro_refused >= self._settings.refusals)
         if not self._estimates:
             self._start(field)
             return True
-        if self._apply(FIELD, self._noise.sigma, lambda estimate: estimate.turned(field, age)):
+        if self._apply(_BY_FIELD, self._noise.sigma, lambda estimate: estimate.turned(field, age)):
             self._refused = 0
             return True
         self._refused += 1
@@ -262,7 +309,7 @@ class FieldRate:
             estimate.propagate_covariance()
         self._set_covariance()
         is_better = float(self._covariance.diagonal()[RATE].max()) > settings.gyro_sigma**2
-        if not self._apply(RATE, settings.gyro_sigma, lambda _: rate, corrects=is_better):
+        if not self._apply(_EYE[RATE], settings.gyro_sigma, lambda _: rate, corrects=is_better):
             self._gyro_refused += 1
             if self._gyro_used and self._gyro_refused >= settings.refusals:
                 self._restart_counted(exclude_gyro=True)
@@ -272,7 +319,7 @@ class FieldRate:
 
     def _apply(
         self,
-        measured: slice,
+        rows: FloatArray,
         sigma: float,
         value_for: Callable[[_Estimate], FloatArray],
         *,
@@ -288,8 +335,8 @@ class FieldRate:
         innovations, weights = [], []
         for estimate in self._estimates:
             estimate.propagate_covariance()
-            innovations.append(value_for(estimate) - estimate.state[measured])
-            weights.append(weigh(estimate.covariance, innovations[-1], _EYE[measured], noise))
+            innovations.append(value_for(estimate) - rows @ estimate.state)
+            weights.append(weigh(estimate.covariance, innovations[-1], rows, noise))
         agree = [weighed.square <= self._gate for weighed in weights]
         if not any(agree):
             self._set_covariance()
@@ -354,6 +401,7 @@ class FieldRate:
         self._since = 0.0
         if len(self._waiting) < _AGREEING:
             return
+        self._start_sigma = field_sigma
         (_, first), (span_a, middle), (span_b, last) = self._waiting
         self._waiting.pop(0)
         square = float(last @ last)
@@ -376,7 +424,10 @@ class FieldRate:
         axis = last / strength
         covariance = np.zeros((SIZE, SIZE))
         covariance[RATE, RATE] = across * np.eye(3) + _SPIN_VARIANCE * along * np.outer(axis, axis)
-        covariance[FIELD, FIELD] = field_sigma**2 * np.eye(3)
+        covariance[FIELD, FIELD] = (field_sigma**2 + settings.bias[0] ** 2) * np.eye(3)
+        covariance[BIAS, BIAS] = settings.bias[0] ** 2 * np.eye(3)
+        covariance[FIELD, BIAS] = covariance[BIAS, FIELD] = -covariance[BIAS, BIAS]
+        covariance[COILS, COILS] = settings.coils[0] ** 2 * np.eye(9)
         covariance[CHANGE, CHANGE] = settings.change_start**2 * np.eye(3)
         covariance[INERTIA, INERTIA] = inertia_covariance(np.asarray(settings.inertia), settings.errors)
         for square, probability in _SPINS:
@@ -403,6 +454,7 @@ class FieldNoise:
         """
         self._configured, self._longest_gap = sigma, longest_gap
         self._ratio = 1.0  # ratio of the estimated to the configured noise
+        self._number = 0  # number of second differences
         self._since = 0.0
         self._strengths: list[float] = []
 
@@ -425,7 +477,10 @@ class FieldNoise:
             first, middle, last = self._strengths
             median = 0.6745 * math.sqrt(6.0) * self._configured
             is_larger = abs(first - 2.0 * middle + last) > self._ratio * median
-            self._ratio = max(1.0, self._ratio * (_NOISE_STEP if is_larger else 1.0 / _NOISE_STEP))
+            first_step, last_step = _NOISE_STEPS
+            step = max(last_step, first_step / (1.0 + first_step * self._number))
+            self._number += 1
+            self._ratio = max(1.0, self._ratio * math.exp(step if is_larger else -step))
 
 
 class _Estimate:
@@ -436,10 +491,12 @@ class _Estimate:
         field: field, T, body axes.
         change: inertial time derivative of the field, T/s, body axes.
         rotation: quaternion of the rotation since the start.
-        covariance: covariance (15, 15) of the states.
+        covariance: covariance (27, 27) of the states.
         log_likelihood: logarithm of the probability density of the measurements, without constant terms.
         inverse: inverse (3, 3) of the estimated inertia tensor, 1/(kg m^2).
         inertia_rows: rows of the estimated inertia tensor, kg m^2.
+        bias: estimated bias (3,) of the magnetometer, T.
+        coils: estimated matrix (3, 3) from the commanded to the actual dipole moment.
     """
 
     def __init__(
@@ -456,6 +513,8 @@ class _Estimate:
         self._quadratic = _quadratic(self._assumed)
         self.rate, self.field, self.change = rate, field, _NONE
         self.rotation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+        self.bias: FloatArray = np.zeros(3)
+        self.coils: FloatArray = np.eye(3)
         self._set_inertia(np.zeros(6))
         self.covariance = covariance
         self.log_likelihood = log_likelihood
@@ -468,8 +527,9 @@ class _Estimate:
 
     @property
     def state(self) -> FloatArray:
-        """The states (15,)."""
-        return np.array([*self.rate, *self.field, *self.change, *self._error])
+        """The states (27,)."""
+        coils = (self.coils - np.eye(3)).ravel()
+        return np.array([*self.rate, *self.field, *self.change, *self._error, *self.bias, *coils])
 
     def advance(self, dipole: FloatArray, seconds: float) -> bool:
         """Propagate the state by `seconds`, and return whether the covariance was propagated, too.
@@ -478,7 +538,7 @@ class _Estimate:
         """
         speed = math.sqrt(sum(w * w for w in self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
-        mx, my, mz = dipole.tolist()
+        mx, my, mz = (self.coils @ dipole).tolist()
         if not self._pending:
             self._pending_start = self.rate, self.field, self.change
         self._pending += seconds
@@ -497,6 +557,13 @@ class _Estimate:
         x, y, z = self.rate
         return np.array(matrix(exponential(age * x, age * y, age * z))) @ field
 
+    def renew_coils(self) -> None:
+        """Reset the matrix of the coils and its covariance to their initial values."""
+        self.propagate_covariance()
+        self.coils = np.eye(3)
+        self.covariance[COILS] = self.covariance[:, COILS] = 0.0
+        self.covariance[COILS, COILS] = self._settings.coils[0] ** 2 * np.eye(9)
+
     def equals(self, other: _Estimate) -> bool:
         """Return whether the rate equals the rate of another estimate within its uncertainty."""
         apart = np.subtract(self.rate, other.rate)
@@ -509,6 +576,8 @@ class _Estimate:
         self.field = added(self.field, change[FIELD])
         self.change = added(self.change, change[CHANGE])
         self._set_inertia(self._error + np.array(change[INERTIA]))
+        self.bias = self.bias + change[BIAS]
+        self.coils = self.coils + np.reshape(change[COILS], (3, 3))
         self.covariance = updated(self.covariance, weighed.gain, weighed.cross, weighed.spread)
         self._update_unexplained()
 
@@ -551,9 +620,9 @@ class _Estimate:
         middle, half, change = (
             _moved(start, _difference(end, start), 0.5) for start, end in zip(starts, ends, strict=True)
         )
-        mx, my, mz = (self._pending_impulse / dt).tolist()
+        dipole = self._pending_impulse / dt
         self._pending, self._pending_impulse = 0.0, np.zeros(3)
-        flow = self._flow(middle, half, change, (mx, my, mz), dt)
+        flow = self._flow(middle, half, change, dipole, dt)
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self.covariance @ transition.T
         settings = self._settings
@@ -571,11 +640,15 @@ class _Estimate:
             covariance[RATE, RATE] += 4.0 * dt * _CURVATURE * squares
         walks[CHANGE] += dt * (settings.change_walk**2 + math.sqrt(spread) * unknown_change)
         walks[INERTIA] += dt * settings.inertia_walk**2
+        walks[BIAS] += dt * settings.bias[1] ** 2
+        walks[COILS] += dt * settings.coils[1] ** 2
         self.covariance = covariance
 
-    def _flow(self, rate: Vector, field: Vector, change: Vector, dipole: Vector, dt: float) -> FloatArray:
-        """Return the linearised change (15, 15) of the states during `dt`."""
-        cross_rate = np.array(skew(rate))
+    def _flow(
+        self, rate: Vector, field: Vector, change: Vector, commanded: FloatArray, dt: float
+    ) -> FloatArray:
+        """Return the linearised change (27, 27) of the states during `dt`."""
+        cross_rate, dipole = np.array(skew(rate)), _floats(self.coils @ commanded)
         momentum = times(self.inertia_rows, rate)
         torque = _difference(cross(dipole, field), cross(rate, momentum))
         flow = np.zeros((SIZE, SIZE))
@@ -585,6 +658,7 @@ class _Estimate:
         changed = by_inertia(acceleration) + cross_rate @ by_inertia(np.array(rate))
         flow[RATE, INERTIA] = -self._trace * self.inverse @ changed
         flow[RATE, FIELD] = self.inverse @ np.array(skew(dipole))
+        flow[RATE, COILS] = -self.inverse @ np.array(skew(field)) @ by_matrix(commanded)
         flow[FIELD, RATE] = skew(field)
         flow[FIELD, FIELD] = flow[CHANGE, CHANGE] = -cross_rate
         flow[FIELD, CHANGE] = np.eye(3)

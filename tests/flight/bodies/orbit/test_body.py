@@ -346,6 +346,19 @@ def test_a_matrix_of_redundant_coils_is_not_stored_while_a_coil_is_isolated() ->
     assert BODY in plain.learned(cast(Any, None)), "three coils keep their matrix"
 
 
+def test_a_change_of_devices_reaches_the_detumbler() -> None:
+    """The detumbler must not apply a reversed coil twice, in its estimated matrix and in the commands."""
+    calls: list[str] = []
+    found: Any = estimation()
+    found.detumbler = SimpleNamespace(
+        renew_coils=lambda: calls.append("coils"), renew_magnetometer=lambda: calls.append("magnetometer")
+    )
+    found.coils_corrected(np.array([-1.0, 1.0, 1.0]), np.full(3, 0.1))
+    found.coils_used(np.array([False, True, True]))
+    found.magnetometer_changed()
+    assert calls == ["coils", "coils", "magnetometer"]
+
+
 @pytest.mark.parametrize(("name", "renewed"), [("orbit", 0), ("orbit_6u_redundant", 1)])
 def test_a_change_of_redundant_coils_resets_their_learned_matrix(name: str, renewed: int) -> None:
     bench = Estimating(name)

@@ -168,14 +168,43 @@ def test_a_magnetometer_noisier_than_configured_gives_an_honest_rate() -> None:
     times = np.arange(0.0, 100.0, 0.2)
     rng, found = np.random.default_rng(2), FieldRate(settings())
     states = tumbling(np.radians([8.0, 4.0, -5.0]), INERTIA, times, np.zeros(3))
-    restarts = []
     for state in states:
         found.advance(np.zeros(3), 0.2)
         found.measure(state[3:] + 4.0 * NOISE * rng.standard_normal(3))
-        restarts.append(found.restarts)
-    assert restarts[-1] == restarts[len(times) // 3]
+    assert 1 <= found.restarts <= 2, "one restart for each doubling of the estimated noise"
     error = found.rate - states[-1][:3]
     assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3
+
+
+@pytest.mark.parametrize(
+    ("working", "bias"),
+    [
+        ((1.0, 0.0, 1.0), (0.0, 0.0, 0.0)),
+        ((1.0, -1.0, 1.0), (0.0, 0.0, 0.0)),
+        ((1.0, 1.0, 1.0), (2.5e-6, -2e-6, 2.4e-6)),
+    ],
+    ids=["dead coil", "reversed coil", "biased magnetometer"],
+)
+def test_the_rate_is_honest_despite_an_unknown_coil_fault_or_bias(
+    working: tuple[float, float, float], bias: tuple[float, float, float]
+) -> None:
+    """The coils are driven as in detumbling, and the fault is estimated."""
+    times = np.arange(0.0, 200.0, 0.2)
+    states = tumbling(np.radians([8.0, 4.0, -5.0]), INERTIA, times, np.array(working) * DIPOLE)
+    rng, found = np.random.default_rng(2), FieldRate(settings())
+    for state in states:
+        found.advance(DIPOLE, 0.2)
+        found.measure(state[3:] + bias + NOISE * rng.standard_normal(3))
+        if found.started:
+            error = found.rate - state[:3]
+            assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 36.0
+    assert found.restarts == 0
+    assert np.linalg.norm(error) < 0.03 * np.linalg.norm(state[:3])
+    np.testing.assert_allclose(found.bias, bias, atol=1.5e-7)
+    # The dipole and the inertia have a common scale that is not observable.
+    np.testing.assert_allclose(found.coil_matrix @ DIPOLE, np.array(working) * DIPOLE, atol=0.03)
+    found.renew_coils()
+    np.testing.assert_array_equal(found.coil_matrix, np.eye(3))
 
 
 def test_two_samples_too_far_apart_start_nothing() -> None:
