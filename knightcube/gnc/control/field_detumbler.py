@@ -16,8 +16,8 @@ the standard deviation of the rate across the field is below `BOUNDED`. The coil
 sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
 
 The filter also estimates the bias of the magnetometer and the matrix of the coils, so a dead or reversed coil
-falsifies neither the rate nor the plan. If the field usually changes within the pauses, the field of the
-coils decays more slowly than configured, and the pauses become longer.
+falsifies neither the rate nor the plan. If the measured field usually changes during the pauses, the field of
+the coils decays more slowly than configured. The pauses then become longer.
 
 The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
 obeys h' = m x B, where m is the dipole moment and B the field. This equation contains neither the inertia nor
@@ -91,8 +91,9 @@ class MomentumPlan:
     """A plan that removes the momentum in minimum time.
 
     Attributes:
-        costate: scaled costate y (3,), inertial axes, A m^2/T, or zero for a body at rest. The commanded
-            dipole moment in the field B is -B x y, clipped at the limit of each coil.
+        costate: scaled costate y (3,), inertial axes, A m^2/T, or zero for a body at rest. In the
+            field B, the commanded dipole moment of coils without errors is -B x y, clipped at the limit of
+            each coil.
         horizon: time until the body is at rest, s.
     """
 
@@ -290,8 +291,9 @@ field."""
 SHORTEST = 9
 """Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
 PAUSES, DECAYING, LARGEST_CHANGE = 8, 4.0, 25.0
-"""Number of coil pauses over which the normalised square of the field change within a pause is averaged, mean
-above which the pauses become longer, and largest square that is used. Noise causes a mean of 1."""
+"""Number of coil pauses over which the normalised square of the field change during a pause is averaged, mean
+square above which the pauses become longer, and value at which each square is clipped. Noise alone causes a
+mean square of 1."""
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 CHANGED = 30.0
@@ -363,7 +365,7 @@ class _Pause(NamedTuple):
         field: first field (3,) T without the estimated bias, body axes.
         rate: estimated body rate (3,), rad/s.
         bias: estimated bias (3,) of the magnetometer, T.
-        square: normalised square of the change from the first to the newest field of the pause, 1 for noise.
+        square: normalised square of the change from the first to the newest field; its mean is 1 for noise.
     """
 
     time_ns: int
@@ -485,7 +487,7 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,), A m^2, that actually acts until the next command."""
+        """Set the dipole moment (3,), A m^2, of the currents sent to the coils until the next command."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole
@@ -496,7 +498,7 @@ class FieldDetumbler:
         return self._begun_ns + self._pause_ns + self._act_ns
 
     def _watch_decay(self, time_ns: int, field: FloatArray) -> None:
-        """Compare a field (3,) T with the first field after a driven phase, rotated with the body rate."""
+        """Compare a field (3,) T with the first field of the pause, propagated with the body rate."""
         found, pause = self._filter, self._pause
         if not found.started or not np.isfinite(field).all():
             return
@@ -555,7 +557,7 @@ class FieldDetumbler:
 
     @property
     def restarts(self) -> int:
-        """Number of restarts of the rate filter after contradictory samples, which a fast spin may cause."""
+        """Number of restarts of the rate filter after contradictory or noisy samples, as in a fast spin."""
         return self._filter.restarts
 
     def _distrust(self) -> None:
