@@ -1,4 +1,4 @@
-"""The body rate from the magnetometer: an extended Kalman filter of rate, field and field derivative.
+"""The body rate from the magnetometer, by an extended Kalman filter.
 
 Relative to a rotating body, the field direction moves on a cone about the rate vector. The motion of the
 field direction therefore gives all three components of the rate, including the component along the field. A
@@ -78,18 +78,18 @@ _EQUAL = 0.1
 _CURVATURE = 1.0
 """Correlation time (s) of the gyroscopic acceleration that is of second order in the error of the rate."""
 _NOISE_STEPS = 0.2, 0.02
-"""Change of the logarithm of the estimated field noise at the first sample, and after many samples. In
-between, the change is inversely proportional to the number of samples."""
+"""Changes of the logarithm of the estimated field noise by the first sample, and by each sample after many
+samples. The changes decrease from the first to the second value, about inversely to the number of samples."""
 _NOISIER = 1.2
 """Least ratio of the estimated to the configured field noise at which the estimate is used."""
 _NOISE_RESTART = 2.0
-"""Ratio of the estimated field noise to the noise at the start of the filter, above which the filter
-restarts. The covariances of a filter that assumed too little noise are too small."""
+"""Ratio of the estimated field noise to its value at the start of the filter above which the filter restarts.
+The covariances of a filter that assumed too little noise are too small."""
 _IMPROBABLE = 25.0
 """Largest difference of two estimates' log-likelihoods at which the less probable estimate is kept."""
 _EYE: FloatArray = np.eye(SIZE)
 _BY_FIELD: FloatArray = _EYE[FIELD] + _EYE[BIAS]
-"""Jacobian (3, n) of a field measurement."""
+"""Jacobian (3, 27) of a field measurement."""
 _NONE: Vector = (0.0, 0.0, 0.0)
 
 
@@ -99,8 +99,8 @@ class FieldRateSettings:
 
     Attributes:
         inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
-        field_sigma: standard deviation of the noise of a field measurement, T per axis. If the strength of
-            the field varies more from sample to sample, a larger standard deviation is used.
+        field_sigma: standard deviation of the noise of a field measurement, T per axis. A
+            larger standard deviation is used if the strength of consecutive samples varies more than this.
         rate_start: initial standard deviation of the rate along the field, rad/s.
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
@@ -168,7 +168,7 @@ class FieldRate:
     may still keep a wrong rate. A gyro rate (`measure_rate`) excludes a wrong rate.
 
     Attributes:
-        restarts: number of restarts after failed predictions.
+        restarts: number of restarts after failed predictions or an increase of the field noise.
         revisions: number of times that another estimate became the most probable one.
     """
 
@@ -263,7 +263,7 @@ class FieldRate:
         return self._estimates[0] if self._estimates else self._unknown
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
-        """Propagate the state by `seconds` under a dipole moment (3,) A m^2 of the coils, body axes."""
+        """Propagate the state by `seconds` under a commanded dipole moment (3,), A m^2, body axes."""
         self._is_reset = False
         self._since += seconds
         self._noise.advance(seconds)
@@ -325,7 +325,7 @@ class FieldRate:
         *,
         corrects: bool = True,
     ) -> bool:
-        """Apply a measurement of the states `measured`, and return whether an estimate agrees with it.
+        """Apply a measurement with the Jacobian `rows` (3, 27), and return whether an estimate agrees.
 
         The measurement (3,), which `value_for` returns in the present axes of an estimate, has the standard
         deviation `sigma` per axis. Unless `corrects` is true, the measurement is only compared with the
@@ -484,7 +484,7 @@ class FieldNoise:
 
 
 class _Estimate:
-    """An estimate of rate, field, field derivative and inertia, with the log-likelihood of its measurements.
+    """An estimate of the states, with the log-likelihood of the measurements.
 
     Attributes:
         rate: body rate, rad/s, body axes.
@@ -520,7 +520,7 @@ class _Estimate:
         self.log_likelihood = log_likelihood
         self._update_unexplained()
         self._pending = 0.0  # time (s) from the covariance to the state
-        # Integral of the dipole since the time of the covariance, A m^2 s.
+        # Integral of the commanded dipole since the time of the covariance, A m^2 s.
         self._pending_impulse = np.zeros(3)
         # Rate, field and field derivative at the time of the covariance.
         self._pending_start = _NONE, _NONE, _NONE
@@ -534,7 +534,7 @@ class _Estimate:
     def advance(self, dipole: FloatArray, seconds: float) -> bool:
         """Propagate the state by `seconds`, and return whether the covariance was propagated, too.
 
-        The coils have the dipole moment `dipole` (3,) A m^2, body axes.
+        The commanded dipole moment of the coils is `dipole` (3,), A m^2, body axes.
         """
         speed = math.sqrt(sum(w * w for w in self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
