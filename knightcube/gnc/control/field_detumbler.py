@@ -91,9 +91,8 @@ class MomentumPlan:
     """A plan that removes the momentum in minimum time.
 
     Attributes:
-        costate: scaled costate y (3,), inertial axes, A m^2/T, or zero for a body at rest. In the
-            field B, the commanded dipole moment of coils without errors is -B x y, clipped at the limit of
-            each coil.
+        costate: scaled costate y (3,), inertial axes, A m^2/T, or zero for a body at rest. In the field B,
+            the commanded dipole moment of coils without errors is -B x y, clipped at the limit of each coil.
         horizon: time until the body is at rest, s.
     """
 

@@ -99,8 +99,8 @@ class FieldRateSettings:
 
     Attributes:
         inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
-        field_sigma: standard deviation of the noise of a field measurement, T per axis. A
-            larger standard deviation is used if the strength of consecutive samples varies more than this.
+        field_sigma: standard deviation of the noise of a field measurement, T per axis. A larger standard
+            deviation is used if the strength of consecutive samples varies more than this.
         rate_start: initial standard deviation of the rate along the field, rad/s.
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
