@@ -31,7 +31,7 @@ class _Timespec(ctypes.Structure):
 
 
 def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
-    """Wake at every slot, and record wake-up times and stolen time, until `stopped` has an element.
+    """Wake at every slot, and record the wake-up and stolen times, until `stopped` is not empty.
 
     Missed slots are skipped.
     """

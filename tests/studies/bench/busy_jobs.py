@@ -1,9 +1,9 @@
 """Workers that are never idle: each repeats its last job until the next job arrives.
 
-`python -m tests.studies.bench executive --busy` uses them, because a satellite plans at most every 10 s, and
-because emulating a camera frame takes longer than processing it. The flight's own jobs are repeated, and the
-results of the repetitions are discarded. A new job waits for the end of the running repetition. Modules are
-imported inside the functions, because the functions run in the workers.
+`python -m tests.studies.bench executive --busy` uses them, because ordinary workers are mostly idle: a
+satellite plans at most every 10 s, and emulating a camera frame takes longer than processing it. The flight's
+own jobs are repeated, and the results of the repetitions are discarded. A new job waits for the end of the
+running repetition. Modules are imported inside the functions, because the functions run in the workers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _M_ARENA_MAX = -8  # malloc.h
 
 
 class Again:
-    """Runner of one module's jobs that repeats the last job while no new job waits."""
+    """Runner of the jobs of one module, which repeats the last job until a new job arrives."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()

@@ -64,7 +64,7 @@ SHORTEST_REPLAN = 10.0
 AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
 """Release state along the flight direction, with the star camera pointing to the sky.
 
-All tasks can work at once.
+In this state all tasks can run from the start.
 """
 
 _PATIENCE_S = 240.0  # longest time until the flight is ready
@@ -175,8 +175,8 @@ def fifo_allowed() -> bool:
 def full_load(load: Load) -> str:
     """Return the configuration in which planner and vision work without pause.
 
-    In the step demonstration the receding strategy plans at every replanning. The goal strategy stops
-    planning once a step is over.
+    In the step demonstration, the strategy `receding` makes a plan in every replanning period. The goal
+    strategy stops planning once a step is over.
     """
     period = load.camera_period
     if load.orbit:

@@ -1,10 +1,9 @@
 """Likelihood fit relative to the Cramer-Rao bound, and its time.
 
 The frames show random fields of the real sky through the simulator's default camera (1024 x 1024, 20 deg). A
-ratio is the rms error divided by the bound of the 20 brightest stars, each computed as if it were alone in
-the sky. The table has the ratios of the whole rate vector, of the rate's magnitude, and of the mid-exposure
-positions of the eight brightest stars. The NEES is 1 if the covariance is correct. No other study uses these
-seeds.
+ratio is the rms error divided by the bound of the 20 brightest stars, which ignores that stars overlap. The
+table has the ratios of the whole rate vector, of the rate's magnitude, and of the mid-exposure positions of
+the eight brightest stars. The NEES is 1 if the covariance is correct. No other study uses these seeds.
 
 With `--known-sky` the stars are identified after the first fit, without prior attitude. The streaks are then
 fitted again with all stars of the catalogue, as in flight; the results and times are those of the second fit.
@@ -36,7 +35,7 @@ _BRIGHT = 8
 
 
 def estimated(scene: Scene, known_sky: bool) -> MotionResult:
-    """Return the motion of a frame with the sign of the true rate.
+    """Return the estimated motion of a frame; the true rate determines its sign.
 
     With `known_sky` the result is that of the second fit.
     """
@@ -81,7 +80,7 @@ def rate_row(
 
 
 def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[float]:
-    """Return squared position errors of the brightest stars / bound, whose expectation is 1.
+    """Return squared position errors of the brightest stars, divided by their bounds; 1 is expected.
 
     Streaks with both ends outside the image are omitted, because their position along the streak is
     undetermined.

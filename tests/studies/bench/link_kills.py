@@ -2,9 +2,9 @@
 
 In each run, a link process receives the commands of a ground station while an attacker replays all old
 frames. The link process is killed (SIGKILL) before or after one of its calls that write to the disk or to the
-socket of the flight. Some of the writes are cut in the middle first. The ground's sender is killed in the
-same way. The benchmark counts commands that the flight received twice, and frame counters that were used
-twice.
+socket of the flight. In some runs, the last write before the kill is cut in the middle. The ground's sender
+is killed in the same way. The benchmark counts commands that the flight received twice, and frame counters
+that were used twice.
 
 With `--scheduled` the commands are in the link's schedule and fall due while the link process is killed. A
 second process, which is not killed, continues. The benchmark counts commands that the flight received twice,
@@ -58,7 +58,7 @@ class Findings:
         scheduled: commands that were put into the schedule.
         schedules_lost: schedules of which no intact copy remained.
         counters_twice: counter values, in either direction, with which two different frames were sent.
-        seen: frames by SPI and IV.
+        seen: sent frames by SPI and IV.
         obeyed: how often the flight received each command, by the number in the command `ping`.
     """
 
@@ -163,7 +163,7 @@ def measure_scheduled(place: Path, kills: int, seed: int) -> Findings:
 
 
 class Way:
-    """The writing calls of a process, which is killed at one of them."""
+    """Wrapper of the writing calls of a process, which kills the process at one of them."""
 
     def __init__(self, point: int, torn: bool, writer: socket.socket) -> None:
         self._left = point

@@ -140,7 +140,7 @@ def _times(taken: Sequence[float]) -> str:
 
 
 def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
-    """Return a task's planning job, with torques of `draw` (9,) times the filter's prior sigmas."""
+    """Return a task's planning job, whose torques are `draw` (9,) times the prior sigmas of the filter."""
     craft = {"1U": "knightcube", "3U": "cubesat_3u"}[name[:2]]
     place = task.along(np.array([0.0, 1.0])).position
     end = task.end(task.horizon)

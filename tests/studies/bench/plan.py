@@ -26,7 +26,7 @@ TOO_SHORT = (0.6, 0.99)
 
 
 def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
-    """Return statistics of planned slews, each given with its shortest feasible duration (s)."""
+    """Return statistics of planned slews; each problem comes with its shortest feasible duration (s)."""
     spans, costs, passed, beyond, failed, unsolved = [], [], [], [], 0, 0
     stretched = 0
     for problem, shortest in problems:
@@ -64,7 +64,7 @@ def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
 def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
     """Return the mean numbers of evaluations that the planner needs to plan again after a third of a slew.
 
-    The planner starts once from the first plan and once without it.
+    The second planning is done once with the first plan as initial guess, and once without it.
     """
     cold, warm = [], []
     for problem, _ in problems:

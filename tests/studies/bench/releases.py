@@ -125,7 +125,7 @@ class RealReleases(RenewedBoard):
 
 
 class Rehearsal:
-    """The benchmark's steps; for each, the version in use afterwards and the duration are recorded."""
+    """Steps of the benchmark, and for each step its duration and the version in use after it."""
 
     def __init__(self, place: Path) -> None:
         self._begun = time.monotonic()

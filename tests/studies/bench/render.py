@@ -61,7 +61,7 @@ def rendered(count: int, seed: int, field_deg: float) -> Rendered:
 
 
 def rows(count: int, seed: int, field_deg: float) -> list[dict[str, Any]]:
-    """Return the rows of the table, of one process for each form."""
+    """Return the rows of the table, one for each form; each form runs in a process of its own."""
     found = []
     for name, prepare in (("numpy", use_numpy_forms), ("compiled", None)):
         with ProcessPoolExecutor(1, get_context("spawn"), prepare) as pool:

@@ -11,8 +11,8 @@ divided by the Cramer-Rao bound of the star positions; `bound` is the same ratio
 rate. Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths
 of streaks. Times are processor times of one core. For photographs, the time is the median of some passes
 after a first pass that is not counted, for all programs. The other star identification programs extract the
-stars themselves, with their default filters and without filters. `ratios` compares the time of each
-photograph with known field with that of each other program: the median of the ratios for each frame size.
+stars themselves, with their default filters and without filters. `ratios` has, for each other program and
+each size of photographs, the median ratio of this project's time to that program's time, with known field.
 `dim frames` are frames of a calibrated camera with such short exposures that few stars are detected.
 """
 

@@ -44,7 +44,8 @@ _WORKERS = ("planner", "vision", "wide")
 class Wish:
     """Options of the flight.
 
-    Duration (s), craft, periods (s) of frames and plans, share of a core or None, and readings per second.
+    They are the duration (s), whether the flight is in orbit, periods (s) of frames and plans, share of a
+    core or None, and inertial readings per second.
     """
 
     duration: float

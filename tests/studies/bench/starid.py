@@ -6,9 +6,9 @@ unknown field between 10 and 30 deg, or show no part of the sky. A result is cor
 correct to 0.05 deg and 80 % of the identified stars are correct. Times are processor times of one core with
 one list per call. The other programs run in separate processes.
 
-`bound` is the median pointing error divided by the median error that the centroid noise allows. The latter
-follows from the Fisher information of all true stars of the list for unknown attitude and scale. It is 1.1774
-sigma, the median of a Rayleigh distribution.
+`bound` is the median, over the lists, of the pointing error divided by the median error that the centroid
+noise allows. This median error follows from the Fisher information of all true stars of the list for unknown
+attitude and scale. It is 1.1774 sigma, the median of a Rayleigh distribution.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def pointing_error(answer: Answer, drawn: StarList) -> float:
 
 
 def pointing_bound(drawn: StarList, sky: SkyIndex) -> float:
-    """Return the bound of sigma (rad) of the boresight per axis, with all true stars and unknown scale."""
+    """Return the bound of the boresight's sigma (rad) per axis, from all true stars with unknown scale."""
     true = np.flatnonzero(drawn.star >= 0)
     field = drawn.field()
     scale = PIXELS / (2.0 * drawn.camera.focal_length * field.half_width[0])
@@ -156,7 +156,7 @@ def pointing_bound(drawn: StarList, sky: SkyIndex) -> float:
 def row_of(
     solver: str, kind: str, answers: Sequence[Answer], lists: Sequence[StarList], bounds: Sequence[float]
 ) -> tuple[dict[str, Any], list[float]]:
-    """Return the results of one solver on the first lists of one kind, and its errors over the bound."""
+    """Return one solver's results on the first lists of one kind, and its errors divided by their bounds."""
     lists, bounds = lists[: len(answers)], bounds[: len(answers)]
     errors = np.array(
         [np.nan if a.boresight is None else pointing_error(a, d) for a, d in zip(answers, lists, strict=True)]

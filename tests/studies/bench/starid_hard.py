@@ -3,9 +3,9 @@
 The lists have unknown fields of view, false stars that are all brighter than the true ones, mirrored images,
 assumed fields that are 10 % wrong, or uncalibrated lenses with 2 to 8 % of distortion. Points that show no
 part of the sky measure the time of a refusal. The lists are drawn as in the benchmark `starid`. `wrong`
-counts incorrect results. For a distorted lens, a result is misleading if its error exceeds both five sigmas
-and 120 arcseconds. The exit status is 1 if a result is wrong or misleading. `--peer` runs tetra3rs or
-cedar-solve on the same lists.
+counts incorrect results. For a distorted lens, a result is wrong only if its error exceeds both five sigmas
+and 120 arcseconds. The exit status is 1 if a result is wrong. `--peer` runs tetra3rs or cedar-solve on the
+same lists.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ _EVEN = 10.0, 30.0
 
 @dataclass(frozen=True, slots=True)
 class Hardship:
-    """One row: a kind of list, its range of fields of view (deg), and its difficulties.
+    """One row of the table: the kind of the lists, their range of fields of view, and their difficulties.
 
     Attributes:
-        kind: name of the row.
+        kind: parameters of the lists.
         fields: range of fields of view, deg.
-        distorted: whether the lens is distorted by _DISTORTION at the corner, with 0 to 5 false stars.
+        distorted: whether the lens has a random distortion (_DISTORTION at the corner), and the list 0 to 5
+            false stars.
         hint: relative error of the given field of view.
         strewn: whether the points are random and show no part of the sky.
     """
@@ -107,7 +108,7 @@ def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[StarMatch, 
 
 
 def verdict(row: Hardship, drawn: StarList, found: StarMatch) -> str:
-    """Return "right", "wrong" or "refused"; for a distorted lens "right", "misleading" or "refused"."""
+    """Return "right", "wrong" or "refused"."""
     if found.fix is None:
         return "refused"
     matched = found.star >= 0
