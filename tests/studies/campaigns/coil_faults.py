@@ -2,9 +2,9 @@
 
 Each run flies 20 s of the demonstration's loop in lock-step, without a camera, through two slews, and breaks
 one coil or one leg of a bridge at a random time, for 3 s or to the end. The IMU has no fault. The campaign
-reports for how long after the fault's onset and end the error of the estimated rate or angle exceeds 5 of its
-claimed standard deviations, how long after the onset the filter still rejects measurements of the healthy
-IMU, and how often control was lost.
+reports how long the error of the estimated rate or angle exceeds 5 of its claimed standard deviations, during
+the fault and after it. It also reports until how long after the onset the filter rejects measurements of the
+healthy IMU, and how often control was lost.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def config_for(slews: tuple[float, float]) -> Config:
 
 
 def judge(flown: Run, entry: FaultEntry) -> Result:
-    """Return how long the error exceeded the limit, and when healthy measurements were refused."""
+    """Return durations of excessive errors, rejections of the healthy IMU, and losses of control."""
     beyond, times = estimate_beyond(flown)
     period = float(np.median(np.diff(times)))
     begin = entry.at or 0.0

@@ -7,22 +7,23 @@ their gains by one criterion: minimum power with every step settled in 9 s and o
 
 `controllers` flies the 700 s step demonstration on the same seeds. The thesis states a power of 0.10 W for
 its own loop, 0.15 W for PID and 0.66 W for adaptive control on its testbed (ch. 5, Hardware Results). Two
-definitions of power are used (`knightcube.gnc.guidance.plant`). V |I| is the power that the chopped
-coils draw from their supply of 3.4 V; it is comparable to the powers of the thesis. R I^2 of the mean current
-is the cost that the paths minimise. The thesis states no stiffness of its thread. On a thread of 4.2e-5 N
-m/rad the thesis's loop draws the stated 0.10 W (as R I^2). The controllers of `STIFF` are also simulated with
-a body on this thread, for which PID and adaptive control are then tuned. The lower bound of the power is the
-clairvoyant optimum, computed by direct collocation (tests.support.collocation_oracle): the whole plant is
-known, and each target is reached at rest 10 s after its command and held. A controller that reaches its
-targets later may use less power.
+definitions of power are used (`knightcube.gnc.guidance.plant`). V |I| is the power that the chopped coils
+draw from their supply of 3.4 V; it is comparable to the powers of the thesis. R I^2 of the mean current is
+the cost that the paths minimise. The thesis states no stiffness of its thread. On a thread of 4.2e-5 N m/rad
+the thesis's loop draws the stated 0.10 W (as R I^2). The controllers of `STIFF` are also simulated on this
+thread; its PID and adaptive control are tuned for it. The lower bound of the power is the optimum for a known
+plant, in which each target is reached at rest 10 s after its command and held. It is computed by direct
+collocation (tests.support.collocation_oracle). A controller that reaches its targets later may use less
+power.
 
 `robust-controllers` flies two steps of the demonstration, 65 s each, in worlds that differ from the loop's
-model: inertia within 20 %, field and coil resistance within 10 %, a thread stiffness of 0 to 3 times that of
-the demonstration (which the loop does not model), a gyro bias, noise of up to 3 times, readings that are one
-to three cycles late, 5 % of damaged packets, and an IMU that is silent for up to a second, once in a slew and
-once in a hold. While the unit is silent the coils are at zero, and the thread alone rotates the body by
-k theta t^2 / (2 J), up to half a degree in a second. This rotation is called the excursion. The steady state
-excludes the silent intervals and `RECOVERY` s after each. All results refer to the true body.
+model. Inertia differs by up to 20 %, and field and coil resistance by up to 10 %. The stiffness of the
+thread, which the loop does not model, is 0 to 3 times that of the demonstration. The gyro has a bias, the
+noise is up to 3 times that of the demonstration, readings are one to three cycles late, and 5 % of the
+packets are damaged. The IMU is silent for up to a second, once in a slew and once in a hold. While the unit
+is silent the coils are at zero, and the thread alone rotates the body by k theta t^2 / (2 J), up to half a
+degree in a second. This rotation is called the excursion. The steady state excludes the silent intervals and
+`RECOVERY` s after each. All results refer to the true body.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def this_loop() -> TestbedConfig:
 
 
 def thesis_loop() -> TestbedConfig:
-    """Return the loop of the thesis: its guidance and its tracker, which use the estimates of the filter."""
+    """Return the loop of the thesis: its guidance and its tracker, with the estimates of the filter."""
     return thesis_config(DURATION)
 
 
@@ -160,7 +161,7 @@ def run(case: Case) -> Result:
     return {
         **case.parameters,
         **{key: _worst(*(row[key] for row in rows)) for key in FIGURES},
-        # The rise time of the slew from the release is not that of a step.
+        # The first slew starts at the release and is no step, so its rise time does not count.
         "rise_s": _worst(*(row["rise_s"] for row in rows[1:])),
         "heat_w": found["power"]["heat_average_w"],
         "supply_w": found["power"]["supply_average_w"],

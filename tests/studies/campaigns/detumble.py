@@ -3,11 +3,11 @@
 Two craft are detumbled, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law
 `magnetometer` has only a magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a
 coarse attitude. The law `inertia` has the same sensors, but the body's moments and principal axes differ from
-the configured ones by up to the default accuracies. For the magnetometer, the coils are off for a twentieth
-of each four seconds, or for a tenth of each two seconds while the rate is uncertain. They are also off before
-the rate is known. The coils are commanded every quarter of a second, and at least once per 0.3 rad of the
-body's rotation. Each time is compared with a rigorous lower bound (`least_time`) for any control of these
-coils. The bound assumes that the coils are never off, and that the largest dipole can have any direction.
+the configured ones by up to the default accuracies. The coils pause for 0.2 s in every 4 s for the
+magnetometer, and in every 2 s while the rate is uncertain. They are also off before the rate is known. The
+coils are commanded every quarter of a second, and at least once per 0.3 rad of the body's rotation. Each time
+is compared with a rigorous lower bound (`least_time`) for any control of these coils. The bound assumes that
+the coils are never off, and that the largest dipole can have any direction.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ from tests.studies.campaigns.free_flight import CRAFT, FIX_SIGMA, GYRO_NOISE, SE
 
 DIRECTIONS = 2000
 CLOSER, TRIES = (0.06, 0.02, 0.007), 60
-"""Spreads (rad) of the directions tried around the worst one found, and their number for each spread."""
+"""Spreads (rad) of further directions around the worst one found, and number of directions for each
+spread."""
 
 
 def least_time(
@@ -64,15 +65,15 @@ def least_time(
 
         y . h(0) - left <= integral of (reach |B x y| + others) from 0 to t.
 
-    The right-hand side grows with t, so each y excludes all times before the two sides are equal. The result
-    is the latest such time of all directions that are tried. It is a lower bound for any set of directions,
-    because each direction alone gives one. Three orthogonal coils with the same limit together have a dipole
-    moment of at most sqrt(3) times this limit.
+    The right-hand side grows with t, so for each y, t is at least the time at which the two sides are equal.
+    The result is the latest of these times over all directions that are tried. It is a lower bound whichever
+    directions are tried, because each direction alone gives a lower bound. Three orthogonal coils with the
+    same limit together have a dipole moment of at most sqrt(3) times this limit.
 
     Args:
         momentum: initial angular momentum (3,), N m s, inertial axes.
         field: magnetic field (n, 3), T, at the middles of n steps, in the same axes.
-        step: duration of all steps or of each step (n,), s. The result is at most their sum.
+        step: duration of all steps or of each step (n,), s. The result is at most the total duration.
         reach: largest magnitude of the coils' dipole moment, A m^2.
         left: final momentum, N m s.
         others: largest torque of other causes, N m, for all steps or for each step (n,).
@@ -241,7 +242,7 @@ class _Bound:
         self._times_ns.append(self._flight.time_ns)
 
     def least(self) -> float:
-        """Return the lower bound of the time (s) until the body is slow, which is at most the time so far."""
+        """Return the lower bound of the detumbling time (s), from the fields and torques recorded so far."""
         flight, craft = self._flight, self._flight.body.craft
         fields, others = np.array(self._fields), np.array(self._others)
         currents = np.array(list(product((-1.0, 1.0), repeat=3))) * flight.limit / flight.dipole_per_ampere

@@ -95,7 +95,7 @@ class DarkFlight(PointingFlight):
         super().cycle(time)
 
     def find_shadow(self, learned: float, shortest: float) -> bool:
-        """Set the begin and end of the first shadow after `learned` s; return whether it is long enough."""
+        """Find the first shadow that begins after `learned` s; return whether it is long enough."""
         times = np.arange(0.0, LONGEST)
         dark = self.flight.ephemeris(LONGEST + 1.0).sunlit_at(times) < 0.5
         begins = np.flatnonzero(dark[1:] & ~dark[:-1] & (times[1:] > learned)) + 1

@@ -6,10 +6,10 @@ same motion. A star is usable if its whole streak lies at least 4 px inside the 
 eight standard deviations of the noise under its streak (`scenes.usable`).
 
 A result is wrong if its error vector exceeds both 6 claimed standard deviations (the square root of its NEES;
-probability 1 in 13 million) and 1 % of the rate. Each condition is also counted alone. The first alone means
-that the covariance is too small. The second alone may be a consistent result from streaks of a few px.
-Refusals are counted by their status. If the usable stars move less than the estimator's minimum length, the
-rate cannot be determined, and a refusal is correct.
+probability 1 in 13 million) and 1 % of the rate. Each condition is also counted alone. An error above 6
+standard deviations means that the covariance is too small. An error above 1 % may be a consistent result from
+streaks of a few px. Refusals are counted by their status. If the usable stars move less than the estimator's
+minimum length, the rate cannot be determined, and a refusal is correct.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def run(case: Case) -> Result:
 
 
 def _path_lengths(scene: Scene) -> FloatArray:
-    """Return the path lengths (n,), px, of the stars, as sums of the chords of both halves."""
+    """Return the path lengths (n,), px, of the stars: the sums of the chords of both halves."""
     halves = (scene.middle - scene.start, scene.end - scene.middle)
     return np.asarray(sum(np.linalg.norm(half, axis=1) for half in halves))
 
@@ -107,7 +107,7 @@ def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
 
 
 def _why_refused(found: MotionResult) -> str:
-    """Return the reason for a refusal as far as the result gives it."""
+    """Return the reason for a refusal, as far as the result contains it."""
     if not found.found:
         return "no motion that the regions agree on"
     return f"{found.used_count} of {found.found} stars used, {found.length:.0f} px, misfit {found.misfit:.2f}"

@@ -30,7 +30,7 @@ Maker = Callable[[Size, np.random.Generator], FloatArray]
 
 
 def spectral_noise(size: Size, slope: float, generator: np.random.Generator) -> FloatArray:
-    """Return noise (rows, columns) of zero mean and unit variance with the amplitude (wave number)^-slope."""
+    """Return noise (rows, columns), mean 0, variance 1, with the amplitude spectrum (wave number)^-slope."""
     rows, columns = size
     wave = np.hypot(np.fft.fftfreq(2 * rows)[:, None] * 2 * rows, np.fft.rfftfreq(2 * columns) * 2 * columns)
     white = np.fft.rfft2(generator.standard_normal((2 * rows, 2 * columns)))

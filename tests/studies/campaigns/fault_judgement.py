@@ -179,7 +179,8 @@ def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
 def _is_driven(own: FloatArray, kind: str) -> bool:
     """Return whether a broken coil or bridge was driven for long enough, from the commanded currents (n,), A.
 
-    A leg that is stuck low has an effect only if it should be high: input A drives forwards, B backwards.
+    A leg that is stuck low has an effect only if it should be high: leg A at positive currents, leg B at
+    negative currents.
     """
     driven = {"a-low": own > DRIVEN, "b-low": own < -DRIVEN}.get(kind, np.abs(own) > DRIVEN)
     return kind.endswith("high") or bool(driven.sum() * CYCLE > 2.5)
@@ -211,7 +212,7 @@ def differs(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def _is_upset(flown: Run, device: str, at: float) -> bool:
-    """Return whether a flipped bit had an effect; none is expected in unused or soon rewritten registers."""
+    """Return whether a flipped bit had an effect; unused or soon rewritten registers show none."""
     match device:
         case "pwm":
             obeyed = _obeyed(flown, at)
@@ -312,7 +313,7 @@ def _obeyed(flown: Run, end: float) -> float | None:
 
 
 def _is_unmeasured(flown: Run) -> BoolArray:
-    """Return whether the age of each cycle's newest measurement exceeds the limit by more than a cycle."""
+    """Return, for each cycle, whether its newest measurement is older than the limit plus one cycle."""
     time_ns = flown["control"]["time_ns"]
     came_ns, sampled_ns = flown["imu"]["time_ns"], flown["imu"]["sample_time_ns"]
     count = np.searchsorted(came_ns, time_ns, side="right")
@@ -324,7 +325,8 @@ def _blind_current(flown: Run, also_unsteered: bool) -> float:
     """Return the largest current (A) while the age of the measurements exceeds the limit.
 
     In this time the estimate may be propagated, but no coil may be driven. `also_unsteered` adds cycles in
-    which the loop has not controlled the body for that long, because the filter rejected the measurements.
+    which the loop has not controlled the body for as long as this limit, because the filter rejected the
+    measurements.
     """
     off = flown["control"]["state"] == 0
     cycles = round(BLIND_GRACE / CYCLE)

@@ -6,7 +6,7 @@ then evaluates the log (`fault_judgement`): whether a specific event reported th
 of the table followed, how long after the end of the fault the flight recovered, which currents the coils
 carried without measurements, and whether the log is complete. A fault of an unused part (a coil that is not
 driven, a planner without a request) has no effect and counts as not exercised. Exercised faults that no event
-reported are listed with the number of their flight, which is that of their case.
+reported are listed with the number of their flight (the case number).
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A case is a board whose emulated devices run in a separate process all the time, and whose stored state
 persists. Its flights are killed one after the other, a quarter of them before they are ready. After each kill
 the campaign samples the currents of the coils every few milliseconds and reads the log and the stored state,
-and the next flight must start. The last flight is stopped by SIGTERM. The last flight must have a record of
-all kills, and must be in safe mode if the number of kills reaches the limit of its configuration.
+and the next flight must start. The last flight is stopped by SIGTERM. It must have a record of all kills, and
+must be in safe mode if the number of kills reaches the crash limit of its configuration.
 """
 
 from __future__ import annotations
@@ -184,9 +184,9 @@ def _current_until(board: Board, kill_ns: int) -> float:
 def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
     """Return the time (s) from the kill to lasting zero current, and the largest current after the limit.
 
-    The first sample of zero current determines the time, which can be late by one sample interval, but not
-    early. Coils that carried current are observed beyond the time limit, and all others long enough to show
-    that they stay at zero.
+    The time ends at the first sample of zero current, so it can be up to one sample interval too long, but
+    not too short. Coils that carried current are observed beyond the time limit, and all others long enough
+    to show that they stay at zero.
     """
     zero_after = beyond = 0.0
     driven = before > 0.0
@@ -207,7 +207,7 @@ def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, flo
 
 
 def _log_of(folder: Path, ready_for: float | None) -> Result:
-    """Return whether the log is readable to its last complete packet, and how much of the flight it has."""
+    """Return whether the log is readable to its last complete packet, and its number of packets."""
     try:
         flown = read_run(folder)
     except UsageError as error:

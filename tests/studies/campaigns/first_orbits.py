@@ -2,7 +2,7 @@
 
 Observer and object move in two random low orbits, which are integrated by DOP853. The object passes at a
 distance of 100 to 3,000 km, and in the middle of the pass the line of sight rotates at 0.05 to 0.6 deg/s.
-There is a sighting every two seconds, with an error of 0.1 px of a camera with 1024 px over 20 deg. The
+There is a sighting every two seconds, with an error of 0.1 px (in a camera with 1024 px over 20 deg). The
 simulation includes light time and the motion of the Earth around the Sun.
 """
 
@@ -64,7 +64,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return a row for each arc length: the determined quantities, their normalised errors, their errors."""
+    """Return a row for each arc length: number of orbits, mean NEES, coverage, and median errors."""
     return summary({"arcs": {arc: _row(own) for arc, own in grouped(results, "arc").items()}})
 
 

@@ -1,7 +1,7 @@
 """A free satellite for campaigns: the simulated world, a random orbit, and sensors with noise.
 
-The simulation omits executive and emulated devices, so a flight needs only the processor time of the world.
-Control rates are lower than 40 Hz.
+Without executive and emulated devices, a flight takes only the processor time of the simulated world. Control
+rates are lower than 40 Hz.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _STREAM = 0xF11
 
 
 class FreeFlight:
-    """True states of a satellite, drawn by one seed, under a commanded dipole."""
+    """True states of a satellite under commanded dipoles; a seed determines all random draws."""
 
     def __init__(
         self,

@@ -5,7 +5,7 @@ Positions, attitudes, Sun directions and ground are random. Altitudes are unifor
 distortion, noise and blemishes. The prior knowledge is the position (GPS), the directions of Sun and magnetic
 field from models, and coarse measurements of both in camera axes (solar cells to 5 deg per axis, magnetometer
 to 2 deg). Each view is rendered with a known atmosphere, whose limb height is known to 1 km, and with an
-unknown one, whose scale height and haze are random.
+unknown atmosphere of random scale height and haze.
 
 Errors are angles between true and measured nadir (both axes together). The NEES of the two axes is 2 if the
 covariance is correct. An accepted result with an error of more than half a degree is wrong. Refused and

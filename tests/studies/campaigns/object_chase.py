@@ -126,7 +126,7 @@ class ObjectChase(PointingFlight):
     def _passing(self, own: FloatArray) -> FloatArray:
         """Return an object's state (6,) at the closest distance.
 
-        The line of sight to the object rotates at the drawn rate.
+        At that time, the line of sight to the object rotates at the drawn rate.
         """
         rng, wanted = self._draw, self._wanted["rate_deg"]
         while True:

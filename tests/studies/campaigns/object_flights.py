@@ -2,9 +2,9 @@
 
 Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`). Every second flight has
 no sighting for ten seconds. From the first frame in which a track is followed, the object should stay within
-the field of view. A linear programme (`least_deviation`) computes whether a body that starts at rest could
-keep it there, with the control authority that issue 16 states and with a roll rate of at most the rate at
-which a flight changes to detumbling.
+the field of view. A linear programme (`least_deviation`) computes the smallest possible deviation of a body
+that starts at rest. The body has the control authority that issue 16 states, and a roll rate of at most the
+rate at which a flight changes to detumbling.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def least_deviation(
     authority: float,
     roll: float,
 ) -> float:
-    """Return the smallest achievable maximum deviation (rad) over instants that are `seconds` apart.
+    """Return the smallest achievable value of the largest deviation (rad); instants are `seconds` apart.
 
     `directions` (n, 3) to the object, the initial `boresight` (3,) of the body at rest, and the magnetic
     `field` (n, 3) are in inertial axes. `authority` is in rad/s^2. `roll` is the fastest rate (rad/s) about
@@ -94,7 +94,7 @@ def _polygons(count: int, authority: float) -> tuple[csr_array, FloatArray]:
 
 
 def _carried(directions: FloatArray) -> FloatArray:
-    """Return two axes (n, 2, 3) across each direction, propagated by the shortest rotations."""
+    """Return two axes (n, 2, 3) normal to each direction, propagated by the shortest rotations."""
     first = np.cross(directions[0], np.eye(3)[int(np.argmin(np.abs(directions[0])))])
     first /= np.linalg.norm(first)
     axes = [np.array([first, np.cross(directions[0], first)])]
@@ -106,7 +106,7 @@ def _carried(directions: FloatArray) -> FloatArray:
 def _turned(directions: FloatArray, axes: FloatArray, field: FloatArray) -> FloatArray:
     """Return the angular accelerations (n, 3, 2) of the deviation (two components) and of the roll.
 
-    The last index is that of two orthogonal unit angular accelerations across the field.
+    The last index selects one of two orthogonal unit angular accelerations normal to the field.
     """
     found = np.zeros((len(directions), 3, 2))
     for n, (direction, both, strength) in enumerate(zip(directions, axes, field, strict=True)):

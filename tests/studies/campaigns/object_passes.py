@@ -189,7 +189,7 @@ class _Frame:
         }
 
     def _bound(self, place: FloatArray, magnitude: float) -> float:
-        """Return the bound on the object's position (px per axis) at mid-exposure."""
+        """Return the Cramer-Rao bound of the object's position (px per axis) at mid-exposure."""
         own = attitude_matrix(self.quaternion) @ np.cross(self.place, self.motion)
         light = float(CAMERA.electrons([magnitude], EXPOSURE)[0])
         floor = CAMERA.read_noise**2 + CAMERA.dark_current * EXPOSURE + CAMERA.gain**2 / 12.0

@@ -102,7 +102,7 @@ def release_attitude() -> tuple[float, float, float, float]:
 
 @cache
 def old_elements() -> tuple[str, str]:
-    """Return the configured elements as a week-old set that is wrong by `OLD_OFF` s along the orbit."""
+    """Return the configured elements as a week-old set with an along-track error of `OLD_OFF` s."""
     config, _ = _described()
     assert config.elements is not None
     known = Satrec.twoline2rv(*config.elements)

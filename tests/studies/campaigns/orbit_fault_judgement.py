@@ -36,7 +36,7 @@ FIELD_GRACE = 8.2
 The detumbler predicts the field for `SILENT_PERIODS` periods of the schedule in config/orbit.yaml, 8 s.
 """
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
-"""Largest errors of an acceptable attitude: in claimed standard deviations, and in rad."""
+"""Largest errors of an acceptable attitude, in claimed standard deviations and in rad."""
 DIPOLE_PER_AMPERE = 0.648
 """Dipole moment per current (A m^2/A) of the coils of config/orbit.yaml."""
 LAST = 12.0
@@ -124,7 +124,7 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
             found = _is_string_lit(flown, at, end)
         case "strings" if kind.kind == "wrong":  # a fine attitude does not use the solar cells
             found = mode == "safe" or not _is_fine(flown, at, end)
-        case "wide":  # upside-down pictures may look correct; an outage of 3 s costs one round of pictures
+        case "wide":  # upside-down pictures may look correct; an outage of 3 s affects one round of pictures
             found = kind.kind not in {"wrong", "intermittent"} and (
                 kind.kind not in {"garbage", "blinded"} or _is_fine(flown, at, end)
             )

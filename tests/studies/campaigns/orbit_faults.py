@@ -3,9 +3,9 @@
 Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and injects one
 fault on the device lines, at a random time and for a random duration; faults of coils and bridges last to the
 end. Some runs have a wrong initial condition instead: an element set that is a week old, no element set, or a
-wall clock that is wrong from the start. The campaign checks whether a specific event reported the fault,
-whether the body meets the requirements of its mode at the end, and the current of coils that were driven
-without valid data, sensor by sensor (readings, field, attitude). It also checks for how long the coils were
+wall clock that is wrong from the start. The campaign checks whether a specific event reported the fault, and
+whether the body meets the requirements of its mode at the end. It checks the current of coils that were
+driven without valid readings, field or attitude, each separately. It also checks for how long the coils were
 driven by an attitude whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an
 unused part (a coil that is not driven, a camera that is idle) counts as not exercised.
 """
@@ -82,7 +82,7 @@ def run(case: Case) -> Result:
 def fly_with(
     kind: FaultKind, mode: str, entries: tuple[FaultEntry, ...], seed: int, elements: str = ""
 ) -> Result:
-    """Run a flight with faults that start and end together, and evaluate them as faults of `kind`."""
+    """Run a flight with faults that start and end together, and evaluate them as one fault of `kind`."""
     config = config_for(mode, elements, replans=kind.device == "planner", wide_often=kind.device == "wide")
     at = entries[0].at or 0.0 if entries else 0.0
     span = entries[0].span if entries else None

@@ -70,7 +70,8 @@ DAY = 86_400.0
 HEAVY = (("iss", 7e-12), ("low", 4e-11))
 """Orbit, and mean atmospheric density (kg/m^3) during half a day at a solar maximum."""
 HEAVY_SHARE = 0.3
-"""Share of the worst torques in the cells `heavy`: the centre of pressure is 6 mm from the centre of mass."""
+"""Share of the worst torques in the cells `heavy`: that of a centre of pressure 6 mm from the centre of
+mass."""
 TURNS = tuple((craft, share) for share in (0.1, 1.0) for craft in ("cubesat_3u", "knightcube"))
 """Craft and share of the cells `turn`."""
 
@@ -225,7 +226,7 @@ def _held(mine: Sequence[Result], judged: Sequence[Result], watts: float) -> dic
 
 
 def _in_heavy_air(mine: Sequence[Result]) -> dict[str, Any]:
-    """Return counts of flights, losses and rejected star attitudes, and errors (deg) and NEES."""
+    """Return the numbers of flights, losses and rejected star attitudes, the errors (deg) and the NEES."""
     judged = [r for r in mine if "rms" in r]
     return {
         "runs": len(mine),
@@ -241,7 +242,7 @@ def _in_heavy_air(mine: Sequence[Result]) -> dict[str, Any]:
 
 
 def _turned(mine: Sequence[Result], watts: float) -> dict[str, Any]:
-    """Return the times (s) until the axis arrived to stay, and the rms error (deg) of the last half hour."""
+    """Return the arrival times (s) of the axis, and the rms error (deg) of the last half hour."""
     times = [r["arrived"] for r in mine if r["arrived"] is not None]
     return {
         "runs": len(mine),

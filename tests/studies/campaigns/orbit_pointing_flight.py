@@ -62,8 +62,8 @@ CYCLE, PAUSE = 2.0, 0.2
 SAMPLES = 4
 """Number of magnetometer samples in a pause of the coils."""
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
-"""Times (s): between star attitudes, between plans, before a failed plan is repeated, and length of the
-prediction."""
+"""Times (s): intervals of star attitudes and of plans, delay before a failed plan is repeated, and length of
+the prediction."""
 COAST = 12.0
 """Time (s) with the coils off while the attitude estimate settles."""
 STAR_SIGMA = 5e-5
@@ -85,9 +85,9 @@ configurations."""
 class PointingFlight:
     """One craft with its filter and law.
 
-    `notes` has a row every 10 s: time, true rotation (3,), rad, from the target of the law, attitude error
-    (rad), NEES of attitude and gyro bias, error of the residual dipole (A m^2), sunlight, and power of the
-    coils (A^2 m^4). `passed` states whether each star attitude passed the gate of the filter.
+    `notes` has a row every 10 s: time; true rotation (3,), rad, from the target of the law; attitude error
+    (rad); NEES of attitude and gyro bias; error of the residual dipole (A m^2); sunlight; power of the coils
+    (A^2 m^4). `passed` states whether each star attitude passed the gate of the filter.
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
@@ -213,7 +213,7 @@ class PointingFlight:
     def _law_at(self, time: float, quaternion: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return attitude and rate of the target at a time.
 
-        A free roll angle is that of the present attitude.
+        If the roll angle is free, the target has the roll angle of the present attitude.
         """
         if self._law is not None:
             wanted = self._law.wanted(time - self._begun)
@@ -303,7 +303,7 @@ class PointingFlight:
 
 
 def density_ratio(orbit: str, density: float | None) -> float:
-    """Return a mean air density, kg/m^3, relative to the simulated world's; 1 if `density` is None."""
+    """Return the ratio of a mean air density, kg/m^3, to the simulated one, or 1 if `density` is None."""
     if density is None:
         return 1.0
     position = np.array([[EARTH_RADIUS + ORBITS[orbit][0], 0.0, 0.0]])
@@ -311,6 +311,6 @@ def density_ratio(orbit: str, density: float | None) -> float:
 
 
 def _mean(before: FloatArray, acting: FloatArray, after: FloatArray) -> FloatArray:
-    """Return the mean rate (3,) of a cycle from the rates at its start, the end of the pause, and its end."""
+    """Return a cycle's mean rate (3,) from the rates at its start, after its pause, and at its end."""
     pause = 0.5 * PAUSE / CYCLE
     return np.asarray(pause * (before + acting) + (0.5 - pause) * (acting + after))

@@ -58,7 +58,7 @@ WANTED = {"knightcube": 2.0, "cubesat_3u": 0.5}
 HEAT = 1.3
 """Largest ratio of the median heat to that of the true body's optimum (issue 34)."""
 LEARN, FIRST = 1_200.0, 60.0
-"""Times (s) for which a body is held before its first slew: a body as configured, and an unknown body."""
+"""Times (s) for which a body is held before its first slew: as configured, and with unknown parameters."""
 HORIZON = {"knightcube": (300.0, 300.0), "cubesat_3u": (600.0, 1200.0)}
 """Shortest and longest requested duration (s) of a slew, by craft."""
 MOMENTS, AXES_DEG, RESIDUAL = 0.05, 3.0, 4.0

@@ -37,7 +37,8 @@ from tests.support.process_watch import answering, below, command
 
 LIMIT_S = 0.35
 ACTS = 10
-"""Number of kills and stops in one flight: of workers and guardian, and at last of the flight itself."""
+"""Number of kills and stops in one flight: first of workers and guardian, and finally of the flight
+itself."""
 _LOAD = Load(600.0, camera_period=1.0, replan_period=0.5)
 _NOTICED_S = 8.0
 """Time (s) within which the end of a process must be in the log on disk.
@@ -154,7 +155,7 @@ def _reported(folder: Path) -> dict[str, int]:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the number of reported deaths, the times until the coils were off, and what remained."""
+    """Return counts of kills and reports, times to zero current, and remaining processes and files."""
     acts: Counter[str] = sum((Counter(result["acts"]) for result in results), Counter())
     reported = sum(
         (

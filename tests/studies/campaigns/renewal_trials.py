@@ -151,7 +151,7 @@ def _step(ends: RenewedEnds, rng: np.random.Generator) -> bool:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the versions in use after the trials, and the cases that ended wrongly."""
+    """Return the versions in use after the trials, and the results that are wrong."""
     wrong = [
         result
         for result in results

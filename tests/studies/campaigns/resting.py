@@ -138,7 +138,7 @@ def expose(
 def job(
     pixels: Image, imperfection: Imperfection, middle: FloatArray, turn: FloatArray, rng: np.random.Generator
 ) -> FrameJob:
-    """Return a flight's job with the model's camera, and priors with errors of their claimed sigma."""
+    """Return a flight's job with the model's camera; the errors of its priors have the claimed sigma."""
     known: dict[str, Any] = {"gain": CAMERA.gain, "psf_sigma": CAMERA.psf_sigma, "line_time": 0.0}
     known |= {"saturation": imperfection.top} | imperfection.known
     detection = DetectionSettings(

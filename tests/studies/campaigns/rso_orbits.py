@@ -1,13 +1,14 @@
 """Campaign `rso-orbits`: ten orbits as in the thesis (Tables 4.3 and 4.4).
 
 The camera rotates at 0.05 rad/s about its y axis for ten orbits, with a frame every second. The frames in
-which the object is observable are the opportunities. Run 0 starts as the thesis does, and all other runs at a
-random angle about that axis. All runs have independent noise. The default detector, which uses the pixels, is
-compared with each indicator alone, by the thesis's strict rule of 2.5 sigma of the frame, and with the lower
-bounds that the thesis requires. The streak that an indicator selects is correct if it is the object, an
-overlap if other stars lie on it, and otherwise false. Table 4.4 is also counted with the 7,000 brightest
-stars alone (to V 6.3). The rates of the ten orbits are estimated by Harris's corners with OLAE, as in the
-thesis, and by the default method.
+which the object is observable are the opportunities. Run 0 starts with the attitude of the thesis, and all
+other runs with a random rotation about the y axis. All runs have independent noise. The default detector,
+which uses the pixels, is compared with each indicator alone. Each indicator is tested by two rules: the
+thesis's strict rule of 2.5 sigma of the frame, and a rule with the lower bounds that the thesis requires. The
+streak that an indicator selects counts as correct if it is that of the object, as an overlap if other stars
+lie on it, and otherwise as false. Table 4.4 is also counted with the 7,000 brightest stars alone (to V 6.3).
+The rates of the ten orbits are estimated by Harris's corners with OLAE, as in the thesis, and by the default
+method.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ ESTIMATORS = ("harris", "likelihood")
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return the orbits of each run at each magnitude, and Table 4.4's with the brightest stars alone."""
+    """Return the cases of each run: each magnitude with all stars, and Table 4.4 with the brightest stars."""
     return [
         Case(
             f"{run}/{magnitude}" + ("" if stars is None else f"/{stars}"),
@@ -225,7 +226,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def table_4_4(results: Sequence[Result]) -> dict[str, Any]:
-    """Return Table 4.4 by each rule and by the default detector, and the mean errors of the rates."""
+    """Return Table 4.4 for each rule and for the default detector, and the mean errors of the rates."""
     frames = [f for result in results for f in result["frames"] if f["magnitude"] == TABLE_MAGNITUDE]
     counts = {rule: np.zeros((3, 3), dtype=int) for rule in RULES}
     for frame in frames:

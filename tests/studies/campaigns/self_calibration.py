@@ -5,8 +5,8 @@ Each run has one unknown lens and FRAMES frames of random fields, at rotations o
 distortion and 30 us of line time. In the row `field`, the field of view is up to 5 % wrong; in the row
 `distortion`, it is known to 2 %; in the row `shift`, another lens of the same distribution replaces the lens
 after half of the frames. The frames are drawn by `supersampled`, not by the estimator's model. The prior of
-the rate is the true rate; it determines the sign of the rotation, which streaks do not show. The bound is
-that of an exactly known camera.
+the rate is the true rate; it gives the sense of rotation, which streaks do not show. The bound is that of an
+exactly known camera.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def expose(lens: TrueLens, rng: np.random.Generator) -> tuple[Image, FloatArray,
 
 
 def described(row: str) -> tuple[FrameJob, LensKnowledge]:
-    """Return the job (without a frame) and the lens of a camera as a row of the table describes it."""
+    """Return the job (without a frame) and the lens knowledge for a row of the table."""
     known = CameraKnowledge(distortion=0.02 if row == "distortion" else 0.005)
     spread = 0.05 if row == "field" else 0.0
     solve = SolveSettings(
@@ -172,7 +172,7 @@ def _judged(found: FrameFound, rate: FloatArray, bound: FloatArray) -> dict[str,
 
 
 def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
-    """Return the NEES of the six estimated parameters, and the number of contradictions."""
+    """Return errors, sigmas and NEES of the estimated lens, and how many frames contradicted it."""
     values, covariance = lens.learned
     error, unit = values[:6] - true.parameters(), np.sqrt(np.diag(covariance)[:6])
     scaled = error / unit

@@ -2,9 +2,9 @@
 
 A point is a combination of one call of the main thread, numbered from the start of its process, and one error
 that strace injects into the call. The list of points contains each call of a traced start with each error.
-The number of calls varies slightly between starts. The seed determines the order of the list. The order
-alternates between calls after and before the opening of the configuration, as long as both remain, because
-nearly all calls before it only read modules. With as many runs as points, the campaign covers the whole list.
+The number of calls varies slightly between starts. The seed determines the order of the list. Calls after and
+before the opening of the configuration alternate as long as both remain, because nearly all calls before the
+opening only read modules. With as many runs as points, the campaign covers the whole list.
 
 A case is a board whose emulated devices run in a separate process. Its flight starts repeatedly, each time
 with one point. The campaign replaces the service manager: it restarts a process that ends, without the fault,
@@ -101,7 +101,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 def run(case: Case) -> Result:
     """Start the flight of one board repeatedly, with one fault each time."""
     with _board() as board:
-        # The traced start leaves stored state and an archive, which every board except a new one has.
+        # The traced start leaves stored state and an archive, as on every board except a new one.
         board.trace()
         faults = [
             {"fault": f"{call} {number}: {error}", "begun": begun}
@@ -179,7 +179,7 @@ class Board:
         return Counter(name for name, _ in calls), Counter(name for name, _ in calls[:opened])
 
     def start(self, fault: str) -> Result:
-        """Start with a fault, and again without it if the process ends; return the outcome."""
+        """Start the flight with a fault; if it ends, start it again without the fault. Return the outcome."""
         strace = ["strace", "-o", "/dev/null", "-e", "trace=none", "-e", f"inject={fault}"]
         begun_s = time.monotonic()
         restarts, flies, status, said = 0, False, 0, ""

@@ -7,10 +7,10 @@ an end of the exposure is computed by ESOQ2 with the true identifications. Its e
 across the boresight and in total.
 
 `streaks-thesis` has the thesis's camera, bilinear spots and uniform noise (2.5-2.11). The bound, given for
-comparison, is that of a camera with Poisson noise. As in the thesis (3.28), the exposure determines the
-length of its streaks, at 0.05 rad/s. The biases of the detected ends are those of the thesis's spots
-(`measured_bias`). The sky has the 7,000 brightest stars. With the whole catalogue, streaks would cross at
-rotations of 50 % of the field, which would displace ends by up to 1 px.
+comparison, is that of a camera with Poisson noise. As in the thesis (3.28), the camera rotates at 0.05 rad/s,
+and the exposure determines the length of the streaks. The biases of the detected ends are those of the
+thesis's spots (`measured_bias`). The sky has the 7,000 brightest stars. With the whole catalogue, streaks
+would cross at rotations of 50 % of the field, which would displace ends by up to 1 px.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _errors(found: Any, scene: Scene, camera: StarCameraModel) -> Result:
 
 
 def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float | None, float | None]:
-    """Return the mean attitude error of the two ends in px (3.29), total and across.
+    """Return the mean attitude error of the two ends, px (3.29): in total, and across the boresight.
 
     None without an attitude.
     """

@@ -9,9 +9,9 @@ minutes whether the claimed uncertainty is correct.
 
 The attitude is evaluated in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse.
 The NEES is given per axis, from samples 10 s apart, about the body axes and about the axes of the star
-camera. The share of the samples beyond 5 sigma and the longest excursion are counted in all attitude packets
-(10 Hz) while the attitude is fine. `learned_refused` counts the events `learned-refused`, which are false
-alarms in these flights.
+camera. The share of samples beyond 5 sigma and the longest excursion come from all attitude packets (10 Hz)
+with a fine attitude. `learned_refused` counts the events `learned-refused`, which are false alarms in these
+flights.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def facts(flown: Run, config: OrbitConfig) -> Result:
 
 
 def _thinned(times: FloatArray) -> BoolArray:
-    """Return which samples are the first ones of intervals of `EVERY` s."""
+    """Return which samples are the first of their interval of `EVERY` s."""
     return np.diff(np.floor(times / EVERY), prepend=-1.0) > 0.0
 
 
@@ -212,7 +212,7 @@ def _inertia(flown: Run) -> dict[str, float] | None:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return a row for each configuration and phase, and a row for each configuration."""
+    """Return a row for each phase of each configuration, and a row for each configuration."""
     phases: dict[str, Any] = {}
     flights: dict[str, Any] = {}
     for name in dict.fromkeys(result["name"] for result in results):

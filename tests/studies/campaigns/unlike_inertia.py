@@ -50,7 +50,7 @@ _FIRST = 4
 ONSET = 10.0
 """Latest time (s) at which a fault begins."""
 SOON = 30.0
-"""Time (s) from its onset within which a fault must be handled in a tumble."""
+"""Time (s) after its onset within which a fault must be handled in a tumble."""
 TEST_INTERVAL = 60.0
 """Time (s) between the self-tests of a coil in the phase `slow`."""
 SLOW_SPEED = 0.0035
