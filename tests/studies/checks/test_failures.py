@@ -22,7 +22,7 @@ _FRAMES = 6
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Return a frame whose rate is the truth for artificial results."""
+    """Return a frame whose true rate is also the truth for artificial results."""
     return slew(np.random.default_rng(_SEED), 1.0, 0.1, 0.2, limit=4.0)
 
 

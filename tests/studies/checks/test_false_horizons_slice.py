@@ -32,7 +32,7 @@ def test_pictures_that_once_gave_a_horizon_give_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", [3, 7, 8, 42])
 def test_a_rendered_day_sky_shows_no_horizon_and_the_reason_is_stated(seed: int) -> None:
-    """Edges of each picture form a significant horizon at some field of view, but no side of it is space."""
+    """Edges of each picture form a significant horizon at some field of view, but neither side is space."""
     draw = np.random.default_rng([77, seed])
     picture = photographed(MAKERS["day_sky"]((480, 640), draw), draw)
     reasons = []

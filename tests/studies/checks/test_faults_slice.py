@@ -82,7 +82,7 @@ def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch
 def test_a_loop_that_steers_without_measurements_is_detected(tmp_path: Any) -> None:
     """The log of a flight with a silent unit is changed as if the loop had continued.
 
-    Both results of the evaluation must show the fault.
+    Both the reaction and the coil current must show the fault.
     """
     entry = FaultEntry(fault="imu: silent", at=AT, span=3.0)
     section = configuration.replace(demo_world(), seed=3, faults=(entry,))

@@ -37,8 +37,8 @@ def _moments(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 def test_a_star_at_rest_has_its_place_its_light_and_the_point_spreads_moments() -> None:
     """The point spread is a rotated ellipse, convolved with the square of a pixel.
 
-    The renderer shares the light of a point by neighbouring cells. The width of a single image depends on the
-    point's place within its cell; the mean over places does not.
+    The renderer distributes the light of a point over neighbouring cells. The width of a single image depends
+    on the position of the point within its cell; the mean over positions does not.
     """
     turned = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])
     spread = turned @ np.diag([1.3, 1.0 / 1.3]) @ turned.T
@@ -120,7 +120,7 @@ def test_an_axis_5_px_off_is_within_what_is_claimed_unless_the_lens_is_called_ex
 def test_an_unspecified_distortion_is_fitted_and_hardly_changes_the_rate() -> None:
     """The distortion is 1 % at the corner.
 
-    A correction after the fit alone would leave a rate error of up to 1.5 %.
+    If the distortion were corrected only after the fit, the rate error would be up to 1.5 %.
     """
     for run in range(3):
         case = next(c for c in mismatch.cases(run + 1, _SEED) if c.key == f"distortion 1 % 30 {run}")

@@ -14,9 +14,9 @@ from tests.studies.campaigns.object_flights import cases, least_deviation, run, 
 
 @pytest.mark.parametrize("lean", [0.0, np.radians(30.0)])
 def test_the_bound_is_that_of_a_catch_up_by_hand(lean: float) -> None:
-    """An object at w = 0.3 deg/s outruns a body that starts at rest with a = 0.012 deg/s^2 by w^2 / 2 a.
+    """An object at w = 0.3 deg/s leads a body accelerating at a = 0.012 deg/s^2 by at most w^2 / 2 a.
 
-    The object starts 1 deg before the boresight, which reduces the deviation by 1 deg. If the field leans
+    The object starts 1 deg short of the boresight, which reduces the lead by 1 deg. If the field leans
     towards the axis of rotation, the authority is multiplied by the cosine of that angle.
     """
     rate, authority, step = np.radians(0.3), np.radians(0.012), 0.5
@@ -25,7 +25,7 @@ def test_the_bound_is_that_of_a_catch_up_by_hand(lean: float) -> None:
     directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(times))], axis=1)
     field = np.tile([np.cos(lean), 0.0, np.sin(lean)], (len(times), 1))
     least = least_deviation(step, directions, np.array([1.0, 0.0, 0.0]), field, authority, np.radians(5.0))
-    # The rotation is about z, by torques across a field in the plane of x and z.
+    # The body rotates about z, by torques normal to a field in the plane of x and z.
     expected = rate**2 / (2.0 * authority * np.cos(lean)) - np.radians(1.0)
     assert least == pytest.approx(max(expected, np.radians(1.0)), rel=0.06)
 
@@ -44,7 +44,7 @@ def test_a_slow_object_is_kept_through_ten_seconds_without_it(tmp_path: Path) ->
 
 
 def test_a_followed_object_is_kept_by_rolling_no_faster_than_the_body_may_turn() -> None:
-    """In this pass of seed 5 the object is lost if paths too fast at their last instant are rejected."""
+    """In this pass of seed 5, the object is lost if paths are rejected that are too fast only at the end."""
     (case,) = (case for case in cases(1, 5) if case.key == "knightcube/0.2/0")
     found = run(case)
     assert found["kept"]

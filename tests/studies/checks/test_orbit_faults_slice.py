@@ -92,7 +92,7 @@ def test_elements_of_a_week_ago_have_an_error_within_their_sigma() -> None:
     date = 2_461_120.0
     off = np.linalg.norm(known.at(date).position - old.at(date).position)
     assert off == pytest.approx(4.0 * 7.6e3, rel=0.05)
-    # After a week the error due to unknown drag exceeds the growth of 1.5 km per day.
+    # After a week, sigma exceeds 1.5 km plus 1.5 km per day, because the drag is unknown.
     assert 1500.0 + 7.0 * 1500.0 < old.at(date).sigma < 2e5
     assert off < 3.0 * old.at(date).sigma
 
@@ -110,7 +110,7 @@ def refly(
 def test_false_pictures_from_the_start_do_not_cause_a_permanent_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Flight 97 of seed 3: false pictures caused a bias of 0.5 deg/s; then every new attitude failed."""
+    """In flight 97 of seed 3, false pictures caused a bias of 0.5 deg/s, and every later attitude failed."""
     found = refly(monkeypatch, 3, 97, "wide: wrong", "acquire", 48.0)
     assert found["event"] == "wide-false"
     assert found["works"]

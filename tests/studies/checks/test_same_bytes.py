@@ -55,7 +55,7 @@ PACKETS: Log = [
 
 
 def changed(place: int, **values: object) -> Log:
-    """Return the packets with other values of one packet."""
+    """Return the packets, with some values of one packet changed."""
     name, time_ns, before = PACKETS[place]
     packets = list(PACKETS)
     packets[place] = name, time_ns, before | values

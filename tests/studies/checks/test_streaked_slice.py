@@ -18,7 +18,7 @@ def _flown(row: str, runs: int) -> list[dict[str, object]]:
 
 
 def test_an_unspecified_rolling_shutter_is_in_the_claim(tmp_path: Path) -> None:
-    """If the covariance ignored the unknown shutter, errors would reach 7 sigma, or 0.4 px, not 0.05 px."""
+    """If the covariance ignored the unknown shutter, errors would reach 7 sigma, or 0.4 px."""
     own = summarise(_flown("rolling 30 us, unstated", 2), tmp_path).facts["all"]
     assert own["attitudes"] == own["frames"] == 6
     assert own["worst"] < 4.5
@@ -28,8 +28,8 @@ def test_an_unspecified_rolling_shutter_is_in_the_claim(tmp_path: Path) -> None:
 def test_a_specified_shutter_does_not_increase_the_claim(tmp_path: Path) -> None:
     """On the same frames, the claimed uncertainty is larger if the line time is not known.
 
-    The two fits of a frame find slightly different widths of the streaks, which also change the claim.
-    Therefore, one frame of six may be an exception.
+    The two fits of a frame find slightly different widths of the streaks, which also change the claimed
+    uncertainty. Therefore, one of the six frames may be an exception.
     """
     flown = [_flown(f"rolling 0 us, {how}", 2) for how in ("stated", "unstated")]
     for results in flown:

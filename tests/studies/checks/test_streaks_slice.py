@@ -20,7 +20,7 @@ def results() -> list[Result]:
 
 @pytest.mark.slow
 def test_the_likelihood_estimator_is_at_the_bound_and_knows_it(results: list[Result]) -> None:
-    """Check the ratio of rms error to bound, and the NEES with 15 degrees of freedom (99.9 % limits)."""
+    """Check the ratio of rms error to bound, and the NEES (99.9 % limits for 15 degrees of freedom)."""
     found = [result["likelihood"] for result in results]
     assert all(one["status"] == "rate" for one in found)
     ratios = [
@@ -54,7 +54,7 @@ def test_the_summary_has_a_row_for_every_cell(results: list[Result]) -> None:
 def test_the_thesis_s_own_camera_gives_the_thesis_s_table() -> None:
     """At 50 %, Table 3.1 states errors of 0.07 % (Harris) and 0.19 % (minimum eigenvalue).
 
-    The mean of two frames may be twice that.
+    The mean of only two frames may be twice as large.
 
     The model of the likelihood estimator does not describe this camera. The estimator must refuse a frame, or
     be better than the best result of the thesis.

@@ -1,6 +1,7 @@
 """Runs a slice of the campaign `unknown-body`: a KnightCube from a slow tumble to the start of its slew.
 
-The limits are the requirements plus the scatter of a filter with correct covariance over few samples.
+The limits are the requirements, widened by the scatter that few samples of a filter with correct covariance
+have.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def test_a_flight_is_judged_by_phase_in_the_axes_of_body_and_star_camera(tmp_pat
     slew = table.facts["phases"]["orbit/slew"]
     count = round(3 * slew["stars_n"])
     assert count >= 9
-    # The filter correlates the errors of the samples of one slew, which count as one error of three axes.
+    # The filter's errors in the samples of one slew are correlated, and count as one error of three axes.
     assert slew["stars_deg"] < 0.01 * math.sqrt(largest(3)), "0.01 deg rms is required"
     assert slew["body_claim"] > slew["camera_claim"], "the claim of the body contains that of the mounting"
     assert 1.0 / largest(count) < slew["camera_nees"] < largest(count), "1 is expected"
