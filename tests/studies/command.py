@@ -30,8 +30,8 @@ def command(function: Callable[..., int]) -> Main:
 
     A keyword-only parameter is an option, and any other parameter an argument. The annotation of each is
     `Annotated[TYPE, HELP]`, or `Annotated[TYPE, HELP, CHOICES]`. A `bool` is an option without a value, a
-    `tuple` takes several values, and a `Literal` only its own. A UsageError is printed, and the exit
-    status is 2.
+    `tuple` takes several values, and a `Literal` takes one of its own values. A UsageError is printed, and
+    the exit status is 2.
     """
 
     def main(arguments: Sequence[str] | None = None) -> int:

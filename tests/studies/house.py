@@ -46,14 +46,14 @@ _REASON = re.compile(r"\blines\b", re.IGNORECASE)
 LIMITS = {"control cycle": 30, "opening of a flight": 45, "star fix": 20}
 """Largest number of files whose functions each activity may call."""
 _FIRST, _LAST = 400, 440
-"""First and last control cycle of the measurement: one second of steady flight, after the first plan."""
+"""First and last control cycle of the measurement: one second of steady flight after the first plan."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
     """A file, class or function with its length in lines.
 
-    `excused` is true if its docstring gives a reason.
+    `excused` is true if its docstring gives a reason for the length.
     """
 
     kind: str
@@ -108,7 +108,7 @@ class Touched:
             return
         code = frame.f_code
         outside = code.co_filename.startswith(f"{ROOT}/sim_hal/") or code is LockStepRunner.submit.__code__
-        outside |= code.co_name == "<module>"  # An import calls decorators, which do not count.
+        outside |= code.co_name == "<module>"  # Decorators that an import calls do not count.
         if event == "return":
             self._outside -= bool(self._outside and outside)
             return
@@ -199,7 +199,7 @@ def main(
 
 
 def kept(long: Sequence[Piece]) -> bool:
-    """Return whether only functions are too long, and at most the permitted number of them."""
+    """Return whether at most the permitted number of functions is too long, and nothing else is."""
     return all(piece.kind == "function" for piece in long) and len(long) <= MOST_LONG_FUNCTIONS
 
 

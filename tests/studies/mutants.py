@@ -6,8 +6,8 @@ then those of the mirrored folder, up to the first failure. A test is fast if al
 most two seconds of processor time, by the list slow.txt. A failure counts if the same test passes on the
 unchanged code.
 
-Docstrings, strings, annotations, decorators, imports, `raise` statements and the `strict` of `zip` are not
-changed. Known equivalent mutants are listed in `equivalent_mutants.yaml`, each with a reason.
+Docstrings, strings, annotations, decorators, imports, `raise` statements and the argument `strict` of `zip`
+are not changed. Known equivalent mutants are listed in `equivalent_mutants.yaml`, each with a reason.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def mutants_of(source: str, path: str) -> list[Mutant]:
 
 
 def _is_fixed(node: ast.AST) -> bool:
-    """Return whether a node and its parts stay unchanged: imports, messages, types, the main block."""
+    """Return whether a node with all its parts is never changed: imports, messages, types, main block."""
     match node:
         case ast.Import() | ast.ImportFrom() | ast.JoinedStr() | ast.Raise() | ast.keyword(arg="strict"):
             return True

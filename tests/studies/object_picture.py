@@ -58,7 +58,7 @@ def draw(run: Run, path: Path) -> None:
 
 
 def _frame(axes: Axes, run: Run, cameras: FloatArray) -> None:
-    """Draw the third frame of the track with the object's streak and path, and the stars."""
+    """Draw the third frame of the track: the stars, and the object's streak and path."""
     config = as_orbit(configuration.load(CONFIG))
     camera = config.camera
     assert camera is not None

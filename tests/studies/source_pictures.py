@@ -7,7 +7,7 @@ Fig. 3.1 to 3.4: a streak and its four cornerness maps.
 Fig. 3.5: the centre of rotation, and the vectors of a streak.
 
 Fig. 3.7 to 3.10: the errors of attitude and rate with the four detectors, from the campaign `streaks-thesis`,
-which is resumed in the folder.
+which is run or resumed in the folder.
 
 Fig. 4.2 to 4.4: the indicators of an object among stars.
 
@@ -266,8 +266,8 @@ def indicators(ends: FloatArray, rate: FloatArray, pinhole: Pinhole) -> list[tup
     """Return the thesis's three indicators (n,) of streaks (n, 2, 2), as plotted in its Fig. 4.2 to 4.4.
 
     `rate` is the rate of the stars (rad/s) over `EXPOSURE`. The end points of each streak are ordered in the
-    direction of a star's motion. A slope is that of the straight line between the two ends in the image, not
-    corrected for the projection.
+    direction of a star's motion. A slope is that of the straight line between the two ends in the image; it
+    is not corrected for the projection.
     """
     vectors = pinhole.unit_vectors(ends)
     expected = star_ends(vectors, rate * EXPOSURE)

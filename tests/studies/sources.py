@@ -161,7 +161,7 @@ _WITH_ANGLES: dict[str, Propose] = {
 
 
 def cosine_limits(runs: int, seed: int) -> Rows:
-    """Return the identifications on the same lists with limits from eq. 31 and from first-order angles."""
+    """Return the results on the same lists with limits of angles and of their cosines (eq. 31)."""
     rows = [["method", "lists", "right; wrong, angle", "right; wrong, eq. 31", "ms, angle", "ms, eq. 31"]]
     half = float(np.tan(np.radians(0.5 * FIELD_DEG)))
     sky = KnownSky(default_index(), (half, half))

@@ -1,1 +1,1 @@
-"""Comparisons of a run as other authors' ground software reads it with the same run in our own reader."""
+"""Comparisons of our own reader with other authors' ground software on the same run."""

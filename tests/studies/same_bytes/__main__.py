@@ -109,7 +109,7 @@ def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
 
 
 def _verdict(run: Run, old: Path, new: Path, job: Future[None], texts: Texts) -> Verdict:
-    """Return the result of the comparison of a run when its job is done.
+    """Wait for the job of a run, and return the result of the comparison.
 
     A run that failed in this checkout counts as different.
     """

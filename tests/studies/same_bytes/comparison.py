@@ -4,7 +4,7 @@ Each log is read with the packet table of the software that wrote it. Packets wh
 are counted as added and otherwise ignored. Sequence counts are per APID, so these packets do not affect the
 others. If a new packet definition only appends fields and has a higher version, the old fields are compared.
 All other bytes must be equal, in the same order. Three labels of the RUN packet are not compared: UTC, the
-version of the software, and the checksum of the configuration's text, in which a comment may change.
+version of the software, and the checksum of the configuration's text, because comments may change.
 
 In the command results, these labels and times of the machine are not compared. Keys that only the new result
 has are counted as added. Texts that differ are accepted if the table of renamed texts converts the old into
