@@ -17,7 +17,7 @@ from knightcube.astro.quaternion import (
 MOST_STAR_MISMATCH = 4.0 * 25.9
 """Largest normalised squared error of a star attitude (three degrees of freedom).
 
-25.9 is exceeded by chance once in 1e5 frames. For streaks of 300 px the bound is four times as large.
+25.9 is exceeded by chance once in 1e5 frames. The factor of four allows for streaks of 300 px.
 """
 
 
@@ -27,7 +27,7 @@ def field_fraction(rate: FloatArray, exposure: float, field_of_view: float) -> f
 
 
 def error_in_pixels(angle: float, resolution: int, field_of_view: float) -> float:
-    """Return an angular error (rad) in px, for a camera with `resolution` px across its field, rad (3.29)."""
+    """Convert an angular error (rad) to px (3.29); `resolution` px span the field of view (rad)."""
     return angle * resolution / field_of_view
 
 

@@ -56,7 +56,7 @@ class ScriptedCamera:
     """Camera that returns given pixels, one picture for each trigger; the last picture is repeated.
 
     A picture may be None for a trigger without a frame. A frame arrives `late_s` after its exposure. If
-    `frozen`, all frames have the same number.
+    `frozen`, all frames have the same frame number.
     """
 
     def __init__(self, session: Callable[[], Session], *pictures: Any, late_s: float = 0.1) -> None:
@@ -81,8 +81,8 @@ class ScriptedCamera:
 class ScriptedUnit:
     """Inertial unit at rest that samples at 40 Hz and measures given values.
 
-    The function `sample` returns rate, field and acceleration of the sample with a number. The attribute
-    `counts` has the counters of the link after the first question.
+    The function `sample` returns rate, field and acceleration of the sample with the given number. The
+    attribute `counts` has the counters of the link after the first call of `link`.
     """
 
     def __init__(

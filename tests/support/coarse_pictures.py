@@ -13,7 +13,8 @@ DPI = 15
 def draw_coarsely(patch: pytest.MonkeyPatch) -> None:
     """Make reports draw coarse pictures, to save processor time.
 
-    All elements are drawn and written. The tests in `tests/ground/report` draw pictures with the full layout.
+    All elements of a picture are still drawn and written. The tests in `tests/ground/report` draw pictures
+    with the full layout.
     """
     engine = pytest.importorskip("matplotlib.layout_engine").ConstrainedLayoutEngine
     patch.setattr(figures, "DPI", DPI)

@@ -162,7 +162,7 @@ class _InteriorPoint:
         band = np.zeros((9, self.n, 5))
 
         def put(row: int, column: int, values: FloatArray | float, ahead: int = 0) -> None:
-            """Set the entry (row of point k, column of point k + ahead) for every k that has this entry."""
+            """Set the entry (row of point k, column of point k + ahead) for all k for which it exists."""
             stop = self.n - ahead
             band[4 + row - column - 5 * ahead, ahead : ahead + stop, column] = np.broadcast_to(
                 values, self.n

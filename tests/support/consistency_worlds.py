@@ -25,7 +25,7 @@ DIPOLE = 80 * 0.0081
 TESTBED_FIELD: FloatArray = np.array([0.0, 0.0, -4.5e-4])
 ORBIT_FIELD = 4.5e-5
 FIELD_TURN = 2.2e-3
-"""Rotation rate (rad/s) of the field's direction in a low polar orbit: two rotations per orbit."""
+"""Rotation rate (rad/s) of the field's direction in a low polar orbit: two revolutions per orbit."""
 CURRENT_BOUND = 3.5e-3
 GAIN_SIGMA = 0.1
 """Standard deviation of the coils' torque relative to its nominal value."""
@@ -84,7 +84,7 @@ class World(Protocol):
 class SuspendedWorld:
     """The testbed of sim_hal, with an air torque and a suspension thread that the filter does not know.
 
-    A coil current that causes the same torque represents the torque of the air.
+    The torque of the air acts as an additional coil current that causes the same torque.
     """
 
     suspended = True

@@ -66,7 +66,7 @@ class Watched:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Results of one flight, and the lateness of its cycles and of a loop without work at the same time."""
+    """Results of one flight, lateness of its cycles, and lateness of the bare loop beside it."""
 
     figures: Figures
     flight: Grid

@@ -26,7 +26,7 @@ class Grid:
         return np.asarray(2.0 * self.lateness >= self.period_ns * 1e-9)
 
     def figures(self) -> dict[str, float]:
-        """Return quantiles (s) of the lateness. The lateness of a lost slot lasts until the loop resumes."""
+        """Return quantiles (s) of the lateness. A lost slot's lateness is counted until the loop resumes."""
         return {name: float(np.quantile(self.lateness, part)) for name, part in QUANTILES.items()}
 
 
@@ -44,7 +44,7 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 
 
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
-    """Return the slots that the comparison loop without work lost, and the neighbours of these slots.
+    """Return the slots that the bare loop lost, and their neighbours.
 
     A stall of the machine may begin and end in different slots of the two loops, because one loop may be
     working while the other sleeps.

@@ -24,7 +24,7 @@ KNOWN_LIMB = 1000.0
 
 
 SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
-"""Ranges, for unknown atmospheres, of the scale height (m) and of the optical depth relative to the standard.
+"""Ranges of the scale height (m) and of the optical depth relative to the standard, for unknown atmospheres.
 """
 
 
@@ -40,7 +40,7 @@ def camera_model() -> EarthCameraModel:
 
 
 def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSettings:
-    """Return the default limb settings with the response of the camera, for an atmosphere of `AIRS`."""
+    """Return the default limb settings for an atmosphere of `AIRS`, with the response of the camera."""
     response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
     settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
     even = replace(settings, limb_height_sigma=KNOWN_LIMB, uneven_limb_sigma=0.0)

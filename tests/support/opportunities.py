@@ -140,7 +140,7 @@ def exposure_attitudes(
 
 
 def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
-    """Return whether object `index` is observable at `times` (m,), with at least half of the Sun's disc."""
+    """Return whether object `index` is observable at `times` (m,), lit by at least half of the Sun."""
     camera = scenario.camera.positions_at(times)
     position = scenario.objects[index].orbit.positions_at(times)
     attitudes = scenario.attitude(times)
@@ -179,8 +179,8 @@ def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> 
 def opportunities(scenario: Scenario, cadence: float, exposure: float) -> list[Opportunity]:
     """Return the frames, one every `cadence` s from time 0, that show an object in their whole exposure.
 
-    Observability is tested at nine instants of each exposure of `exposure` s. Raises OutOfRange if the
-    cadence or the exposure is not positive.
+    Observability is tested at nine instants of each exposure, which lasts `exposure` s. Raises OutOfRange if
+    the cadence or the exposure is not positive.
     """
     _check("cadence", cadence)
     _check("exposure", exposure)

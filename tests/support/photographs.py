@@ -57,7 +57,7 @@ def reduced(pixels: Image, columns: int, rows: int) -> Image:
 
 
 def _areas(many: int, few: int) -> FloatArray:
-    """Return the fractions (few, many) that `many` pixels along an axis contribute to `few` larger pixels."""
+    """Return the contributions (few, many) of `many` pixels along an axis to `few` larger pixels."""
     edges, step = np.arange(many, dtype=np.float64), many / few
     begin = step * np.arange(few)[:, None]
     overlap = np.minimum(edges + 1.0, begin + step) - np.maximum(edges, begin)

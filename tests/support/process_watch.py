@@ -1,9 +1,9 @@
 """Samples of the processor time and memory of running processes, read from /proc.
 
 The proportional set size (PSS) divides each page among the processes that map it, so a sum over processes
-counts no page twice (proc_pid_smaps(5)). If processes that are not watched map a page too, the sum includes
-only a part of this page. `unshared` computes the memory that the watched processes would hold if no other
-process shared their memory.
+counts no page twice (proc_pid_smaps(5)). If other processes map a page too, the sum contains only a part of
+this page. `unshared` computes the memory that the watched processes would hold if no other process shared
+their memory.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Look:
     """One sample: monotonic time (s), and processor time (s) and proportional set (bytes) by process name.
 
-    `own` is the part of the proportional set that is not mapped from files, which other processes do not
-    change. `turns` contains two times (s) of each main thread since its start: the time in which it ran, and
-    the time in which it was ready but had no processor.
+    `own` is the part of the proportional set that is not mapped from files; other processes do not change it.
+    `turns` contains two times (s) of each main thread since its start: the time in which it ran, and the time
+    in which it was ready but had no processor.
     """
 
     time: float

@@ -81,7 +81,7 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """Resources that a limited control group used: periods (throttled, total), memory (bytes), refusals.
+    """Use of a limited control group: periods (throttled, total), memory (bytes), and times at its limit.
 
     The memory is NaN with a kernel before Linux 5.19, whose cgroup v2 does not record the largest use.
     """

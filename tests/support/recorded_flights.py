@@ -32,7 +32,7 @@ from tests.support.shared_results import made_once
 
 RECORD = Path(__file__).with_suffix(".json")
 TOLERANCE = 1e-5
-"""Largest relative difference from the record, which rounding in another order may cause."""
+"""Largest accepted relative difference from the record, for rounding in another order."""
 NAMES = {
     ("event", "name"),
     ("mode", "trigger"),
@@ -123,7 +123,7 @@ def faults(*entries: tuple[str, float, float]) -> tuple[FaultEntry, ...]:
 
 
 def commanded(config: Any, *steps: dict[str, Any], **modes: Any) -> Any:
-    """Return a configuration with scheduled commands and other settings of the modes."""
+    """Return a configuration with scheduled commands, and with changed settings of the modes."""
     timeline = tuple(CommandStep(**step) for step in steps)
     section = configuration.replace(config.modes, **modes)
     return configuration.replace(config, modes=section, commands=Commands(timeline=timeline))

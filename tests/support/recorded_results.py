@@ -24,16 +24,16 @@ import numpy as np
 from knightcube.compiled import in_use
 
 TOLERANCE = 1e-5
-"""Largest relative difference of the `ANSWERS` from the record, which rounding in another order may cause."""
+"""Largest accepted relative difference of the `ANSWERS` from the record, for rounding in another order."""
 OTHER_TOLERANCE = 2e-3
-"""Largest relative difference of other values from the record.
+"""Largest accepted relative difference of all other values from the record.
 
 Another processor rounds sums differently, which may change the step at which an iteration stops.
 
-The largest difference found is 0.06 %, of a misfit (1 of 68 cases of `tests/knightcube/vision`, 2026-11-29).
+The largest difference found is 0.06 %, in a misfit (1 of 68 cases of `tests/knightcube/vision`, 2026-11-29).
 """
 COMPILED_TOLERANCE = 1e-2
-"""Largest relative difference of other values from the record if compiled functions are used.
+"""Largest accepted relative difference of all other values from the record if compiled functions are used.
 
 The largest difference found, of a covariance or a faint star, is 0.7 % (5 of 68 cases of
 `tests/knightcube/vision`, 2026-11-27).

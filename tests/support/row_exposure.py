@@ -20,7 +20,7 @@ from sim_hal.star_camera import StarCameraModel, image
 from tests.support.scenes import catalogue
 
 Turns = Callable[[FloatArray], FloatArray]
-"""Function from times (m,), s after mid-exposure, to rotations (m, 3), rad since then, camera frame."""
+"""Function from times (m,), s, to rotations (m, 3), rad, camera frame, both since mid-exposure."""
 
 _LIMIT = 7.0
 # Largest step (px) of a star between two instants, and half width of the patch in units of the point spread's
@@ -89,14 +89,14 @@ def _add(
     exposure: float,
     electrons: float,
 ) -> None:
-    """Add a star of `electrons` at `path` (m, 2), px, at evenly spaced `times` (m,), to `light`."""
+    """Add a star of `electrons` to `light`; it is at `path` (m, 2), px, at evenly spaced `times` (m,)."""
     reach = math.ceil(_REACH * camera.psf_sigma) + 1
     kept = camera.pinhole.contains(np.nan_to_num(path, nan=-1e6), float(reach))
     path, step = path[kept], times[1] - times[0]
     corner = np.rint(path).astype(int) - reach
     across, down = (corner[:, k, None] + np.arange(2 * reach + 1) for k in (0, 1))
     x, y = (_shares(pixel, path[:, k], camera.psf_sigma) for k, pixel in ((0, across), (1, down)))
-    # Fraction of the interval around the instant within the exposure of each row.
+    # Fraction of the interval around each instant that lies within the exposure of each row.
     begin = (down - 0.5 * (camera.rows - 1)) * camera.line_time - 0.5 * exposure
     first = np.maximum(times[kept, None] - 0.5 * step, begin)
     last = np.minimum(times[kept, None] + 0.5 * step, begin + exposure)

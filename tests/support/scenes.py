@@ -108,7 +108,7 @@ class RandomSlew:
         return cls(seed, run, theta, percent, float(draw.choice(EXPOSURES)))
 
     def exposed(self, camera: StarCameraModel) -> tuple[Scene, int]:
-        """Return the frame, and the number of skies that were drawn until one had enough usable stars."""
+        """Return the frame, and the number of skies drawn until one had enough usable stars."""
         generator = np.random.default_rng((self.seed, self.run, 1))
         theta, fraction = np.deg2rad(self.theta), self.percent / 100.0
         for drawn in range(1, _MOST_SKIES + 1):

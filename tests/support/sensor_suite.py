@@ -65,7 +65,7 @@ class Gyros(Section, frozen=True, kw_only=True):
     """Three rate gyros along the body axes.
 
     `noise` is in rad/s per sqrt(Hz), `bias_start` in rad/s, and `bias_walk` in rad/s per sqrt(s). `rate_hz`
-    is the sample rate. Each sample is the mean over its period.
+    is the sample rate. Each sample is the mean rate over one sample period.
     """
 
     noise: Positive
@@ -83,7 +83,7 @@ class Magnetometer(Section, frozen=True, kw_only=True):
     """A three-axis magnetometer along the body axes.
 
     `noise` (T) is the noise of a sample, and `bias_start` (T) the hard-iron error after ground calibration.
-    `bias_walk` (T per sqrt(s)) is the random walk of the hard iron together with the field model's error in
+    `bias_walk` (T per sqrt(s)) is the combined random walk of the hard iron and of the field model's error in
     orbit.
     """
 

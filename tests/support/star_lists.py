@@ -150,7 +150,7 @@ def _distort(pixels: FloatArray, camera: Pinhole, corner: float) -> FloatArray:
 
 
 def configurations(known_deg: float | None = 0.1) -> list[ListKind]:
-    """Return the twelve list kinds of issue 4: two fields, two noise levels, three numbers of false stars."""
+    """Return the twelve kinds of list of issue 4: two fields, two noise levels, three false star counts."""
     base = ListKind(known_deg=known_deg)
     return [
         replace(base, field_deg=field, noise_px=noise, false_stars=false)
@@ -161,7 +161,7 @@ def configurations(known_deg: float | None = 0.1) -> list[ListKind]:
 
 
 def spread_field(count: int, magnitude: bool = False) -> StarField:
-    """Return `count` points in random directions near the boresight; magnitudes are known if requested."""
+    """Return `count` points in random directions near the boresight, with magnitudes if requested."""
     draw = np.random.default_rng(count)
     tangent = draw.uniform(-0.1, 0.1, (count, 2))
     direction = np.column_stack([tangent, np.ones(count)])

@@ -1,7 +1,8 @@
 """Simulated star frames for the tests of image processing, independent of the simulator's camera.
 
-Fixed point stars move as v' = -omega x v. The paths of the stars are sampled at steps of 0.1 px or less, and
-each sample is a Gaussian that is integrated over each pixel (erf). Photon, dark and read noise are added.
+The directions v of fixed stars change as v' = -omega x v. The paths of the stars are sampled at steps of 0.1
+px or less, and each sample is a Gaussian that is integrated over each pixel (erf). Photon, dark and read
+noise are added.
 """
 
 from __future__ import annotations

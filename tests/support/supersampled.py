@@ -141,8 +141,8 @@ def light(
 ) -> FloatArray:
     """Return the expected electrons (rows, columns) of a sky.
 
-    `length` (px) limits the length of paths. `delay` is the time between rows (rolling shutter) in units of
-    the exposure.
+    `length` (px) limits the length of paths. `delay` is the time between rows of a rolling shutter, in units
+    of the exposure.
     """
     layers, edge = len(optics.spreads), _reach(optics.radius)
     size = CELLS * pinhole.rows + 2 * edge, CELLS * pinhole.columns + 2 * edge
@@ -214,7 +214,7 @@ def _lay(grid: Cells, pinhole: Pinhole, edge: int, place: FloatArray, weight: Fl
 
 
 def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
-    """Return the cells (rows, columns) of the detector in a layer convolved with a point spread.
+    """Convolve a layer with a point spread, and return the detector's cells (rows, columns).
 
     The layer extends beyond the detector by the `radius` (px) of the point spread, so that the periodic
     convolution reaches no cell of the detector from the opposite side. Neighbouring cells share the light of

@@ -71,7 +71,7 @@ def test_the_cameras_of_usu_are_tipped_like_the_satellite() -> None:
     middle, forward, aft = boresights("usu")
     assert angles(middle, DOWN) == pytest.approx(55.0)
     for other, turned in ((forward, 45.0), (aft, -45.0)):
-        # A rotation about y by 45 deg moves the component of the boresight that is normal to y.
+        # A rotation by 45 deg about y rotates the component of the boresight normal to y by 45 deg.
         found = np.degrees(np.arctan2(other[0], other[2]) - np.arctan2(middle[0], middle[2]))
         assert found == pytest.approx(turned)
         assert other[1] == pytest.approx(middle[1])

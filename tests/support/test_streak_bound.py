@@ -25,7 +25,7 @@ _TABLE = [
 def test_one_endpoint_has_the_published_bound(row: tuple[float, ...]) -> None:
     """The bounds of an end point are the published bounds, within half a unit of the last digit plus 3 %.
 
-    The published table has two digits of numbers as small as 0.004.
+    The published values, down to 0.004, have two digits.
     """
     length, *published = row
     found: list[float] = []
@@ -58,7 +58,7 @@ def test_the_bound_of_the_rate_shrinks_with_stars_and_with_light() -> None:
     many = rate_bound(pinhole, stars, light, rate, 1.0, 1.0, 150.0).covariance
     bright = rate_bound(pinhole, stars, 4.0 * light, rate, 1.0, 1.0, 150.0).covariance
     assert np.all(np.linalg.eigvalsh(few - many) > 0.0)
-    # Four times the signal divides the bound by a factor between two (photon noise) and four (read noise).
+    # Four times the signal divides the bound by a number between two (photon noise) and four (read noise).
     ratio = np.sqrt(np.trace(many) / np.trace(bright))
     assert 2.0 < ratio < 4.0
 

@@ -72,7 +72,7 @@ def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
 
 
 def single_bits(field: Field, value: int) -> list[int]:
-    """Return the value of a bit field's unused bits, if any, and then its named bits from the highest."""
+    """Return the unused bits of a bit field as one value, if any, then its named bits, highest first."""
     used, size = len(field.bits), 8 * int(field.kind[1:])
     spare = [value >> used] if size > used else []
     return spare + [value >> bit & 1 for bit in reversed(range(used))]
