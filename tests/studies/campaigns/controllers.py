@@ -161,7 +161,7 @@ def run(case: Case) -> Result:
     return {
         **case.parameters,
         **{key: _worst(*(row[key] for row in rows)) for key in FIGURES},
-        # The first slew starts at the release and is no step, so its rise time does not count.
+        # The first slew starts at the release and is not a step, so its rise time does not count.
         "rise_s": _worst(*(row["rise_s"] for row in rows[1:])),
         "heat_w": found["power"]["heat_average_w"],
         "supply_w": found["power"]["supply_average_w"],
