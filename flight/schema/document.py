@@ -499,7 +499,8 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
         missing = re.match(r"Object missing required field `(.+)`", message)
         if missing:
             hint = _description(_kinds_at(shape, f"{path}.{missing.group(1)}"))
-            problem = "is missing" + (f": give the {hint}" if hint else "")
+            article = "" if hint.startswith(("a ", "an ", "the ")) else "the "
+            problem = "is missing" + (f": give {article}{hint}" if hint else "")
             raise document.error(join(dotted, missing.group(1)), problem) from error
         below = " >" in message
         message = _permitted(message, shape, path)

@@ -88,7 +88,7 @@ def check_consistency(config: Config, document: Document) -> None:
         _check_testbed(config, refuse)
     if isinstance(config, OrbitConfig):
         _check_orbit(config, refuse)
-    _check_commands(config.commands, isinstance(config, TestbedConfig), refuse)
+    _check_commands(config, refuse)
     if config.link is not None:
         _check_link(config.link, config.commands, refuse)
     unit = config.inertial_unit
@@ -420,14 +420,26 @@ def _check_unit(kind: str, unit: UnitSection, refuse: Refuse) -> None:
             refuse(f"{kind}.calibration.{name}", f"{problem} {_LARGEST_CORRECTION:g} in each element")
 
 
-def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> None:
+_COMMANDED = {
+    "testbed": ("safe", "detumble", "hold", "testbed-demo"),
+    "orbit": ("safe", "detumble", "sun", "point"),
+}
+"""Modes that can be commanded, by the body of this package."""
+
+
+def _check_commands(config: Config, refuse: Refuse) -> None:
+    commands, modes = config.commands, _COMMANDED.get(config.body)
     for index, step in enumerate(commands.timeline):
         dotted = f"commands.timeline[{index}]"
         given = [name for name in ("mode", "slew", "point", "clear") if getattr(step, name) is not None]
         if len(given) != 1:
             refuse(dotted, f"gives {given}: must give one of mode, slew, point, clear")
-        if step.point is not None and on_testbed:
+        if step.point is not None and isinstance(config, TestbedConfig):
             refuse(f"{dotted}.point", "is a command for satellites: use `slew` for the testbed")
+        if step.slew is not None and isinstance(config, OrbitConfig):
+            refuse(f"{dotted}.slew", "is a command for the testbed: use `point` for a satellite")
+        if modes is not None and step.mode is not None and step.mode not in modes:
+            refuse(f"{dotted}.mode", f"is {step.mode}: this body can be commanded to {', '.join(modes)}")
         check_aim(dotted, step, step.point, refuse)
     if not _is_loopback(commands):
         problem = "accepts unprotected commands from other machines"
@@ -585,6 +597,7 @@ def parse(text: str, name: str = "configuration") -> Config:
     _replace_unit(document)
     _check_body(document)
     shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
+    _check_sections(document, shape)
     drop_inherited(document)
     config: Config = convert(document, with_drivers(shape, document))
     check_consistency(config, document)
@@ -603,6 +616,15 @@ def merged_text(text: str, name: str) -> str:
     # The names are quoted, because they may contain line breaks.
     names_of = ", ".join(ascii(Path(one).name) for one in document.chain)
     return f"# merged from {names_of}\n{to_yaml(document.values)}"
+
+
+def _check_sections(document: Document, shape: type[Any]) -> None:
+    """Raise ConfigError with all missing values if a file that extends no other file lacks most of them."""
+    required = [one for one in msgspec.structs.fields(shape) if one.required and one.encode_name != "name"]
+    missing = [one.encode_name for one in required if one.encode_name not in document.values]
+    if 2 * len(missing) > len(required) and len(document.chain) == 1:
+        cure = "give them, or add `extends: orbit`, or another configuration that has them"
+        raise ConfigError(document.name, f"has no {', '.join(f'`{name}`' for name in missing)}: {cure}")
 
 
 def _check_body(document: Document) -> None:

@@ -334,12 +334,16 @@ FLOWN_S = 10.0
 
 @dataclass(slots=True)
 class CheckResult:
-    """The result of a check; the configuration is ready to fly if the list `problems` is empty."""
+    """The result of a check; the configuration is ready to fly if the list `problems` is empty.
+
+    The list `warnings` has what the configuration cannot do.
+    """
 
     config: Config
     path: Path
     chain: tuple[str, ...] = ()
     problems: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     devices: list[Any] = field(default_factory=list)
     result: RunResult | None = None
     elapsed: float = 0.0
@@ -372,6 +376,7 @@ def check(options: argparse.Namespace) -> int:
     config = configuration.parse(chosen.text, str(path))
     chain = read_document(chosen.text, str(path)).chain
     verdict = CheckResult(config, path, chain, [chosen.problem] if chosen.problem else [])
+    verdict.warnings += _shortcomings(config)
     if options.merged is not None:
         _write(options.merged, configuration.merged_text(chosen.text, str(path)))
     with placing(chosen.text, str(path)):
@@ -404,6 +409,20 @@ def check_values(config: Config) -> None:
         target = config.targets[0].point
         cure = "add `gps`, or `elements`, which `knightcube elements` makes"
         raise ConfigError("targets[0].point", f"is {target}: pointing needs the satellite's position: {cure}")
+
+
+def _shortcomings(config: Config) -> list[str]:
+    """Return what a satellite cannot do with its devices."""
+    stars = config.camera is not None and config.camera.star_tracker is not None
+    if (
+        not isinstance(config, OrbitConfig)
+        or stars
+        or config.wide_cameras
+        or config.solar_strings is not None
+    ):
+        return []
+    lacks = "no star tracker (`camera.star_tracker`), no `wide_cameras` and no `solar_strings`"
+    return [f"{lacks}: the attitude stays unknown, and the satellite never points to `targets`"]
 
 
 def _write(path: Path, text: str) -> None:
@@ -462,6 +481,7 @@ def _facts(verdict: CheckResult) -> dict[str, Any]:
         "drivers": _drivers(config),
         "flight": flown,
         "problems": verdict.problems,
+        "warnings": verdict.warnings,
         "ready": not verdict.problems,
     }
 
@@ -505,8 +525,9 @@ def _text(verdict: CheckResult) -> str:
         lines += [("", with_cause(name, ending)) for name in sorted(ending.warnings)]
         if result.faults:
             lines.append(("injected", "; ".join(result.faults)))
+    lines += [("warning", warning) for warning in verdict.warnings]
     lines += [("problem", problem) for problem in verdict.problems]
-    warned = result is not None and result.ending.warnings and not result.faults
+    warned = verdict.warnings or (result is not None and result.ending.warnings and not result.faults)
     ready = "ready, with warnings: see above" if warned else "ready"
     lines.append(("verdict", "not ready" if verdict.problems else ready))
     return "".join(f"{name + ':' if name else '':15}{text}\n" for name, text in lines)

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from flight.bodies.orbit.body import filter_settings
 from flight.link.commands import Point
+from flight.link.events import COMMANDABLE, FOREIGN_MODES
 from flight.loop.commanding import command_of
 from flight.schema import reader
 from flight.schema.bodies import OrbitConfig, TestbedConfig, as_orbit, as_testbed
@@ -282,6 +283,37 @@ def test_a_time_line_points_a_satellite_and_never_the_testbed() -> None:
     assert command_of(step) == Point(PointingTarget(Goal.GROUND, (math.radians(45.0), math.radians(9.0))))
     with pytest.raises(ConfigError, match=r"`commands.timeline\[0\].point` is a command for satellites"):
         reader.parse(DEMO.replace("duration:", line, 1), "demo.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "step", "complaint"),
+    [
+        (ORBIT, "slew: 0.1", r"\[0\].slew` is a command for the testbed: use `point` for a satellite"),
+        (
+            ORBIT,
+            "mode: hold",
+            r"\[0\].mode` is hold: this body can be commanded to safe, detumble, sun, point",
+        ),
+        (DEMO, "mode: sun", r"\[0\].mode` is sun: this body can be commanded to safe, detumble, hold, testb"),
+    ],
+)
+def test_a_time_line_has_only_commands_of_its_body(text: str, step: str, complaint: str) -> None:
+    line = f"commands: {{timeline: [{{at: 9.0, {step}}}]}}\nduration:"
+    with pytest.raises(ConfigError, match=complaint):
+        reader.parse(text.replace("duration:", line, 1))
+
+
+@pytest.mark.parametrize("body", ["testbed", "orbit"])
+def test_the_modes_of_a_time_line_are_those_that_the_flight_accepts(body: str) -> None:
+    foreign = {mode.label for mode in FOREIGN_MODES[body]}
+    assert {*reader._COMMANDED[body]} == {mode.label for mode in COMMANDABLE} - foreign - {"slew"}
+
+
+def test_a_file_without_most_sections_is_refused_with_a_hint_to_extend() -> None:
+    with pytest.raises(
+        ConfigError, match=r"^one\.yaml: has no `inertial_unit`, .*: give them, or add `extends"
+    ):
+        reader.parse("name: one\n", "one.yaml")
 
 
 def test_a_satellite_that_follows_an_object_needs_a_camera_and_both_angles() -> None:

@@ -30,6 +30,7 @@ from tests.ground.commands.in_process import command
 from tests.support.orbit_devices import orbit_config
 from tests.support.places import DEMO, ROOT
 
+SATELLITE = ROOT / "config" / "orbit.yaml"
 TESTBED = ROOT / "config" / "testbed.yaml"
 WELL = FlightEnding(10.0, 400, "testbed-demo", coils_at_zero=True, coil_error="")
 
@@ -86,6 +87,20 @@ def test_warnings_of_the_flight_are_in_the_verdict(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "warnings planner-failed (" in done.stdout
     assert done.stdout.endswith("verdict:       ready, with warnings: see above\n")
+
+
+def test_a_satellite_without_a_sensor_of_its_attitude_is_ready_with_a_warning(tmp_path: Path) -> None:
+    blind: dict[str, Any] = {"camera": "none", "wide_cameras": [], "duration": 0.5}
+    path = write(tmp_path, SATELLITE, **blind, solar_strings="none", targets=[{"at": 0.0, "point": "sun"}])
+    facts = json.loads(command("check", path, "--json").stdout)
+    assert (facts["ready"], facts["problems"]) == (True, [])
+    [warning] = facts["warnings"]
+    assert warning.endswith("the attitude stays unknown, and the satellite never points to `targets`")
+    done = command("check", path)
+    assert f"\nwarning:       {warning}\n" in done.stdout
+    assert done.stdout.endswith("verdict:       ready, with warnings: see above\n")
+    path = write(tmp_path, SATELLITE, **blind, targets=[{"at": 0.0, "point": "sun"}])
+    assert json.loads(command("check", path, "--json").stdout)["warnings"] == [], "the solar strings suffice"
 
 
 def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
