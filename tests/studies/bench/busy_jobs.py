@@ -93,7 +93,7 @@ BUSY: dict[str, Callable[[Any], Any]] = {
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,
 }
-"""Functions that repeat a job, by the name of the module whose jobs they run."""
+"""Functions that repeat the jobs of a module, by the name of the module."""
 
 
 def keep_busy() -> None:

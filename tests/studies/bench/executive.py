@@ -7,8 +7,8 @@ its horizon cameras run at their flight rate. With `--busy` each worker repeats 
 job arrives, so no worker is ever idle.
 
 A bare sleep loop at the same rate (`tests.studies.bench.bare_loop`) runs beside the flight and measures
-stalls of the machine. The kernel measures the stolen time, in which the host of a virtual machine does not
-run it. A loop with work to do is affected by such stalls more often than a loop that only sleeps. If
+stalls of the machine. The kernel measures the stolen time: the time in which the host of a virtual machine
+does not run it. A loop with work to do is affected by such stalls more often than a loop that only sleeps. If
 SCHED_FIFO is permitted, the flight runs twice, with and without it. Run the benchmark alone on two cores. The
 slope of memory needs flights of 16 minutes or longer.
 """
@@ -54,7 +54,7 @@ from tests.support.lateness import Grid, draw
 from tests.support.process_watch import ProcessWatch, answering
 
 PRIORITY = 50
-"""Priority of the bare loop under SCHED_FIFO, equal to that of the flight's control thread."""
+"""Priority of the bare loop under SCHED_FIFO, equal to the priority of the flight's control thread."""
 
 ORBIT = ROOT / "config" / "orbit.yaml"
 SHARED_LOOKS = 9

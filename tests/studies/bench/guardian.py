@@ -1,7 +1,7 @@
 """Time for which the coils carry current after a fault.
 
 Real-time flights on emulated devices in a separate process are stopped, hung and killed. The benchmark
-measures the time from the fault to zero current in the log of the devices, which has a sample every 25 ms.
+measures the time from the fault to zero current in the log of the devices; this log has a sample every 25 ms.
 The guardian must zero the current within 0.5 s.
 """
 

@@ -1,9 +1,10 @@
 """A user's campaign, killed and resumed.
 
-The command `knightcube campaign` runs with the same draws undisturbed, and then killed at random times (one
-SIGINT, otherwise SIGKILL) and restarted each time. With `--dask` it also runs on a cluster of two workers,
-one of which is killed. The benchmark compares the printed summaries and the result of each flight. It counts
-the flights that were flown twice, the processes that outlive a campaign, and the remaining temporary files.
+The command `knightcube campaign` runs twice with the same draws: undisturbed, and killed at random times
+(once by SIGINT, otherwise by SIGKILL) and restarted each time. With `--dask` it also runs on a cluster of two
+workers, one of which is killed. The benchmark compares the printed summaries and the result of each flight.
+It counts the flights that were flown twice, the processes that outlive a campaign, and the remaining
+temporary files.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Rates and objects in frames of calibrated lenses with strong distortion.
 
 The independent renderer (`tests/support/supersampled.py`) draws real stars without objects, at exposures of
-0.4 s and rotations of 10 and 30 % of the field. Each frame is evaluated with the true lens, whose stated
-accuracy is that of a calibration, and with the pinhole camera of the same field of view.
+0.4 s and rotations of 10 and 30 % of the field. Each frame is evaluated with two lenses: the true lens with
+the stated accuracy of a calibration, and the pinhole camera of the same field of view.
 """
 
 from __future__ import annotations

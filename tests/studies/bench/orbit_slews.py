@@ -1,12 +1,12 @@
 """Plan slews in orbit, random or recorded.
 
-The slews are of 30 to 180 deg from rest to rest, in the orbits of the space station and of a Sun-synchronous
-satellite, in the field of WMM2025. A 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2) slews in 80 to 400 s, and a 3U
-(0.0066 and 0.0333 kg m^2, 0.2 A m^2) in 300 to 1,200 s. `--recorded` plans the slews of `optimum_orbit.json`,
-compares them with their optima, and integrates the dipoles independently. `--job` runs the planning job of
-the flight software instead. The job predicts the orbit, plans the slew and computes the table of the path.
-Its slew avoids exclusion cones, and its torques of air drag and sunlight are those of the areas that the body
-exposes along the slew. Times are processor times of this process.
+The slews rotate by 30 to 180 deg from rest to rest, in the orbits of the space station and of a
+Sun-synchronous satellite, with the magnetic field of WMM2025. A 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2)
+slews in 80 to 400 s, and a 3U (0.0066 and 0.0333 kg m^2, 0.2 A m^2) in 300 to 1,200 s. `--recorded` plans the
+slews of `optimum_orbit.json`, compares them with their optima, and integrates the dipoles independently.
+`--job` runs the planning job of the flight software instead. The job predicts the orbit, plans the slew and
+computes the table of the path. Its slew avoids exclusion cones. The torques of air drag and sunlight follow
+from the areas that the body exposes along the slew. Times are processor times of this process.
 """
 
 from __future__ import annotations

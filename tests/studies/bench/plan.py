@@ -1,7 +1,7 @@
 """Measure the planner against the optimum.
 
 The slews are random over the testbed's range, with thread stiffness, disturbance and moving end points
-(tests.support.step_problems). The durations of the first set are 1.1 to 2.5 times the shortest feasible one.
+(tests.support.step_problems). Slews of the first set last 1.1 to 2.5 times their shortest feasible duration.
 The durations of the second set are too short, and the planner extends them. Solve times are processor times
 of this process. The cost is compared with the collocation oracle's cost for the same duration. Limits are
 checked at 4001 points of the path.

@@ -85,7 +85,7 @@ class RealBoard(FakeBoard):
         (release / "manifest").write_text(releases.manifest_text(release), encoding="utf-8")
 
     def fly(self, *program: str) -> tuple[str, str]:
-        """Start the flight by the launcher; return the started version (empty if none) and the messages."""
+        """Start the flight by its launcher; return the version (empty without a start) and the messages."""
         state = self.root / "state"
         state.mkdir(exist_ok=True)
         text = (self.root / "etc/knightcube/flight.yaml").read_text(encoding="utf-8")
@@ -110,7 +110,7 @@ class RealReleases(RenewedBoard):
         self.files = RealBoard(self.root, place / "flight.yaml")
 
     def sources(self, version: str, added: str = "") -> Path:
-        """Return a copy of the repository's sources with another version, and with statements `added`."""
+        """Return a copy of the repository's sources that has another version and the statements `added`."""
         folder = self.place / f"source-{version}"
         for part in PARTS:
             if (ROOT / part).is_dir():

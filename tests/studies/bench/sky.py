@@ -1,19 +1,19 @@
 """The star tracker on photographs and on simulated frames.
 
 The photographs are in a folder with a file `truth.json`, which gives right ascension and declination of the
-image's centre and the horizontal field of view in degrees. Each photograph is solved with its field of view
-known to 5 %, and a photograph of a field of 10 to 30 deg also with an unknown field. The photographs with a
-ratio of 4 to 3 and a field of at least 10 deg are also solved after a reduction to 646 x 486 pixels
-(`reduced`), with the field known. The simulated frames have the simulator's camera with a field of 12 deg
-known to 0.1 deg and an exposure of 0.1 s. The angle of the axis of rotation from the boresight is random
-between 30 and 90 deg, or 90 deg in the rows with `across`. `over bound` is the rms error across the boresight
-divided by the Cramer-Rao bound of the star positions; `bound` is the same ratio for the magnitude of the
-rate. Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths
-of streaks. Times are processor times of one core. For photographs, the time is the median of some passes
-after a first pass that is not counted, for all programs. The other star identification programs extract the
-stars themselves, with their default filters and without filters. `ratios` has, for each other program and
-each size of photographs, the median ratio of this project's time to that program's time, with known field.
-`dim frames` are frames of a calibrated camera with such short exposures that few stars are detected.
+image's centre and the horizontal field of view in degrees. Each photograph is solved with a field of view
+that is known to 5 %; photographs of 10 to 30 deg are also solved with an unknown field. Photographs with an
+aspect ratio of 4 to 3 and a field of at least 10 deg are also reduced to 646 x 486 pixels (`reduced`) and
+solved with a known field. The simulated frames have the simulator's camera with a field of 12 deg known to
+0.1 deg and an exposure of 0.1 s. The angle of the axis of rotation from the boresight is random between 30
+and 90 deg, or 90 deg in the rows with `across`. `over bound` is the rms error across the boresight divided by
+the Cramer-Rao bound of the star positions; `bound` is the same ratio for the magnitude of the rate.
+Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths of
+streaks. Times are processor times of one core. For photographs, the time is the median of some passes after a
+first pass that is not counted, for all programs. The other star identification programs extract the stars
+themselves, with their default filters and without filters. `ratios` has, for each other program and each size
+of photographs, the median ratio of this project's time to that program's time, with known field. `dim frames`
+are frames of a calibrated camera with exposures so short that few stars are detected.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Trial:
 
 
 def _shown(folder: Path) -> Iterator[Trial]:
-    """Yield the trials of all photographs, those of reduced photographs last."""
+    """Yield the trials of all photographs; the trials of reduced photographs come last."""
     truth = json.loads((folder / "truth.json").read_text())
     for name, values in truth.items():
         yield Trial(name, values, True)
@@ -265,7 +265,7 @@ def _peer_row(chosen: Sequence[tuple[Answer, Case]]) -> dict[str, Any]:
 
 
 def _counted(pictures: Sequence[Photograph]) -> dict[str, Any]:
-    """Return the results of photographs with the numbers of right and wrong results."""
+    """Return the results of the photographs, and how many of them are right and wrong."""
     right = sum(one.solved and one.arcsec <= RIGHT_ARCSEC for one in pictures)
     wrong = sum(one.solved for one in pictures) - right
     return {"photographs": [asdict(one) for one in pictures], "right": right, "wrong": wrong}

@@ -131,7 +131,7 @@ def fly(folder: Path, wish: Wish) -> Figures:
 
 
 def _limited(limits: Limits, stack: ExitStack, *words: Any) -> LiveFlight:
-    """Start a flight within the limits, which do not apply to the processes that run before it."""
+    """Start a flight within the limits; processes that already run are not limited."""
     for process in process_watch.below(os.getpid()):
         limits.release(process)
     flight, stop = LiveFlight(*words, before=limits.line()), threading.Event()
@@ -143,7 +143,7 @@ def _limited(limits: Limits, stack: ExitStack, *words: Any) -> LiveFlight:
 
 
 def _demote(flight: LiveFlight, limits: Limits, stop: threading.Event) -> None:
-    """Lower the priority of each worker below that of the control process as soon as the worker exists."""
+    """Give each worker, once it exists, a lower priority than the control process."""
     done: set[int] = set()
     while not stop.wait(0.1):
         for role, process in executive.members(flight).items():

@@ -1,7 +1,7 @@
 """Star identification compared with cedar-solve and tetra3rs.
 
 The lists have the twelve configurations of issue 4: 1024 x 1024 pixels, fields of 12 and 20 deg, 0.1 and 0.5
-px of noise, 0, 2 and 5 false stars, and an error of the known field of up to 0.1 deg. Further lists have an
+px of noise, and 0, 2 and 5 false stars. Their assumed field is wrong by up to 0.1 deg. Further lists have an
 unknown field between 10 and 30 deg, or show no part of the sky. A result is correct if its boresight is
 correct to 0.05 deg and 80 % of the identified stars are correct. Times are processor times of one core with
 one list per call. The other programs run in separate processes.

@@ -1,11 +1,11 @@
 """Star identification in difficult lists.
 
-The lists have unknown fields of view, false stars that are all brighter than the true ones, mirrored images,
-assumed fields that are 10 % wrong, or uncalibrated lenses with 2 to 8 % of distortion. Points that show no
-part of the sky measure the time of a refusal. The lists are drawn as in the benchmark `starid`. `wrong`
-counts incorrect results. For a distorted lens, a result is wrong only if its error exceeds both five sigmas
-and 120 arcseconds. The exit status is 1 if a result is wrong. `--peer` runs tetra3rs or cedar-solve on the
-same lists.
+The lists have an unknown field of view, false stars that are all brighter than the true stars, mirrored
+images, an assumed field that is 10 % wrong, or an uncalibrated lens with 2 to 8 % of distortion. Points that
+show no part of the sky measure the time of a refusal. The lists are drawn as in the benchmark `starid`.
+`wrong` counts incorrect results. For a distorted lens, a result is wrong only if its error exceeds both five
+sigmas and 120 arcseconds. The exit status is 1 if a result is wrong. `--peer` runs tetra3rs or cedar-solve on
+the same lists.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ bytes that form no frame. With `--forged N` they also send N forged frames a sec
 replayed, damaged and without the key. The link must examine these frames, so commands by UDP may be lost. In
 both flights the operator sends 40 commands, alternately by UDP, by a persistent TCP connection and by a new
 TCP connection. The benchmark prints the executed commands, the rates of the attackers, and the lateness of
-the control cycles. The exit status is 1 if a command was not executed, or if the 99 % quantile of the
-lateness is more than twice that of the flights without attack (medians over the rounds).
+the control cycles. The exit status is 1 if a command was not executed, or if the attack more than doubles the
+99 % quantile of the lateness (medians over the rounds).
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> d
 
 
 def _wait_for_port(tcp: int) -> None:
-    """Wait until a link listens on the port. Raises TimeoutError if none does."""
+    """Wait until a link listens on the port. Raises TimeoutError without one."""
     until = time.monotonic() + 2.0 * _START_S
     while time.monotonic() < until:
         with suppress(OSError):
@@ -99,7 +99,7 @@ def _wait_for_port(tcp: int) -> None:
 
 
 def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
-    """Send commands alternately by three connections; return number and reason of each unexecuted one."""
+    """Send commands over three connections in turn; return number and reason of each unexecuted command."""
     packer, failures = CommandPacker(), list[str]()
     ways = (f"{_PEER}:{udp}", f"tcp:{_PEER}:{tcp}", f"tcp:{_PEER}:{tcp}")
     with ExitStack() as stack:
