@@ -34,9 +34,9 @@ DURATION = 20.0
 SPAN = 3.0
 SIGMAS = 5.0
 LONGEST_BEYOND = 0.25
-"""Longest time (s) after an onset or an end for which the error may exceed `SIGMAS`."""
+"""Longest time (s) for which the error may exceed `SIGMAS` after the onset or the end of a fault."""
 LONGEST_REFUSAL = 0.5
-"""Time (s) after the onset from which the filter may reject no measurement of the healthy IMU."""
+"""Time (s) after the onset after which the filter must accept all measurements of the healthy IMU."""
 
 
 def faults() -> list[str]:
@@ -47,7 +47,7 @@ def faults() -> list[str]:
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each fault, for 3 s and to the end."""
+    """Return `runs` flights of each fault that lasts 3 s, and of each fault that lasts to the end."""
     return [
         Case(
             f"{name} {span or 'lasting'} {k}", (seed, number, span is None, k), {"fault": name, "span": span}

@@ -5,16 +5,16 @@ loop with paths of minimum supply energy, the loop of the thesis, PID and adapti
 control receive the targets instead of a path. `tests.studies.tune_controllers` (at commit 5e5e847b) tuned all
 their gains by one criterion: minimum power with every step settled in 9 s and overshoots of at most 1 %.
 
-`controllers` flies the 700 s step demonstration on the same seeds. The thesis states a power of 0.10 W for
-its own loop, 0.15 W for PID and 0.66 W for adaptive control on its testbed (ch. 5, Hardware Results). Two
-definitions of power are used (`knightcube.gnc.guidance.plant`). V |I| is the power that the chopped coils
-draw from their supply of 3.4 V; it is comparable to the powers of the thesis. R I^2 of the mean current is
-the cost that the paths minimise. The thesis states no stiffness of its thread. On a thread of 4.2e-5 N m/rad
-the thesis's loop draws the stated 0.10 W (as R I^2). The controllers of `STIFF` are also simulated on this
-thread; its PID and adaptive control are tuned for it. The lower bound of the power is the optimum for a known
-plant, in which each target is reached at rest 10 s after its command and held. It is computed by direct
-collocation (tests.support.collocation_oracle). A controller that reaches its targets later may use less
-power.
+`controllers` flies the 700 s step demonstration with the same seeds for all controllers. The thesis states a
+power of 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive control on its testbed (ch. 5,
+Hardware Results). Two definitions of power are used (`knightcube.gnc.guidance.plant`). V |I| is the power
+that the chopped coils draw from their supply of 3.4 V; it is comparable to the powers of the thesis. R I^2 of
+the mean current is the cost that the paths minimise. The thesis states no stiffness of its thread. On a
+thread of 4.2e-5 N m/rad the thesis's loop draws the stated 0.10 W (as R I^2). The controllers of `STIFF` are
+also simulated on this thread; its PID and adaptive control are tuned for it. The lower bound of the power is
+the optimum for a known plant, in which each target is reached at rest 10 s after its command and held. It is
+computed by direct collocation (tests.support.collocation_oracle). A controller that reaches its targets later
+may use less power.
 
 `robust-controllers` flies two steps of the demonstration, 65 s each, in worlds that differ from the loop's
 model. Inertia differs by up to 20 %, and field and coil resistance by up to 10 %. The stiffness of the

@@ -56,8 +56,8 @@ def least_time(
     """Return a lower bound, s, of the time in which a momentum (3,), N m s, can fall to `left` N m s.
 
     In inertial axes the momentum h obeys h' = m x B + T, whatever the inertia and the attitude are. The
-    magnitude of the coils' dipole moment m is at most `reach` (A m^2), and that of the torque T of all other
-    causes at most `others` (N m). For any unit vector y,
+    dipole moment m of the coils is at most `reach` (A m^2), and the torque T of all other causes at most
+    `others` (N m), both in magnitude. For any unit vector y,
 
         y . (h(0) - h(t)) = integral of (m . (y x B) - y . T) <= integral of (reach |B x y| + others).
 

@@ -29,8 +29,8 @@ from tests.support.flights import CONFIG
 
 CRAFT = {"knightcube": "orbit.yaml", "cubesat_3u": "orbit_3u.yaml"}
 SETTLED, LAST = 300.0, 120.0
-"""Time (s) after the start from which errors with star fixes are evaluated, and length (s) of the evaluated
-interval at the end of the shadow.
+"""Start (s) of the evaluation of errors with star fixes, and length (s) of the evaluated last part of the
+shadow.
 """
 
 

@@ -36,13 +36,13 @@ from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
-# Upper limits (% of the field) of the rotation classes for which times and errors are reported.
+# Upper limits (% of the field) of rotation classes; times and errors are reported by class.
 TURNS = (5, 20, 35, 50)
 _FREEDOM = 3
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` random motions; the sky is drawn when one is run."""
+    """Return `runs` random motions; the sky of a motion is drawn when the motion is run."""
     slews = (RandomSlew.drawn(seed, run) for run in range(runs))
     return [
         Case(

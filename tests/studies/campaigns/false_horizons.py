@@ -2,9 +2,10 @@
 
 The pictures show ground, weather, skylines, marks and glare. They are independent of `sim_hal.earth_camera`.
 Each is an intensity of 0 to 1 on a plane, composed of noise with a power-law spectrum, ramps, polygons and
-discs. `photographed` adds blur, noise, camera response and quantisation. Several cameras search each picture
-with three kinds of prior knowledge: none, the altitude, or that of a flight (position, Sun, coarse Sun and
-field of a random scene). Any nadir found in these pictures is a false detection.
+discs. `photographed` adds blur, noise, camera response and quantisation. Each picture is taken by a random
+one of several cameras, and searched with three kinds of prior knowledge: none, the altitude, or that of a
+flight in a random scene (position, Sun direction, coarse measurements of Sun and field). Any nadir found in
+these pictures is a false detection.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def noise(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def stars(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return stars above trees, hills, a roof or a dome, which are darker or brighter than the sky."""
+    """Return stars above trees, hills, a roof or a dome; these are darker or brighter than the sky."""
     rows, columns = size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
     sky = generator.uniform(0.0, 0.3) * (0.3 + 0.7 * np.clip(y, -1.0, 1.0) ** 2)
@@ -204,7 +205,7 @@ def _turned(size: Size, generator: np.random.Generator) -> tuple[FloatArray, Flo
 
 
 def _level(size: Size) -> tuple[FloatArray, FloatArray]:
-    """Return two coordinates (rows, columns) from -1 to 1 along the rows and the columns."""
+    """Return coordinates x and y (rows, columns), each from -1 to 1 across the picture."""
     rows, columns = size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
     return x, y

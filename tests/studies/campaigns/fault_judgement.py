@@ -46,7 +46,7 @@ OWN: Mapping[str, frozenset[str]] = {
 """Events that report a fault of a device."""
 
 COIL_JUDGED = frozenset({"coil-broken", "coil-corrected"})
-"""Events by which a broken coil is isolated, or a reversed one used with its sign changed."""
+"""Events by which a broken coil is isolated, or the sign of a reversed coil is changed."""
 
 OWN_OF_KIND: dict[str, frozenset[str]] = {
     # The packets are valid, but too few or too old for control, so only the event of the stream is reported.
@@ -68,7 +68,7 @@ REACTION: Mapping[str, str] = {
 
 
 def part_of(kind: FaultKind) -> str:
-    """Return the device name that the table uses for a fault; the coils of all axes share one row."""
+    """Return the name of the faulty device in the tables; the coils of all axes share one entry."""
     return kind.device.partition("-")[0]
 
 

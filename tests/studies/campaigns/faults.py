@@ -3,10 +3,10 @@
 Each run flies the demonstration's loop for half a minute in one mode. It injects one fault on the device
 lines, at a random time and for a random duration; faults of coils and bridges last to the end. The campaign
 then evaluates the log (`fault_judgement`): whether a specific event reported the fault, whether the reaction
-of the table followed, how long after the end of the fault the flight recovered, which currents the coils
-carried without measurements, and whether the log is complete. A fault of an unused part (a coil that is not
-driven, a planner without a request) has no effect and counts as not exercised. Exercised faults that no event
-reported are listed with the number of their flight (the case number).
+of the table followed, and whether the log is complete. It also evaluates how long after the end of the fault
+the flight recovered, and which currents the coils carried without measurements. A fault of an unused part (a
+coil that is not driven, a planner without a request) has no effect and counts as not exercised. Exercised
+faults that no event reported are listed with the number of their flight (the case number).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def faults() -> list[FaultKind]:
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights, which cycle through all faults in all modes."""
+    """Return `runs` flights in which all faults and all modes occur in turn."""
     kinds = faults()
     found = []
     for number in range(runs):

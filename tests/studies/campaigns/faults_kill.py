@@ -34,14 +34,14 @@ from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight, devices_running, write_config
 
 START_S = 1.5
-"""Time (s) from the start of the process to READY, which is assumed until the first start is measured."""
+"""Time (s) from the start of the process to READY; it is assumed until the first start is measured."""
 
 AT_MOST_S = 60.0
 
 
 @dataclass
 class Board:
-    """Devices, stored state and counts of a board, which outlive its flight processes.
+    """Devices, stored state and counts of a board; they outlive its flight processes.
 
     Attributes:
         boots: number of flights that have recorded their own start.
@@ -96,7 +96,7 @@ class Board:
 
 LIMIT_S = 0.5
 KILLS = 16
-"""Number of kills of a board, which is the highest `crash_limit` that a configuration may have."""
+"""Number of kills of a board: the highest `crash_limit` that a configuration may have."""
 
 EARLY = 0.25
 """Fraction of the kills that happen before the flight is ready."""
@@ -106,7 +106,7 @@ _BEFORE_S = 0.1
 _CALM_S = 0.15
 _GIVE_UP_S = 2.0
 _POLL_S = 0.004
-_LOGGED_S = 1.0  # time (s) after READY from which packets must be on disk
+_LOGGED_S = 1.0  # longest time (s) after READY without packets on disk
 _GONE_S = 3.0
 _TARGET = 0.3
 
@@ -243,7 +243,7 @@ def _state_of(board: Board, counted: bool) -> Result:
 def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
     """Stop a flight by SIGTERM; return whether its end and its mode are correct.
 
-    The number of kills equals the crash limit, which leads to safe mode, or is one smaller.
+    The number of kills either equals the crash limit, which leads to safe mode, or is one smaller.
     """
     crash_limit = int(np.clip(board.boots + rng.integers(2), 1, KILLS))
     with board.flight(number, 0.1, crash_limit) as flight:
@@ -269,7 +269,7 @@ def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the times for which the coils carried current after kills, and the other results."""
+    """Return how long the coils carried current after kills, and the other results."""
     kills = [kill for result in results for kill in result["kills"]]
     ends = [result["end"] for result in results if result["end"] is not None]
     driven = [kill for kill in kills if kill["current_before_a"] > 0.0]

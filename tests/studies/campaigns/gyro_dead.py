@@ -35,9 +35,9 @@ from tests.support.unlike_body import configured, released
 
 LIMIT = math.radians(0.5)
 ORBIT_SECONDS = 1_500.0
-"""Duration (s) of a flight in orbit, in which the slew to nadir ends."""
+"""Duration (s) of a flight in orbit; the slew to nadir ends in this time."""
 SETTLED = 30.0
-"""Time (s) after the start of a step from which the error is evaluated."""
+"""Time (s) from the start of a step to the start of its evaluation."""
 _COILS = ((5e-4, 0.0, 0.0), (0.0, 5e-4, 0.0), (0.0, 0.0, 5e-4))
 
 

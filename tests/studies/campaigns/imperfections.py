@@ -98,7 +98,7 @@ def _gradient(electrons: float) -> Stage:
 
 
 def _wide_light(electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the frame with stray light: 5,000 e- around a random position with a sigma of 250 px."""
+    """Return the frame with stray light: 5,000 e- at a random position, decreasing with a sigma of 250 px."""
     row, column = np.indices(electrons.shape)
     place = rng.uniform(0.0, electrons.shape)
     away = np.square(row - place[0]) + np.square(column - place[1])

@@ -98,7 +98,7 @@ def known_sky(field_deg: float) -> KnownSky:
 
 
 def answer_of(name: str, field: StarField, sky: KnownSky, motion: StarMotion) -> StarMatch:
-    """Return the result of a method, which receives all inputs that it can use."""
+    """Give a method all inputs that it can use, and return its result."""
     if name == "rate":
         return identify_by_rate(field, sky, motion=motion)
     return METHODS[name].identify(field, sky)

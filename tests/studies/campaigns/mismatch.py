@@ -143,7 +143,7 @@ def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
 def usable_sky(
     camera: StarCameraModel, exposure: float, motion: Callable[[], dict[str, Any]], rng: np.random.Generator
 ) -> tuple[dict[str, Any], Attitudes, Sky]:
-    """Return parameters of `motion`, its attitudes, and the stars near a field with enough usable stars.
+    """Return the parameters and attitudes of a motion, and the stars of a field with enough usable stars.
 
     Raises ValueError if no drawn field has enough usable stars.
     """

@@ -1,9 +1,9 @@
 """One flight of campaign `object-flights`: a craft that searches for an object and follows it.
 
 The flight has the filter, the planner's job and the pointing law of `orbit_pointing_flight`. The flight's own
-`ObjectAim` chooses the target from the tracks of the flight's own `ObjectTracker`. A frame every two seconds
-gives a star attitude and a sighting, whose error is drawn at random. Star attitude, sighting and the
-planner's table arrive two seconds later. The object moves on its own orbit, which is integrated by DOP853.
+`ObjectAim` chooses the target from the tracks of the flight's own `ObjectTracker`. Every two seconds, a frame
+gives a star attitude and a sighting with a random error. Star attitude, sighting and the planner's table
+arrive two seconds later. The object moves on its own orbit, which is integrated by DOP853.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class ObjectChase(PointingFlight):
                 return other
 
     def cycle(self, time: float) -> None:
-        """Simulate one cycle; the results of the last cycle's frame and planner arrive first."""
+        """Simulate one cycle; it first receives the results of the last cycle's frame and planning job."""
         if self._frame is not None:
             self._tracker.ingest(self._frame)
             self._aim.accept(self._tracker.objects, self.flight.time_ns)

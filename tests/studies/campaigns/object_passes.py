@@ -1,11 +1,11 @@
 """Campaign `object-passes`: passes of an object in rendered frames, with star tracker and tracking.
 
-Craft and object orbit the Earth. The object moves at 0.05 to 0.6 deg/s at closest approach. The camera holds
-its attitude for six frames, in which the object leaves a streak. Then it rotates with the object, and the
-stars leave streaks. A `short` pass has ten frames at 1 Hz; a `long` one has a frame every 5 s for 3 to 6 min.
-Exposures are 0.2 s, with 512 x 512 px over 20 deg. Each case without an object has the same number of frames
-and the same motion, so every track in it is false. The error of a sighting is compared with the Cramer-Rao
-bound of a point with that motion in that frame.
+Craft and object orbit the Earth. The object moves at 0.05 to 0.6 deg/s at closest approach. For six frames
+the camera holds its attitude, and the object leaves a streak. Then the camera rotates with the object, and
+the stars leave streaks. A `short` pass has ten frames at 1 Hz; a `long` pass has a frame every 5 s for 3 to 6
+min. Exposures are 0.2 s, with 512 x 512 px over 20 deg. Each case without an object has the same number of
+frames and the same motion, so every track in it is false. The error of a sighting is compared with the
+Cramer-Rao bound for the motion of the point in that frame.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 100 s in each of its modes.
 
-Flights do not begin with a release at 10 deg/s, but in a state close to that of their mode. Cameras, receiver
+Each flight begins in a state close to that of its mode, and not with a release at 10 deg/s. Cameras, receiver
 and planner run more often than in a real flight, so that a fault of a few seconds affects them.
 """
 

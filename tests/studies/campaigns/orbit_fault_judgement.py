@@ -40,7 +40,8 @@ SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 DIPOLE_PER_AMPERE = 0.648
 """Dipole moment per current (A m^2/A) of the coils of config/orbit.yaml."""
 LAST = 12.0
-"""Duration (s) of the end of a flight, in which the body must meet the requirements of its mode (`works`)."""
+"""Duration (s) of the last part of a flight, in which the body must meet the requirements of its mode
+(`works`)."""
 SET_UP = 0.53
 """Time (s) until the PWM chip is set up. Losses before this time are not counted."""
 ACTS, RATE_OFF = 2e-3, 0.0175
@@ -59,7 +60,7 @@ ORBIT_OWN: Mapping[str, frozenset[str]] = {
     "clock": OWN["clock"] | {"clock-off"},
     "elements": frozenset({"gps-refused", "gps-lost"}),
 }
-"""Events that report a fault of a device in orbit, in addition to those of its stream."""
+"""Events that report a fault of a device in orbit, in addition to the events of the device's stream."""
 _STREAMS = {"imu": ("imu", "field"), "magnetometer": ("field",), "gps": ("gps",), "camera": ("camera",)}
 _AT_ZERO_COMMAND = ("bridge", "coil", "pwm", "bus")
 """Faults with which a coil may carry current although none is commanded."""
@@ -86,7 +87,7 @@ def judge(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> Resu
 
 
 def is_own(kind: FaultKind, name: str, text: str) -> bool:
-    """Return whether an event reports a fault by the name of its part."""
+    """Return whether an event is specific to the faulty part."""
     part = part_of(kind)
     if name == "stream-poor":
         return text.startswith(tuple(f"{stream}:" for stream in _STREAMS.get(part, ("none",))))
@@ -242,7 +243,7 @@ def _points(flown: Run, times: np.ndarray) -> BoolArray:
 
 
 def beyond(flown: Run) -> float:
-    """Return the time (s) for which the coils were driven on the basis of a wrong attitude."""
+    """Return how long (s) the coils were driven with a wrong attitude estimate."""
     errors = attitude_errors(flown)
     if not len(errors.times):
         return 0.0

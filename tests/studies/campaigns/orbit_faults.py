@@ -58,7 +58,7 @@ def faults() -> list[str]:
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights, which cycle through all faults in all modes."""
+    """Return `runs` flights in which all faults and all modes occur in turn."""
     names = faults()
     found = []
     for number in range(runs):

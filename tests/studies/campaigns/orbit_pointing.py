@@ -3,8 +3,8 @@
 The craft are a 3U and the KnightCube.
 
 Cells `hold` start nadir-pointing along the flight direction without learned parameters, and last at least two
-revolutions. In the first revolution, which is not evaluated, the filter estimates the residual dipole and the
-torques.
+revolutions. The filter estimates the residual dipole and the torques in the first revolution, which is not
+evaluated.
 
 Cells `day` are the same over a day, with a quarter of the runs.
 

@@ -96,8 +96,8 @@ class PointingFlight:
         Keys of `wanted`: craft, share of the worst disturbances, target, and the initial rotation (deg), if
         any.
 
-        If given, `description` (DescriptionErrors) contains the differences of the true body from the
-        configured one, and `residual` multiplies the worst residual dipole of 1e-3 A m^2.
+        The optional `description` (DescriptionErrors) contains the differences of the true body from the
+        configured body, and the optional `residual` multiplies the worst residual dipole of 1e-3 A m^2.
         """
         self._wanted = wanted
         target = wanted["target"]
@@ -129,7 +129,7 @@ class PointingFlight:
         self._turn: FloatArray = np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
-        """Return the initial attitude and rate, which are those of the pointing law.
+        """Return the initial attitude and rate, as the pointing law requires them.
 
         If an initial rotation is given, the attitude is rotated from the law's attitude about a random axis,
         and the rate has a random direction.
@@ -191,7 +191,7 @@ class PointingFlight:
         )
 
     def _command(self, time: float, around: FilterEnvironment) -> FloatArray:
-        """Return the dipole (3,), A m^2, until the end of the cycle."""
+        """Return the dipole (3,), A m^2, that the coils have until the end of the cycle."""
         found, flight = self._filter, self.flight
         if time < COAST:
             return np.zeros(3)

@@ -6,8 +6,8 @@ have their full magnitude. The optimum is that of the true body for the same dur
 
 A body that equals its configuration is held for 1,200 s before its slew. An unknown body has moments of
 inertia that are wrong by up to 5 %, principal axes that are wrong by up to 3 deg, and a residual dipole of
-4e-3 A m^2. It flies two slews, each after 60 s: the `first`, and a second one with the parameters that have
-been estimated by then (`learned`).
+4e-3 A m^2. It flies two slews, each after 60 s: `first`, and then `learned` with the parameters estimated by
+then.
 
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
@@ -63,7 +63,7 @@ HORIZON = {"knightcube": (300.0, 300.0), "cubesat_3u": (600.0, 1200.0)}
 """Shortest and longest requested duration (s) of a slew, by craft."""
 MOMENTS, AXES_DEG, RESIDUAL = 0.05, 3.0, 4.0
 """Largest relative error of a moment of an unknown body, largest rotation (deg) of its principal axes about
-each body axis, and multiple of the residual dipole of 1e-3 A m^2."""
+each body axis, and its residual dipole in units of 1e-3 A m^2."""
 EVERY = 3
 """Number of control windows between two plans for the rest of a slew."""
 
@@ -102,12 +102,13 @@ def unknown_body(craft: str, seed: int) -> DescriptionErrors:
 
 
 class SlewFlight(PointingFlight):
-    """A flight with slews, whose durations and ends are drawn."""
+    """A flight with slews of random durations and end attitudes."""
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
         """Create the flight.
 
-        Keys of `wanted`: craft, orbit, share of the worst disturbances, hold time, whether unknown.
+        Keys of `wanted`: craft, orbit, share of the worst disturbances, hold time, and whether the body is
+        unknown.
         """
         self._rng = np.random.default_rng([seed, 16])
         start = normalise(self._rng.normal(size=4))

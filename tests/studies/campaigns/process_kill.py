@@ -5,8 +5,9 @@ are killed or stopped at random times; the log must report each event, and each 
 Finally the flight process itself is killed or stopped. The coil currents must become zero, no process of the
 flight may remain, and none of its files may remain in the folder for temporary files or in shared memory.
 
-The emulated devices and the process that samples the coils represent hardware, which would not compete for
-the processor. Both run under SCHED_FIFO if it is permitted, so that a busy machine delays only the flight.
+The emulated devices and the process that samples the coils have a higher priority, because real hardware
+would not compete for the processor. Both run under SCHED_FIFO if it is permitted, so that a busy machine
+delays only the flight.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ _NOTICED_S = 8.0
 The end is detected within two seconds and stored a second later; the rest is a margin for busy machines.
 """
 _HARDWARE = 70
-"""SCHED_FIFO priority of the processes that represent hardware, above that of the flight."""
+"""SCHED_FIFO priority of the processes that represent hardware; it is higher than that of the flight."""
 _GONE_S = 30.0
 """Time (s) after which all processes of a flight have ended by themselves; a starting process must finish its
 start first.
@@ -97,7 +98,7 @@ def _in_shared_memory() -> set[Path]:
 
 
 def _hurt_parts(flight: LiveFlight, number: int, rng: np.random.Generator) -> Counter[str]:
-    """Kill or stop a worker or the guardian, one after the other; return the counts by process."""
+    """Kill or stop workers and the guardian one after the other; return the counts by process."""
     acts: Counter[str] = Counter()
     hurt: set[int] = set()
     deadline = time.monotonic() + 20.0 * max(number, 1)

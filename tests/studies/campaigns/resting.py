@@ -69,7 +69,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def streaked_cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` frames of each camera of `streaked` and length."""
+    """Return `runs` frames for each camera of `streaked` and each streak length."""
     return _cases(SHUTTERS | IMPERFECTIONS, STREAKS, runs, seed)
 
 

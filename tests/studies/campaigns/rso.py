@@ -54,7 +54,7 @@ class Sky:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Detections in one report: error (px) of the true object's ends, or None if it was missed.
+    """Detections in one report: error (px) of the true object's ends, or None for a missed object.
 
     `false` counts detections of objects that do not exist.
     """
@@ -91,7 +91,7 @@ def _motion(generator: np.random.Generator, place: FloatArray) -> FloatArray:
 
 
 def look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> tuple[ObjectReport | None, float]:
-    """Return the report on a frame, which uses the likelihood estimate, and the processor time (s)."""
+    """Return the report on a frame by the likelihood estimate, and the processor time (s)."""
     return warm_call("rso", lambda: _look(pixels, camera, rate))
 
 

@@ -79,7 +79,7 @@ class SafeFlight:
         self.notes: list[tuple[float, float, float, float]] = []
 
     def window(self, seconds: float) -> None:
-        """Simulate one control window that starts at `seconds`: a pause of the coils, then commands."""
+        """Simulate one control window from `seconds` on: first a pause of the coils, then commands."""
         flight, start_ns = self._flight, round(seconds * SECOND)
         flight.act(np.zeros(3))
         for phase_ns in SAMPLES_NS:

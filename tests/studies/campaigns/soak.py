@@ -42,7 +42,7 @@ of other faults."""
 
 
 def cases(hours: int, seed: int) -> list[Case]:
-    """Return flights of six hours, and a shorter last one."""
+    """Return flights of six hours; the last flight may be shorter."""
     begins = range(0, hours, FLIGHT_HOURS)
     return [
         Case(f"from-hour-{begin}", (seed, begin), {"seconds": HOUR_S * min(FLIGHT_HOURS, hours - begin)})

@@ -226,7 +226,7 @@ class Board:
         return False
 
     def _end(self, begun: subprocess.Popen[str]) -> str:
-        """End a flight, whose guardian ends last; return its standard error."""
+        """End a flight, wait for its guardian, which ends last, and return the standard error."""
         if begun.poll() is None:
             os.killpg(begun.pid, signal.SIGKILL)
         said = begun.communicate()[1] or ""

@@ -1,4 +1,4 @@
-"""Groups of results, and their statistics, which are None without values."""
+"""Groups of results, and their statistics; a statistic without values is None."""
 
 from __future__ import annotations
 

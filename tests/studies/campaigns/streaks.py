@@ -44,7 +44,7 @@ LIKELIHOOD = "likelihood"
 NO_BIAS: Mapping[str, float] = {}
 THESIS_CAMERA = StarCameraModel(field_of_view=FIELD, psf="bilinear", noise="uniform")
 THESIS_RATE = 0.05
-"""Rate (rad/s) of the thesis's camera (chapter 4), from which the exposure for a rotation follows."""
+"""Rate (rad/s) of the thesis's camera (chapter 4); it determines the exposure for a rotation."""
 THESIS_BIAS: dict[str, float] = {
     "harris": -0.07,
     "minimum-eigenvalue": 0.36,

@@ -4,7 +4,7 @@ Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another p
 tumble, whose rate is lower than the configured one so that all phases fit into the flight. The differences of
 body, coils and sensors from the configuration are at most the accuracies that the configuration states
 (`simulation.free_body.errors`). The dipoles of the coils vary over tens of seconds (`COIL_VARIATION`). Cells
-`NAME-tumble` are only the beginnings of such flights, in which most bodies still tumble. They show within
+`NAME-tumble` are only the first minutes of such flights, in which most bodies still tumble. They show within
 minutes whether the claimed uncertainty is correct.
 
 The attitude is evaluated in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse.
@@ -55,7 +55,7 @@ FLOWN = {"orbit": 1300.0, "orbit_3u": 1900.0}
 BEGINNINGS = {"orbit": 200.0, "orbit_3u": 250.0}
 """Durations (s) of the cells `NAME-tumble`."""
 COIL_VARIATION = 0.005
-"""Relative standard deviation of each coil's dipole, which changes every 20 s."""
+"""Relative standard deviation of each coil's dipole; the dipole changes every 20 s."""
 PHASES = ("tumble", "acquisition", "slew", "sunlit", "eclipse")
 EVERY = 10.0
 """Time (s) between the samples of a NEES."""

@@ -46,7 +46,7 @@ DURATIONS = {
 }
 """Time (s) of the flights of each phase and state of the coils."""
 _FIRST = 4
-"""Number of coil states in the first version of this campaign, whose case numbers and seeds stay the same."""
+"""Number of coil states in the first version of this campaign; their case numbers and seeds stay the same."""
 ONSET = 10.0
 """Latest time (s) at which a fault begins."""
 SOON = 30.0

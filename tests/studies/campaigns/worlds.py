@@ -3,9 +3,9 @@
 In the cases `detumble/`, the KnightCube is detumbled as in the campaign `detumble`, alternately by two laws.
 In the cases `nadir/`, 3U and KnightCube alternately hold nadir as in the campaign `orbit-pointing`, at SHARE
 of the worst torques. Only the worlds differ. Basilisk has no day bulge, no ring current and no random walks
-of air density and dipole, so these effects are off in both worlds. Its field is WMM2025; that of this project
-is IGRF-14. Times, errors and coil energies of both worlds should agree within 20 % in the median. The
-campaign needs the extra `worlds`.
+of air density and dipole, so these effects are off in both worlds. The field of Basilisk is WMM2025, and that
+of this project IGRF-14. Times, errors and coil energies of both worlds should agree within 20 % in the
+median. The campaign needs the extra `worlds`.
 """
 
 from __future__ import annotations
