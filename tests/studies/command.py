@@ -26,7 +26,7 @@ class Main(Protocol):
 
 
 def command(function: Callable[..., int]) -> Main:
-    """Make a study's function its `main`, which reads the parameters from a command line.
+    """Make a study's function its `main`, which reads the function's parameters from a command line.
 
     A keyword-only parameter is an option, and any other parameter an argument. The annotation of each is
     `Annotated[TYPE, HELP]`, or `Annotated[TYPE, HELP, CHOICES]`. A `bool` is an option without a value, a

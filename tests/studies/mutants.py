@@ -2,9 +2,9 @@
 
 Each mutant changes one expression on one line of product code and is tested in a temporary copy of the
 repository: the tracked files with their uncommitted changes. The fast tests of the mirrored file run first,
-then those of the mirrored folder, up to the first failure. A test is fast if all its cases together take at
-most two seconds of processor time, by the list slow.txt. A failure counts if the same test passes on the
-unchanged code.
+then the fast tests of the mirrored folder, up to the first failure. A test is fast if all its cases together
+take at most two seconds of processor time, by the list slow.txt. A failure counts if the same test passes on
+the unchanged code.
 
 Docstrings, strings, annotations, decorators, imports, `raise` statements and the argument `strict` of `zip`
 are not changed. Known equivalent mutants are listed in `equivalent_mutants.yaml`, each with a reason.
@@ -256,8 +256,8 @@ def mirrored_tests(root: Path, path: str) -> list[str]:
     """Return the test files that may find a fault of a module.
 
     The mirrored file comes first, then the other files of the mirrored folder, beginning with those that
-    import the module. If `tests` has no folder with the same path, the mirrored folder is that of the nearest
-    parent.
+    import the module. If `tests` has no folder with the same path, the folder of the nearest parent is the
+    mirrored folder.
     """
     module = Path(path)
     mirror = root / "tests" / module.parent
@@ -277,7 +277,7 @@ def mirrored_tests(root: Path, path: str) -> list[str]:
 
 @dataclass
 class _Copy:
-    """A copy of the repository in which one mutant at a time is tested."""
+    """A copy of the repository in which mutants are tested one at a time."""
 
     folder: Path
     environment: dict[str, str]

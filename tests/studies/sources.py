@@ -115,7 +115,7 @@ def table_4_4(runs: int, seed: int) -> Rows:
 
 
 def end_biases(runs: int, seed: int) -> Rows:
-    """Return the inward bias of streak ends in the thesis's frames, which `streaks-thesis` removes."""
+    """Return the inward bias of streak ends in the thesis's frames; `streaks-thesis` removes this bias."""
     rows = [["detector", "bias in use, px", "measured, px"]]
     for name in DETECTOR_NAMES:
         rows.append([f"`{name}`", f"{THESIS_BIAS[name]:.2f}", f"{measured_bias(name, runs, seed):.3f}"])

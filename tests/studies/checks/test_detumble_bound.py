@@ -30,8 +30,7 @@ def test_along_a_constant_field_no_time_is_sufficient() -> None:
 def test_momentum_along_a_rotating_field_waits_for_the_rotation() -> None:
     """The field rotates in a plane, and the momentum is along the initial field.
 
-    Of all directions, the one that is ahead of the momentum by half of the field's rotation gives the largest
-    bound.
+    The direction ahead of the momentum by half of the field's rotation gives the largest bound.
     """
     speed = 2.2e-3
     turning = STRENGTH * np.stack([np.sin(speed * MIDDLES), 0.0 * MIDDLES, np.cos(speed * MIDDLES)], axis=1)

@@ -35,7 +35,7 @@ def _moments(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def test_a_star_at_rest_has_its_place_its_light_and_the_point_spreads_moments() -> None:
-    """The point spread is a rotated ellipse, convolved with the square of a pixel.
+    """The point spread is a rotated ellipse, convolved with a square pixel.
 
     The renderer distributes the light of a point over neighbouring cells. The width of a single image depends
     on the position of the point within its cell; the mean over positions does not.

@@ -184,7 +184,7 @@ def test_equivalent_mutants_have_reasons() -> None:
 
 
 def test_slice_of_product_code(tmp_path: Path) -> None:
-    """Any test of the functions kills two mutants of the repository that return None."""
+    """Any test of the two mutated functions detects that they return None."""
     drawn = draw(ROOT, 400, 1, ["knightcube/astro/inertia.py"])
     found = [one for one in drawn if one.text == "return None"][:2]
     assert len(found) == 2

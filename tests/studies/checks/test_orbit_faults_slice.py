@@ -122,7 +122,7 @@ def test_detumbling_continues_although_the_unit_restarted_at_another_phase(
 ) -> None:
     """In flight 0 of seed 4, the unit's samples came a millisecond before the commands.
 
-    A detumbler that rejected all these samples would use its prediction for half a minute, which is wrong by
+    A detumbler that rejected all these samples would use its prediction for half a minute, with an error of
     2.5 deg/s.
     """
     found = refly(monkeypatch, 4, 0, "imu: off", "detumble", 56.0)

@@ -1,4 +1,4 @@
-"""Tests that the comparison of two checkouts finds an injected difference and ignores permitted ones."""
+"""Tests that the comparison of checkouts finds an injected difference and ignores permitted differences."""
 
 from __future__ import annotations
 

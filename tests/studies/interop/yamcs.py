@@ -7,7 +7,7 @@ socket beyond loopback. The exit status is 1 if a check fails. The study is skip
 the bundle is missing.
 
 The testbed executes all commands except those that point a satellite. With `--orbit` a satellite executes two
-pointing commands, which needs minutes. With `--short`, which CI uses, only the commands that complete in any
+pointing commands, which takes minutes. With `--short` (used by CI), only the commands that complete in any
 state of the flight are executed.
 """
 
@@ -45,7 +45,7 @@ _DEADLINE_S = 120.0
 
 
 def _same_table(name: str) -> dict[str, Any]:
-    """Return the command arguments that load the parameter table that a configuration already uses."""
+    """Return the arguments of the command that loads the parameter table already in use."""
     config = load(_CONFIGS / name)
     values = [
         float(getattr(getattr(config, section), key))
@@ -93,7 +93,7 @@ PLANS = {
 _ENDED = ("TM Connection closed", "read TM socket")
 """Warnings of Yamcs when the study ends the gateway; the second appears if data are still in transit."""
 _RACE = 'because "paramProcessor" is null'
-"""Text of an exception in Yamcs 5.12.8, in which a finished verifier unsubscribes during a packet's delivery.
+"""Text of an exception in Yamcs 5.12.8: a finished verifier unsubscribes while a packet is delivered.
 
 The packet is archived with correct values, but is not sent to displays. These exceptions are counted
 separately.

@@ -1,8 +1,8 @@
 """Checks that this checkout behaves as another revision does.
 
-The study flies ten flights and runs commands in this checkout, with its uncommitted changes, and in a
-temporary checkout of the other revision (REV), with the same interpreter on the same machine. It compares the
-flight logs and the commands' results.
+The study flies ten flights and runs commands in two checkouts: this one with its uncommitted changes, and a
+temporary checkout of the other revision (REV). Both use the same interpreter on the same machine. It compares
+the flight logs and the commands' results.
 """
 
 from __future__ import annotations

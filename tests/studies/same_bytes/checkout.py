@@ -87,7 +87,7 @@ def cache_folder(root: Path, commit: str, name: str, key: object) -> Path:
 
 
 def _machine() -> str:
-    """Return the name of the processor, according to which linear algebra libraries select their code."""
+    """Return the name of the processor; linear algebra libraries select their code by it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

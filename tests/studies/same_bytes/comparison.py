@@ -67,7 +67,7 @@ class Texts:
         return cls(pairs)
 
     def renamed(self, text: str) -> str:
-        """Return a text of the old revision in the wording of the new one."""
+        """Convert a text of the old revision to the wording of the new revision."""
         for old, new in self._pairs:
             found = old.fullmatch(text)
             if found is not None:
@@ -101,7 +101,7 @@ class Difference:
     Attributes:
         log: "flight", "truth" or "answers", or "run" if a run failed.
         packet: name of the packet, of the command, or of the run.
-        time: mission time (s) of the old packet, or None without one.
+        time: mission time (s) of the old packet, or None without a packet.
     """
 
     log: str
@@ -247,7 +247,7 @@ def _apid(packet: bytes) -> int:
 def _difference(
     stem: str, a: bytes, b: bytes, old: Table, new: Table, texts: Texts
 ) -> tuple[Difference | None, bool]:
-    """Return the difference of two packets, if any, and whether the new definition only adds fields."""
+    """Return the first difference of two packets or None, and whether the new definition only adds fields."""
     first, second, time = old.get(_apid(a)), new.get(_apid(b)), _time(a)
     if first is None or second is None or _apid(a) != _apid(b):
         return Difference(stem, _name(a, old), time, "packet", _name(a, old), _name(b, new)), False
@@ -295,7 +295,7 @@ def _kinds(fields: Iterable[Field]) -> list[tuple[str, str, int]]:
 
 
 def _one_ended(stem: str, a: bytes | None, b: bytes | None, old: Table, new: Table) -> Difference:
-    """Return the difference between two logs of which one ends first."""
+    """Return the difference of two logs if one of them ends before the other."""
     name, time = (_name(a, old), _time(a)) if a is not None else (_name(b or b"", new), _time(b or b""))
     return Difference(
         stem, name, time, "packet", "end of log" if a is None else name, "end of log" if b is None else name

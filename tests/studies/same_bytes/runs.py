@@ -1,7 +1,7 @@
 """The flights and commands whose results are compared, and their execution in a checkout of any revision.
 
-All are commands of `python -m flight`, which any revision has even if modules move. Both revisions process
-the same pictures: those that the old one rendered, and photographs if there are any.
+All commands are commands of `python -m flight`, which exists in any revision even if modules move. Both
+revisions process the same pictures: those that the old one rendered, and photographs if there are any.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class Run:
     """Commands that one process runs, each a line as in a shell, without `python -m flight`.
 
     Attributes:
-        flight: arguments of the command `run`, the configuration first, which is run before; or empty.
+        flight: arguments of the command `run`, beginning with the configuration, or empty. This command runs
+            first.
         changes: YAML that replaces values of the flight's configuration.
     """
 
