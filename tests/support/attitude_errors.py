@@ -35,8 +35,8 @@ def attitude_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, floa
     """Return the total error and the error across the boresight (rad) of an attitude (4,).
 
     The total error is the rotation angle from truth to estimate. The error across the boresight is the angle
-    between the true and the estimated boresight. The error across the boresight excludes the rotation about
-    the boresight, which is about ten times less accurate in a narrow field.
+    between the true and the estimated boresight. It excludes the rotation about the boresight, which is about
+    ten times less accurate in a narrow field.
     """
     difference = multiply(estimate, conjugate(truth))
     boresight = attitude_matrix(difference)[:, 2]

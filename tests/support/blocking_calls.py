@@ -24,7 +24,7 @@ ROOT = str(CONFIG.parents[1])
 MODULES = frozenset(
     {"posix", "time", "select", "_socket", "_posixsubprocess", "_io", "io", "fcntl", "mmap", "_thread"}
 )
-"""Modules of C functions, and of the types of C methods, that may wait in the operating system."""
+"""Modules of the C functions, and of the types with C methods, that may wait in the operating system."""
 HARMLESS = frozenset({"monotonic_ns", "monotonic", "time_ns", "time", "perf_counter", "perf_counter_ns"})
 FIRST, LAST = 40, 200
 """First and last control cycle of the interval in which calls are recorded."""

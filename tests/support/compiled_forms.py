@@ -1,7 +1,7 @@
-"""Comparison of three implementations of a function: with numpy, with loops, and compiled by numba.
+"""Comparison of three implementations of a function: in numpy, as loops, and as loops compiled by numba.
 
-Compilation takes seconds. In runs without slow tests, `tests/conftest.py` sets `compiles` to False, so that
-only the implementations with numpy and with loops are compared.
+Compilation takes seconds. In runs without slow tests, `tests/conftest.py` sets `compiles` to False; then only
+the first two implementations are compared.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def offer(
         chance: random generator from `chances`.
         examples: contents that the reader accepts.
         read: function that reads and checks the result; its second argument is true for undamaged data.
-        refusals: the errors by which the reader refuses a content; an undamaged example must be accepted.
+        refusals: exceptions by which the reader may refuse a content; an undamaged example must be accepted.
         reseal: function that corrects checksums, so that damaged data pass the checksum test.
     """
     files = dict(chance.choice(examples))

@@ -23,7 +23,8 @@ class LimbTruth:
         points: pixels (n, 2).
         directions: unit vectors (n, 3) in camera axes.
         solar_cosines: cosine (n,) of the Sun's zenith distance at the tangent point of each line of sight.
-            The cosine is positive if the ground is sunlit. The atmosphere is sunlit some degrees farther.
+            The cosine is positive if the ground is sunlit. The atmosphere is sunlit some degrees beyond the
+            sunlit ground.
     """
 
     points: FloatArray

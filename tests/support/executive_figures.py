@@ -17,12 +17,11 @@ from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalle
 from tests.support.process_watch import MIB, Look
 
 PERIOD_NS = 25_000_000
-"""Period (ns) of the control group, which runs at 40 Hz. Mission time zero is a multiple of this period
+"""Period (ns) of the control cycle (40 Hz). Mission time zero is a multiple of this period
 (`flight.app.flight`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
-"""Time of flight (s) at which the fit of the slope of the memory starts, and shortest duration (s) of the
-fit.
+"""Start (s of flight) and shortest duration (s) of the interval in which the slope of the memory is fitted.
 
 Before this time, buffers of some minutes fill up, and pages of libraries and of the sky index are loaded for
 the first time.

@@ -74,9 +74,9 @@ def slope_per_hour(
     """Return the slope per hour of a noisy level and its 95 % interval (low, high), or NaN.
 
     The slope is NaN if the samples cover too short a time. The level is noisy, because a process allocates
-    and frees memory as it works. The level of each block of time is its 10 % quantile, which a leak increases
-    too. The slope is the median of all pairwise slopes of the blocks, and its interval follows from Kendall's
-    tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
+    and frees memory as it works. The level of each block of time is its 10 % quantile, which also increases
+    with a leak. The slope is the median of all pairwise slopes of the blocks, and its interval follows from
+    Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
     """
     from scipy import stats  # noqa: PLC0415 - sharing its pages would change the flight's measured memory
 

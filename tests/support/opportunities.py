@@ -177,7 +177,7 @@ def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> 
 
 
 def opportunities(scenario: Scenario, cadence: float, exposure: float) -> list[Opportunity]:
-    """Return the frames, one every `cadence` s from time 0, that show an object in their whole exposure.
+    """Return the frames that show an object during the whole exposure; a frame is due every `cadence` s.
 
     Observability is tested at nine instants of each exposure, which lasts `exposure` s. Raises OutOfRange if
     the cadence or the exposure is not positive.

@@ -13,7 +13,7 @@ Rows = Sequence[tuple[float, Mapping[str, Any]]]
 
 
 class WritablePackets(dict[str, Any]):
-    """Packets that a test can change, which replace the packets of a run."""
+    """Changeable packets that replace the packets of a run in tests."""
 
     logs: Any
 

@@ -21,7 +21,7 @@ from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky
 PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "sky"
 
 
-# Standard deviation (rad) of the prior attitude in tracking, which corresponds to 1.5 px.
+# Standard deviation (rad) of the prior attitude in tracking; it corresponds to 1.5 px.
 _PRIOR_SIGMA = 3e-4
 
 

@@ -26,7 +26,7 @@ PERIOD_US = 5_000
 _LEAST_QUOTA_US = 1_000
 """Shortest run time (us) in a period that the kernel accepts."""
 ROOT = Path("/sys/fs/cgroup")
-"""Folder of the hierarchy of cgroup v2, or of the hierarchies of cgroup v1."""
+"""Folder that contains the hierarchy of cgroup v2, or the hierarchies of cgroup v1."""
 _SOURCE = Path(__file__).with_name("yardstick.c")
 
 
@@ -83,7 +83,8 @@ def measure() -> Yardstick:
 class Used:
     """Use of a limited control group: periods (throttled, total), memory (bytes), and times at its limit.
 
-    The memory is NaN with a kernel before Linux 5.19, whose cgroup v2 does not record the largest use.
+    The memory is NaN if the kernel is older than Linux 5.19, in which cgroup v2 does not record the largest
+    use.
     """
 
     periods: int

@@ -40,7 +40,7 @@ NAMES = {
     ("streak", "status"),
     ("stars", "status"),
 }
-"""Text fields that contain names, which are recorded."""
+"""Text fields that are recorded, because they contain names."""
 OF_THE_COMPUTER = {
     "run": {"config_name", "config_crc", "software", "utc_ns", "seed"},
     "health": {"cpu_share", "proportional", "memory_slope", "disk_free", "temperature"},
@@ -92,7 +92,7 @@ def _figures(values: Any) -> list[float]:
 
 
 def differences(record: Record, found: Record) -> list[str]:
-    """Return the packets and fields of a flight that differ from its record, one text per field."""
+    """Return the packets and fields of a flight that differ from the record, one text per field."""
     lines = [f"{name}: in one of them only" for name in sorted(record.keys() ^ found.keys())]
     for name in sorted(record.keys() & found.keys()):
         for field, known in record[name].items():

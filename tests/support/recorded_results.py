@@ -28,7 +28,7 @@ TOLERANCE = 1e-5
 OTHER_TOLERANCE = 2e-3
 """Largest accepted relative difference of all other values from the record.
 
-Another processor rounds sums differently, which may change the step at which an iteration stops.
+Processors round sums differently, which may change the step at which an iteration stops.
 
 The largest difference found is 0.06 %, in a misfit (1 of 68 cases of `tests/knightcube/vision`, 2026-11-29).
 """
@@ -39,7 +39,7 @@ The largest difference found, of a covariance or a faint star, is 0.7 % (5 of 68
 `tests/knightcube/vision`, 2026-11-27).
 """
 ANSWERS = ("rate", "quaternion")
-"""Names of the values that agree within `TOLERANCE` on all processors, also if they are compiled."""
+"""Names of the values that agree within `TOLERANCE` on all processors, even with compiled functions."""
 COMPILED = in_use()
 ZERO = 1e-15
 CURE = "if the change is intended, set KNIGHTCUBE_RECORD=1 and run the test to write the record again"

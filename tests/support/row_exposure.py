@@ -110,6 +110,6 @@ def _add(
 
 
 def _shares(pixels: IntArray, place: FloatArray, sigma: float) -> FloatArray:
-    """Return the fraction (m, p) of points at `place` (m,) on each of the `pixels` (m, p)."""
+    """Return the fraction (m, p) of each point at `place` (m,) that falls on each of its `pixels` (m, p)."""
     away = (pixels - place[:, None]) / sigma
     return np.asarray(ndtr(away + 0.5 / sigma) - ndtr(away - 0.5 / sigma))

@@ -20,7 +20,7 @@ EXPOSURES = (0.2, 1.0)
 MOST_TURN = 0.5
 """Largest rotation of a random slew, as a fraction of the field."""
 BRIGHTEST = 7000
-"""Number of brightest stars that reproduces the tables of the thesis, which does not state the number."""
+"""Number of brightest stars that reproduces the tables of the thesis; the thesis does not state it."""
 LEAST_USABLE = 5
 """Smallest number of usable stars in a random slew."""
 _MOST_SKIES = 1000
@@ -101,7 +101,7 @@ class RandomSlew:
 
     @classmethod
     def drawn(cls, seed: int, run: int) -> RandomSlew:
-        """Return motion number `run` of a campaign, which does not depend on the number of motions."""
+        """Return motion number `run` of a campaign; it does not depend on the number of motions."""
         draw = np.random.default_rng((seed, run, 0))
         theta = float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi)))
         percent = float(100.0 * draw.uniform(0.0, MOST_TURN))

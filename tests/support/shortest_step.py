@@ -83,7 +83,7 @@ def _run(slew: Slew, state: tuple[float, float], sign: float, dt: float) -> Floa
 
 
 def _at(slew: Slew, state: tuple[float, float], sign: float, time: float) -> FloatArray:
-    """Return the state (2,) after `time` s, which may be negative."""
+    """Return the state (2,) after `time` s; `time` may be negative."""
     now = np.array(state)
     count = max(1, int(np.ceil(abs(time) / 0.1)))
     for _ in range(count):

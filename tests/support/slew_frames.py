@@ -61,7 +61,7 @@ def flight(body: str, seed: int, about: FloatArray | None = None) -> tuple[Orbit
 
 
 def _mounting() -> float:
-    """Return the standard deviation (rad per axis) of a camera's mounting error, uniform within its limit."""
+    """Return the standard deviation (rad per axis) of a mounting error that is uniform within its limit."""
     camera = as_orbit(configuration.parse(CONFIG.read_text(encoding="utf-8"))).camera
     assert camera is not None
     return float(np.radians(camera.accuracy.mounting_deg) / np.sqrt(3.0))

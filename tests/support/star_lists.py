@@ -62,7 +62,7 @@ class StarList:
     Attributes:
         pixels: centroids (n, 2), x and y.
         magnitude: (n,), instrumental.
-        star: true guide stars (n,), -1 for false stars.
+        star: index (n,) of the true guide star of each point, -1 for false stars.
         attitude: true attitude (4,), ICRS to camera.
         camera: true camera.
         kind: parameters of the list.

@@ -14,7 +14,7 @@ from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
 from tests.support.earth_truth import sun_direction, sun_point
 
 K1 = -0.1
-"""Radial distortion coefficient of the lenses, which moves the corners inwards by 30 px."""
+"""Radial distortion coefficient of the lenses; it moves the corners inwards by 30 px."""
 
 
 CAMERAS: dict[str, tuple[EarthCameraModel, SunSettings]] = {

@@ -27,7 +27,7 @@ CELLS = 3
 """Number of cells along a pixel's side."""
 
 Spread = Callable[[FloatArray, FloatArray], FloatArray]
-"""Density of a point's signal at (dx, dy) px from it, which need not be normalised."""
+"""Density of the signal at (dx, dy) px from its point; it need not be normalised."""
 
 _FINER = 5
 _APART = 0.15
@@ -65,7 +65,7 @@ def disc(diameter: float) -> Spread:
 
 
 def ring(diameter: float, hole: float) -> Spread:
-    """Return a defocused point in a telescope with a central obstruction: a disc with a hole (px)."""
+    """Return the defocused point of a telescope with central obstruction: a disc with a hole (px)."""
     whole, dark = disc(diameter), disc(hole)
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
@@ -141,8 +141,8 @@ def light(
 ) -> FloatArray:
     """Return the expected electrons (rows, columns) of a sky.
 
-    `length` (px) limits the length of paths. `delay` is the time between rows of a rolling shutter, in units
-    of the exposure.
+    Paths may be at most `length` px long. `delay` is the time between rows of a rolling shutter, in units of
+    the exposure.
     """
     layers, edge = len(optics.spreads), _reach(optics.radius)
     size = CELLS * pinhole.rows + 2 * edge, CELLS * pinhole.columns + 2 * edge
@@ -218,7 +218,7 @@ def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
 
     The layer extends beyond the detector by the `radius` (px) of the point spread, so that the periodic
     convolution reaches no cell of the detector from the opposite side. Neighbouring cells share the light of
-    a point, which blurs the layer by a triangle along each axis; the function removes this blur.
+    a point, which convolves the layer with a triangle along each axis; the function removes this blur.
     """
     half = _reach(radius)
     fine = (np.arange((2 * half + 1) * _FINER) + 0.5) / (_FINER * CELLS) - (half + 0.5) / CELLS

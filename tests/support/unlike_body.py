@@ -42,7 +42,7 @@ def released(world: Simulation, seed: int, place_deg: float, speed: float) -> Si
 
 
 def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
-    """Return a configuration without cameras, which a tumbling satellite does not use."""
+    """Return a configuration without cameras, because a tumbling satellite does not use them."""
     return configuration.replace(config, duration=duration, camera=None, wide_cameras=())
 
 
