@@ -611,7 +611,8 @@ class Imaging:
         self._spare = True  # whether there was time to search the last frame for objects
         self._searches, self._frame_every, self._turn = True, 1, 0
         self._shed = self._late = 0
-        self._pause_ns = 0  # time between the exposures of the last two frames
+        # End of the newest frame's exposure, and time from the preceding frame to it.
+        self._exposed_ns = self._pause_ns = 0
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and the number of rates from streaks that the filter accepted."""
@@ -651,7 +652,7 @@ class Imaging:
 
     def begin(self, time_ns: int) -> None:
         """Until the first frame arrives, measure the age of the newest frame from `time_ns`."""
-        self._last_frame_ns = time_ns
+        self._last_frame_ns = self._exposed_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
         """Schedule the next exposure of the star camera, if an exposure is permitted now.
@@ -719,7 +720,7 @@ class Imaging:
         self._due_ns = None
         # The age of a frame is measured from the end of its exposure, not from its arrival.
         end_ns = frame.exposure_start_ns + frame.exposure_ns
-        self._pause_ns, self._last_frame_ns = end_ns - self._last_frame_ns, end_ns
+        self._pause_ns, self._exposed_ns, self._last_frame_ns = end_ns - self._exposed_ns, end_ns, end_ns
         age_ns = now_ns - end_ns
         late = age_ns > self._settings.max_age_ns
         text = f"frame {frame.sequence} arrives {age_ns * 1e-9:.1f} s after its exposure"

@@ -680,6 +680,11 @@ def test_late_frames_are_those_that_meet_a_busy_worker_or_take_too_long() -> Non
     bench.take(6, 25 * S, 25300 * MS)
     bench.finish(FrameFound(motion(), None), 30300 * MS + 1)
     assert bench.task.workload() == (0, 3)
+    bench.task.reduce(True, 2)
+    bench.task.trigger(bench.cycle(30_310 * MS))
+    bench.take(7, 35 * S, 35300 * MS)
+    bench.finish(FrameFound(motion(), None), 40300 * MS)
+    assert bench.task.workload() == (1, 3), "an omitted exposure does not shorten the time between two frames"
 
 
 def test_a_problem_of_the_worker_is_reported() -> None:
