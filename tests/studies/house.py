@@ -74,7 +74,7 @@ class Piece:
 def pieces(root: Path = ROOT) -> list[Piece]:
     """Return all files, classes and functions of the product, the longest first.
 
-    A function within a function belongs to the outer one.
+    A function within a function belongs to the outer function.
     """
     found = []
     for path in sorted(path for package in PRODUCT for path in (root / package).rglob("*.py")):
@@ -132,8 +132,8 @@ class Touched:
 def of_flight() -> dict[str, set[str]]:
     """Return the files whose functions are called at the opening of a flight and in a control cycle.
 
-    The opening lasts from the request to the first cycle. The control cycle is the one with the most files in
-    a second of flight.
+    The opening lasts from the request to the first cycle. The control cycle is the cycle with the most files
+    in a second of flight.
     """
     opening, cycles = Touched(), [Touched()]
     fly, run = FlightLoop.run, ControlCycle.run

@@ -123,7 +123,7 @@ def end_biases(runs: int, seed: int) -> Rows:
 
 
 def image_matching_errors(runs: int, seed: int) -> Rows:
-    """Return the ratios of AIM's attitude errors to the q-method's, by prior error and number of steps."""
+    """Return the attitude errors of AIM relative to the q-method, by prior error and number of steps."""
     steps = (1, 2, 3, 4)
     head = [
         "field, deg",

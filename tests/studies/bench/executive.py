@@ -149,7 +149,7 @@ def main(
 
 
 def _schedulings(wanted: str) -> list[str]:
-    """Return the scheduling policies to run: the ordinary one, and SCHED_FIFO if it is permitted."""
+    """Return the scheduling policies to run: the default policy, and SCHED_FIFO if it is permitted."""
     if wanted == "ordinary" or fifo_allowed():
         return ["fifo", "ordinary"] if wanted == "both" else [wanted]
     sys.stderr.write("SCHED_FIFO is refused here: flown without it\n")

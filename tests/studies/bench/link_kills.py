@@ -117,7 +117,7 @@ def main(
 
 
 def measure(place: Path, kills: int, seed: int) -> Findings:
-    """Kill the link and the sender `kills` times each, in turn."""
+    """Kill the link and the sender alternately, `kills` times each."""
     make_keys(place / "keys")
     flight = open_unix(place / "commands")
     draw, found, frames = np.random.default_rng(seed), Findings(), list[bytes]()

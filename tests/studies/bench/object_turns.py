@@ -1,9 +1,9 @@
 """Detection of objects among long streaks, and its time.
 
 The camera of the simulator rotates by 10 to 30 % of its field within 0.5 s about a random axis. A frame has
-no object, or one of the given magnitude that moves by 9 to 87 px relative to the stars, as in the campaign
-`rso-orbits`. The search uses the rotation of the likelihood estimate. Only the search is timed, in processor
-time.
+no object, or an object of the given magnitude that moves by 9 to 87 px relative to the stars, as in the
+campaign `rso-orbits`. The search uses the rotation of the likelihood estimate. Only the search is timed, in
+processor time.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ solved with a known field. The simulated frames have the simulator's camera with
 and 90 deg, or 90 deg in the rows with `across`. `over bound` is the rms error across the boresight divided by
 the Cramer-Rao bound of the star positions; `bound` is the same ratio for the magnitude of the rate.
 Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths of
-streaks. Times are processor times of one core. For photographs, the time is the median of some passes after a
-first pass that is not counted, for all programs. The other star identification programs extract the stars
+streaks. Times are processor times of one core. For photographs, the time of each program is the median of
+some passes after a first pass that is not counted. The other star identification programs extract the stars
 themselves, with their default filters and without filters. `ratios` has, for each other program and each size
 of photographs, the median ratio of this project's time to that program's time, with known field. `dim frames`
 are frames of a calibrated camera with exposures so short that few stars are detected.

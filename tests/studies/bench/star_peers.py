@@ -5,7 +5,7 @@ needs numpy below 2. A job is a star list (`pixels`, `size`) or a frame (`image`
 field of view and its uncertainty in degrees. For a frame, the time includes the other program's star
 extraction. A job with `passes` is repeated, and its time is the median. The program prints one JSON object
 with the CPU time (ms) and the boresight (3,) of each job, or null for a refusal. It also prints by how much
-catalogue and index increase the resident memory after the import of the other program.
+catalogue and index increase the resident memory, after the import of the other program.
 """
 
 import importlib

@@ -133,7 +133,7 @@ THREADS = {OURS: CONTROLLERS, THICK: STIFF}
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return every controller on each of `runs` seeds, and those of `STIFF` on the stiff thread."""
+    """Return `CONTROLLERS` with each of `runs` seeds, and `STIFF` with each seed on the stiff thread."""
     drawn = [(thread, name) for thread, names in THREADS.items() for name in names]
     return [
         Case(
@@ -238,7 +238,7 @@ def robust_cases(runs: int, seed: int) -> list[Case]:
 
 
 def draw(seed: tuple[int, ...]) -> dict[str, Any]:
-    """Return one world; values without a unit in their name are factors of the demonstration's values."""
+    """Return one world; values without a unit in their name are relative to the demonstration's values."""
     rng = np.random.default_rng(seed)
 
     def about_one(share: float) -> float:

@@ -45,7 +45,7 @@ class Board:
 
     Attributes:
         boots: number of flights that have recorded their own start.
-        start_s: time (s) until READY of the last start.
+        start_s: time (s) from the last start to READY.
         left: processes that were children of a flight when it was killed.
     """
 
@@ -169,7 +169,7 @@ def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def _current_until(board: Board, kill_ns: int) -> float:
-    """Wait until `kill_ns`; return the largest current (A) of the last 0.1 s, or the last sample if none.
+    """Wait until `kill_ns`; return the largest current (A) of the last 0.1 s, from at least one sample.
 
     One sample is not enough, because a flight switches its coils off at times to read the magnetometer.
     """
@@ -185,8 +185,8 @@ def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, flo
     """Return the time (s) from the kill to lasting zero current, and the largest current after the limit.
 
     The time ends at the first sample of zero current, so it can be up to one sample interval too long, but
-    not too short. Coils that carried current are observed beyond the time limit, and all others long enough
-    to show that they stay at zero.
+    not too short. Coils that carried current are observed beyond the time limit; all other coils are observed
+    long enough to show that they stay at zero.
     """
     zero_after = beyond = 0.0
     driven = before > 0.0
@@ -218,7 +218,7 @@ def _log_of(folder: Path, ready_for: float | None) -> Result:
 
 
 def _whole(flown: Run) -> bool:
-    """Return whether a run's logs are complete, except for one truncated packet at the end of each."""
+    """Return whether the logs of a run are complete; each may end with one truncated packet."""
     return all(
         log.skipped_bytes + log.other_versions + sum(log.missing.values()) == 0
         and log.truncated_bytes < LONGEST_PACKET
@@ -227,7 +227,7 @@ def _whole(flown: Run) -> bool:
 
 
 def _state_of(board: Board, counted: bool) -> Result:
-    """Return whether the stored state is intact and lists all kills, except perhaps an early one.
+    """Return whether the stored state is intact and lists all kills; an early kill may be missing.
 
     The state must list every boot so far as unclean: the last boot by `running`, the others by name. A flight
     that was ready must have recorded its own start.

@@ -1,6 +1,6 @@
 """Campaign `orbit-faults`: every fault of a satellite's devices in every mode, in lock-step.
 
-Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and injects one
+Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances. It injects one
 fault on the device lines, at a random time and for a random duration; faults of coils and bridges last to the
 end. Some runs have a wrong initial condition instead: an element set that is a week old, no element set, or a
 wall clock that is wrong from the start. The campaign checks whether a specific event reported the fault, and

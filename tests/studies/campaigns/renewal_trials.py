@@ -2,8 +2,8 @@
 
 A case is a board that runs a release with a configuration. The ground sends one bundle, activates it, and may
 confirm it. Every second run of the privileged program is killed with all its child processes at a random
-time; the link is restarted at random. After the trial period the old or the new version must be in use, and
-the old one if the bundle had a flaw. The link must still execute a command.
+time; the link is restarted at random. After the trial period the old or the new version must be in use; if
+the bundle had a flaw, it must be the old version. The link must still execute a command.
 """
 
 from __future__ import annotations

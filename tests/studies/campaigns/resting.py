@@ -9,7 +9,7 @@ The error of an attitude is given in claimed standard deviations (the square roo
 more than 6 counts as confidently wrong. A displaced optical axis, or a point spread function with a displaced
 centroid, rotates all attitudes by the same angle. A flight calibrates this rotation, as part of its mounting,
 with the same stars. In these rows (`SHIFTED`) the median error is subtracted, and the prior includes the
-displaced axis. The row `none` has an exactly known lens; all others have the default uncertainty of an
+displaced axis. The row `none` has an exactly known lens; all other rows have the default uncertainty of an
 uncalibrated lens.
 """
 

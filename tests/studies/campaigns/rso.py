@@ -84,7 +84,7 @@ def draw_sky(camera: StarCameraModel, generator: np.random.Generator, tracked: b
 
 
 def _motion(generator: np.random.Generator, place: FloatArray) -> FloatArray:
-    """Return a rotation (3,), rad/s, across `place`, with a speed that is uniform in its logarithm."""
+    """Return a rotation (3,), rad/s, normal to `place`; the logarithm of its speed is uniform."""
     speed = np.exp(generator.uniform(np.log(SLOWEST), np.log(FASTEST)))
     axis = np.cross(place, generator.normal(size=3))
     return np.asarray(speed * axis / np.linalg.norm(axis))
@@ -118,7 +118,7 @@ def match(report: ObjectReport | None, truth: FloatArray | None) -> Found:
 
 
 def ends_error(ends: FloatArray, truth: FloatArray) -> float:
-    """Return the larger error of two ends (2, 2), px; one frame does not show which came first."""
+    """Return the larger error of two ends (2, 2), px; a frame does not show which end came first."""
     return float(min(np.linalg.norm(ends - other, axis=1).max() for other in (truth, truth[::-1])))
 
 

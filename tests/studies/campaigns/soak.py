@@ -37,8 +37,8 @@ MEMORY_BYTES_PER_HOUR = 8 << 20
 BUDGET_BYTES = 4 << 20
 _SEGMENT_BYTES = 256 << 10
 _UNHEARD = ("camera", "vision", "disk")
-"""Parts that receive no faults, because the flight has no camera, and a full disk would lose the records
-of other faults."""
+"""Parts that receive no faults: the flight has no camera, and a full disk would lose the records of other
+faults."""
 
 
 def cases(hours: int, seed: int) -> list[Case]:
@@ -134,7 +134,7 @@ def resident_bytes() -> int:
 
 
 def _slope(memory: Sequence[tuple[float, int]]) -> float:
-    """Return the growth of memory (bytes per hour) over the second half."""
+    """Return the growth of the memory (bytes per hour) in the second half of its samples."""
     half = np.array(memory[len(memory) // 2 :], dtype=float)
     return float(np.polyfit(half[:, 0], half[:, 1], 1)[0]) * HOUR_S
 

@@ -1,14 +1,15 @@
 """Campaign `start`: each system call of a flight's start on a board fails once; the flight must still start.
 
-A point is a combination of one call of the main thread, numbered from the start of its process, and one error
-that strace injects into the call. The list of points contains each call of a traced start with each error.
-The number of calls varies slightly between starts. The seed determines the order of the list. Calls after and
-before the opening of the configuration alternate as long as both remain, because nearly all calls before the
-opening only read modules. With as many runs as points, the campaign covers the whole list.
+A point is a pair of one call of the main thread and one error that strace injects into this call; calls are
+numbered from the start of the process. The list of points contains each call of a traced start with each
+error. The number of calls varies slightly between starts. The seed determines the order of the list. Calls
+after and before the opening of the configuration alternate as long as both remain, because nearly all calls
+before the opening only read modules. With as many runs as points, the campaign covers the whole list.
 
-A case is a board whose emulated devices run in a separate process. Its flight starts repeatedly, each time
-with one point. The campaign replaces the service manager: it restarts a process that ends, without the fault,
-unless its exit status is 78. With that status the board would stay grounded, which must not happen.
+A case is a board whose emulated devices run in a separate process. The flight of the board starts repeatedly,
+each time with one point. The campaign replaces the service manager: it restarts a process that ends, without
+the fault, unless its exit status is 78. With that status the board would stay grounded, which must not
+happen.
 """
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ class Board:
         }
 
     def trace(self) -> tuple[Counter[str], Counter[str]]:
-        """Return the numbers of calls by kind: of all calls, and of those before the configuration."""
+        """Return the numbers of calls by name: in total, and before the configuration is opened."""
         path = self._place / "trace"
         strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)

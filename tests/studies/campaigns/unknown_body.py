@@ -1,11 +1,11 @@
 """Campaign `unknown-body`: attitude knowledge of satellites that differ from their description, in the loop.
 
 Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another position of the orbit with a
-tumble, whose rate is lower than the configured one so that all phases fit into the flight. The differences of
-body, coils and sensors from the configuration are at most the accuracies that the configuration states
-(`simulation.free_body.errors`). The dipoles of the coils vary over tens of seconds (`COIL_VARIATION`). Cells
-`NAME-tumble` are only the first minutes of such flights, in which most bodies still tumble. They show within
-minutes whether the claimed uncertainty is correct.
+tumble. The rate of the tumble is lower than the configured rate, so that all phases fit into the flight. The
+differences of body, coils and sensors from the configuration are at most the accuracies that the
+configuration states (`simulation.free_body.errors`). The dipoles of the coils vary over tens of seconds
+(`COIL_VARIATION`). Cells `NAME-tumble` are only the first minutes of such flights, in which most bodies still
+tumble. They show within minutes whether the claimed uncertainty is correct.
 
 The attitude is evaluated in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse.
 The NEES is given per axis, from samples 10 s apart, about the body axes and about the axes of the star
@@ -142,7 +142,7 @@ def _thinned(times: FloatArray) -> BoolArray:
 
 
 def in_phases(flown: Run, times: FloatArray) -> dict[str, BoolArray]:
-    """Return which of the `times` (n,) s are in each phase.
+    """Return which of the `times` (n,), s, are in each phase.
 
     A slew lasts from the time at which the body starts to point at a target until the planned path ends.
     """

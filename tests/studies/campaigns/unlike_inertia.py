@@ -58,7 +58,7 @@ SLOW_SPEED = 0.0035
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each craft in each phase and state, with faults on x, y and z in rotation."""
+    """Return `runs` flights of each craft in each phase and state; the faulty axis is x, y and z in turn."""
     kinds = tuple(DURATIONS)
     return [
         Case(f"{name} {kind} {k}", (seed, number, k), {"name": name, "kind": kind, "axis": "xyz"[k % 3]})

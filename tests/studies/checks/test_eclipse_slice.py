@@ -34,7 +34,7 @@ def test_the_filter_is_judged_with_stars_and_at_the_end_of_the_shadow(tmp_path: 
 
 
 class Driven(eclipse.DarkFlight):
-    """A flight whose coils give nearly their full moment about one axis after another, in both directions."""
+    """A flight in which one coil after another gives nearly its full moment, in both directions."""
 
     def _plan(self, time: float) -> None:
         pass

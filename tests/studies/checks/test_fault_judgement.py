@@ -36,7 +36,7 @@ def test_a_worker_meets_a_fault_only_with_a_job_that_was_begun_under_it(
 
 @pytest.mark.parametrize(("current", "met"), [(0.008, False), (0.024, False), (0.03, True)])
 def test_a_monitor_that_doubles_little_reports_nothing_wrong(current: float, met: bool) -> None:
-    """A doubled reading of 8 mA is within the error of a correct one, so no monitor can distinguish them."""
+    """At 8 mA, a doubled reading is within the error of a correct one, so no monitor can distinguish them."""
     control = np.zeros(400, dtype=[("time_ns", "<i8"), ("current_written", "<f8", 3)])
     control["time_ns"] = np.arange(400) * 25_000_000
     control["current_written"][:, 0] = -current

@@ -50,7 +50,7 @@ def test_halve():
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a repository with one module and its tests, one of which fails."""
+    """Return a repository with one module and its tests; one of the tests fails."""
     # The import of the installed plugins would take half of each run.
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     root = tmp_path / "repository"

@@ -73,7 +73,7 @@ def written(folder: Path, packets: Log, table: tuple[Packet, ...] = OLD) -> Path
 
 
 def event_logs(folder: Path, old: str, new: str) -> tuple[Path, Path]:
-    """Write two logs of one event each, with an old text and a new one."""
+    """Write two logs of one event each: one with the old text, the other with the new text."""
     return (
         written(folder / "old", [("event", 0, EVENT_VALUES | {"text": old})], (EVENT,)),
         written(folder / "new", [("event", 0, EVENT_VALUES | {"text": new})], (EVENT,)),

@@ -79,8 +79,8 @@ def main(
 def missed(figures: Figures, by_link: bool) -> list[str]:
     """Return the names of the results that exceed their limits.
 
-    Over a link, packets of one instant may arrive in two frames, so for a moment the page may show only those
-    of the first frame.
+    Over a link, packets of one instant may arrive in two frames; for a moment, the page may then show only
+    the packets of the first frame.
     """
     wrong = [name for name, bound in ASKED.items() if not getattr(figures, name) <= bound]
     wrong += [name for name in ("complaints", "strangers", "filed") if getattr(figures, name)]
@@ -144,7 +144,7 @@ def _flown(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
 
 @contextlib.contextmanager
 def _linked(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
-    """Yield address and process of a console that has only a flight's link, and the link's process."""
+    """Yield address and process of a console that is connected to the link alone, and the link's process."""
     address, place = f"127.0.0.1:{free_port()}", run.parent
     own = write_linked_config(place, base=config, udp=address, rate=100_000)
     with process("run", own, "--realtime", "--out", run):

@@ -1,10 +1,10 @@
 """Yamcs archives and commands a simulated flight through the authenticated link.
 
-The study flies in real time with link, gateway and Yamcs. It prints one JSON line for each check: Yamcs loads
-the XTCE without a warning; every kind of command completes, and a refused one is reported; the archive holds
-every packet of the flight log, byte for byte; Yamcs decodes the same values as this project; no process has a
-socket beyond loopback. The exit status is 1 if a check fails. The study is skipped with a message if Java or
-the bundle is missing.
+The study flies in real time with link, gateway and Yamcs. It prints one JSON line for each check. Yamcs must
+load the XTCE without a warning. Every kind of command must complete, and a refused command must be reported.
+The archive must hold every packet of the flight log, byte for byte. Yamcs must decode the same values as this
+project. No process may have a socket beyond loopback. The exit status is 1 if a check fails. The study is
+skipped with a message if Java or the bundle is missing.
 
 The testbed executes all commands except those that point a satellite. With `--orbit` a satellite executes two
 pointing commands, which takes minutes. With `--short` (used by CI), only the commands that complete in any

@@ -114,7 +114,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Result of the comparison of one flight, or of one group of command results.
+    """Result of the comparison of one flight, or of the command results of one group.
 
     Attributes:
         compared: number of compared packets and values.
@@ -283,7 +283,7 @@ def _different_field(
 
 
 def _extends(first: Layout, second: Layout) -> bool:
-    """Return whether the second definition is the first one with appended fields and a higher version."""
+    """Return whether the second definition has a higher version and only appends fields to the first."""
     shared = second.packet.fields[: len(first.packet.fields)]
     more = len(second.packet.fields) > len(shared) == len(first.packet.fields)
     raised = second.packet.version > first.packet.version

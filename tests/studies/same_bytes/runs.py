@@ -1,7 +1,7 @@
 """The flights and commands whose results are compared, and their execution in a checkout of any revision.
 
 All commands are commands of `python -m flight`, which exists in any revision even if modules move. Both
-revisions process the same pictures: those that the old one rendered, and photographs if there are any.
+revisions process the same pictures: those rendered by the old revision, and photographs if there are any.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ json.dump([dataclasses.asdict(packet) for packet in table], sys.stdout)
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Commands that one process runs, each a line as in a shell, without `python -m flight`.
+    """Commands that one process runs; each is a line as in a shell, without `python -m flight`.
 
     Attributes:
         flight: arguments of the command `run`, beginning with the configuration, or empty. This command runs
