@@ -90,7 +90,7 @@ class Page:
 
 
 def missing() -> str:
-    """Return the package of the browser tests that is missing, or an empty string."""
+    """Return a message about a missing package of the browser tests, or an empty string."""
     try:
         import playwright.sync_api  # noqa: F401, PLC0415 - an extra of the tests
     except ModuleNotFoundError:

@@ -11,7 +11,7 @@ REACHED_AFTER = 10.0
 
 
 def clairvoyant_power(config: TestbedConfig, world: Simulation) -> float:
-    """Return the mean R I^2 (W) of the optimum for a demonstration's steps in a world that is fully known."""
+    """Return the mean R I^2 (W) of the optimum for a demonstration's steps in a fully known world."""
     true = SingleAxisPlant(
         world.truth.inertia or config.plant.inertia,
         config.plant.coil_turns * config.plant.coil_area * (world.truth.field or config.plant.field),

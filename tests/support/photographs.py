@@ -75,7 +75,7 @@ def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pi
 def photograph(
     folder: Path, name: str, truth: dict[str, float], known: bool, size: tuple[int, int] | None = None
 ) -> Photograph:
-    """Return the star tracker's result for one photograph, reduced to `size` (columns, rows) if given."""
+    """Return the star tracker's result for one photograph, which is first reduced if `size` is given."""
     pixels = read_image(folder / name)
     pixels = pixels if size is None else reduced(pixels, *size)
     shown = f"{pixels.shape[1]} x {pixels.shape[0]}"

@@ -34,7 +34,7 @@ def passing_object(rng: np.random.Generator, own: FloatArray) -> tuple[FloatArra
 
 
 def flown_states(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
-    """Return the states (n, 6) at `times` of a free fall; `state` is the state at `times[middle]`."""
+    """Return the states (n, 6) of a free fall at `times`; `state` is the state at `times[middle]`."""
     parts = []
     for sense in (times[middle::-1], times[middle:]):
         found = solve_ivp(

@@ -143,7 +143,7 @@ def draw_random(kind: ListKind, count: int, rng: np.random.Generator) -> StarLis
 
 
 def _distort(pixels: FloatArray, camera: Pinhole, corner: float) -> FloatArray:
-    """Return pixels with a radial distortion that is cubic in the distance, and `corner` px at the corner."""
+    """Return pixels with a radial distortion that is cubic in the distance and `corner` px at the corner."""
     centre = np.array(camera.centre)
     off = (pixels - centre) / (PIXELS / np.sqrt(2.0))
     return np.asarray(pixels + corner * off * np.sum(off**2, axis=-1, keepdims=True))

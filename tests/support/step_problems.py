@@ -129,8 +129,8 @@ def feasible_problems(
 ) -> list[tuple[Problem, float]]:
     """Return slews that last `share` times their shortest feasible duration, which is also returned (s).
 
-    A third of the plants has no suspension thread, and two thirds have a suspension thread of one of two
-    stiffnesses. Half of the plants have a disturbance, and half of the slews end with a rate.
+    A third of the plants has no suspension thread; the others have a thread of one of two stiffnesses. Half
+    of the plants have a disturbance, and half of the slews end with a rate.
     """
     rng = np.random.default_rng(seed)
     problems: list[tuple[Problem, float]] = []

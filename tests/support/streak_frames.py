@@ -133,7 +133,7 @@ def expose(
 
 
 def _along(direction: FloatArray, rotation: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return the directions (m, 3) of one star at fractions (m,) of the rotation from mid-exposure."""
+    """Return the directions (m, 3) of a star after fractions (m,) of the rotation since mid-exposure."""
     angle = np.linalg.norm(rotation)
     if angle == 0.0:
         return np.tile(direction, (len(fraction), 1))

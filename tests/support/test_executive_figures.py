@@ -64,7 +64,7 @@ def test_a_lost_slot_is_the_machines_only_when_the_bare_loop_lost_it_or_its_neig
     [
         (15, 20, True),
         (15, 10, False),
-        # A small load that is always present is not taken as the cause of the loop's lateness.
+        # A small load that is always present does not count as the cause of the loop's lateness.
         (90, 40, False),
         (90, 50, True),
     ],

@@ -78,7 +78,7 @@ def test_the_cameras_of_usu_are_tipped_like_the_satellite() -> None:
 
 
 def written(tmp_path: Path, old: str, new: str) -> Path:
-    """Write the file of the suite VT with one replaced text, and return the path of the file."""
+    """Write the file of the suite VT with one replaced text; return its path."""
     text = Path("config/sensors/vt.yaml").read_text()
     assert old in text
     path = tmp_path / "suite.yaml"

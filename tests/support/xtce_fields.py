@@ -89,7 +89,7 @@ def _alike(read: Any, wanted: Any) -> bool:
 
 
 def shifted(text: str) -> str:
-    """Return an XTCE document whose `imu` has a second field a byte too late, and a CRC of one byte."""
+    """Return an XTCE document in which a field of `imu` is one byte too late, and the CRC has one byte."""
     entry = '<ParameterRefEntry parameterRef="{}" />'
     before, after = text.split(entry.format("imu_device_time_ns"))
     pads = [
