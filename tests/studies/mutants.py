@@ -1,6 +1,6 @@
 """Fraction of random one-line faults that the fast tests find.
 
-Each mutant changes one expression on one line of product code and is tested in a temporary copy of the
+Each mutant changes one expression on one line of product code. It is tested in a temporary copy of the
 repository: the tracked files with their uncommitted changes. The fast tests of the mirrored file run first,
 then the fast tests of the mirrored folder, up to the first failure. A test is fast if all its cases together
 take at most two seconds of processor time, by the list slow.txt. A failure counts if the same test passes on

@@ -2,7 +2,7 @@
 
 The step demonstration flies in real time on emulated devices in separate processes. Planner and vision work
 without pause, and the guardian watches. With `--orbit` the satellite of `config/orbit.yaml` flies instead. It
-points to nadir from the start, its planner has the shortest period that the configuration allows (10 s), and
+points to nadir from the start. Its planner has the shortest period that the configuration allows (10 s), and
 its horizon cameras run at their flight rate. With `--busy` each worker repeats its last job until the next
 job arrives, so no worker is ever idle.
 

@@ -1,9 +1,9 @@
 """Lateness of the loop while its link is flooded.
 
 The step demonstration flies in real time on its emulated devices beside its link process. It flies first
-without a flood. In the second flight the link receives 10,000 forged frames a second while it plays back the
-archive and sends a file of 50 MB, at a total of a megabyte per second. The benchmark prints the lateness of
-the control cycles, the counts of link and ground, and the received part of the file.
+without a flood. In the second flight the link receives 10,000 forged frames a second. Meanwhile it plays back
+the archive and sends a file of 50 MB, at a total of a megabyte per second. The benchmark prints the lateness
+of the control cycles, the counts of link and ground, and the received part of the file.
 """
 
 from __future__ import annotations

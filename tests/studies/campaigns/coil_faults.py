@@ -1,6 +1,6 @@
 """Campaign `coil-faults`: accuracy of the filter while a coil does not carry the commanded current.
 
-Each run flies 20 s of the demonstration's loop in lock-step, without a camera, through two slews, and breaks
+Each run flies 20 s of the demonstration's loop in lock-step, without a camera, through two slews. It breaks
 one coil or one leg of a bridge at a random time, for 3 s or to the end. The IMU has no fault. The campaign
 reports how long the error of the estimated rate or angle exceeds 5 of its claimed standard deviations, during
 the fault and after it. It also reports until how long after the onset the filter rejects measurements of the

@@ -53,7 +53,7 @@ def least_time(
     left: float,
     others: FloatArray | float = 0.0,
 ) -> float:
-    """Return a lower bound, s, of the time in which a momentum (3,), N m s, can fall to `left` N m s.
+    """Return a lower bound (s) of the time in which a momentum (3,), N m s, can fall to `left` N m s.
 
     In inertial axes the momentum h obeys h' = m x B + T, whatever the inertia and the attitude are. The
     dipole moment m of the coils is at most `reach` (A m^2), and the torque T of all other causes at most

@@ -126,7 +126,7 @@ def _how_wrong(found: MotionResult, scene: Scene) -> str:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the counts, the distribution of NEES, the times, every seed that failed, and the plot."""
+    """Return the counts, the NEES distribution, the times, every seed that failed, and the plot."""
     facts = {
         "frames": len(results),
         "verdicts": dict(sorted(Counter(r["verdict"] for r in results).items())),

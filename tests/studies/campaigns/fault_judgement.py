@@ -1,9 +1,9 @@
 """Evaluation of a run of campaign `faults` by its log and its true states.
 
-The tables have the event and the reaction that each fault must cause. A fault counts as reported only by a
-specific event: a stuck coil also causes a tumbling event, but that event does not name the failed part. If
-the table of events states a reaction, the reaction must follow. Times are determined from log and truth, not
-from events alone, because events are rate-limited.
+The tables have the event and the reaction that each fault must cause. A fault counts as reported only if a
+specific event reports it. For instance, a stuck coil also causes a tumbling event, but that event does not
+name the failed part. If the table of events states a reaction, the reaction must follow. Times are determined
+from log and truth, not from events alone, because events are rate-limited.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A case is a board whose emulated devices run in a separate process all the time, and whose stored state
 persists. Its flights are killed one after the other, a quarter of them before they are ready. After each kill
-the campaign samples the currents of the coils every few milliseconds and reads the log and the stored state,
-and the next flight must start. The last flight is stopped by SIGTERM. It must have a record of all kills, and
+the campaign samples the coil currents every few milliseconds, and reads the log and the stored state. Then
+the next flight must start. The last flight is stopped by SIGTERM. It must have a record of all kills, and
 must be in safe mode if the number of kills reaches the crash limit of its configuration.
 """
 

@@ -6,9 +6,9 @@ without it, only the magnetometer and the plant model. A step counts as reached 
 0.5 deg of the target in the last 70 s of the step.
 
 The cells `orbit` are flights of `config/orbit.yaml` from a tumble of 3 deg/s to nadir, at a random position
-of the orbit, with a body, coils and sensors that differ from the configuration within the stated accuracies.
-They have neither horizon cameras nor solar cells. The estimate uses star attitudes, streak rates, the
-magnetometer and the dynamic model. The error of the nadir axis is evaluated from the end of the slew on.
+of the orbit. Body, coils and sensors differ from the configuration within the stated accuracies. They have
+neither horizon cameras nor solar cells. The estimate uses star attitudes, streak rates, the magnetometer and
+the dynamic model. The error of the nadir axis is evaluated from the end of the slew on.
 """
 
 from __future__ import annotations

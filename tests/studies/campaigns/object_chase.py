@@ -30,8 +30,7 @@ from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, Poi
 from tests.support.short_arcs import flow, passing_object
 
 NEAREST, END = 120.0, 210.0
-"""Time (s) at which the line of sight to the object rotates at the drawn rate, and time (s) at which the
-flight ends.
+"""Times (s) at which the line of sight to the object rotates at the drawn rate, and at which the flight ends.
 """
 FIELD = np.radians(10.0)
 """Angle (rad) from the boresight to the nearest edge of a frame of 512 px over 20 deg."""
@@ -62,9 +61,9 @@ class ObjectChase(PointingFlight):
     Attributes:
         reported: names of the events, in order.
         refused: number of planner tables that were rejected because the body would rotate too fast.
-        notes: for each cycle the time, the angle (rad) from the boresight to the object, the body's rate
-        about the boresight and its whole rate (rad/s), the number of the followed track, and whether the
-        frame showed the object.
+        notes: for each cycle the time; the angle (rad) from the boresight to the object; the body's rate
+            about the boresight and its total rate (rad/s); the number of the followed track; whether the
+            frame showed the object.
         shown, directions, fields: boresight (3,), true direction (3,) and field (3,), T, of each cycle, ICRS.
     """
 

@@ -14,11 +14,11 @@ attitudes the filter rejected, and how many in a row.
 Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the configured ones by
 up to the default accuracies.
 
-Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, at a rate of 0.3 deg/s, and last 100
-min. `arrived` counts bodies whose pointing axis reaches the target within ARRIVED deg and stays there until
-the end, for at least half a revolution. `lost` counts bodies that are more than LOST deg from the target at
-the end. The weight of the rotation about that axis is small (WEIGHTS of `orbit_pointing_flight`), so only the
-error of three axes includes it.
+Cells `turn` start 30 to 180 deg off their target (nadir, Sun or an inertial attitude) at a rate of 0.3 deg/s,
+and last 100 min. `arrived` counts bodies whose pointing axis comes within ARRIVED deg of the target and stays
+there until the end, for at least half a revolution. `lost` counts bodies that are more than LOST deg from the
+target at the end. The weight of the rotation about that axis is small (WEIGHTS of `orbit_pointing_flight`),
+so only the error of three axes includes it.
 
 `share` multiplies the torques that the coils cannot cancel immediately: drag, sunlight, and the rotation of
 the principal axes. The residual dipole always has its full magnitude.
@@ -45,8 +45,8 @@ from tests.studies.campaigns.statistics import mean, median, rms
 
 REVOLUTION = 5_700.0
 LOST = 60.0
-"""Angle (deg) from the target at the end of a cell `turn`, or at any time of a cell `hold`, above which a
-body counts as lost.
+"""Angle (deg) from the target above which a body counts as lost, at the end of a cell `turn` or at any time
+of a cell `hold`.
 """
 ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
 """Largest angle (deg) from the target at arrival, by craft; issue 19 permits the lighter KnightCube a

@@ -1,8 +1,8 @@
 """One run of campaign `orbit-pointing`: a craft with its filter, planning job and control law.
 
 The planner worker's job (`pointing_job`) makes the tables. If the target is far, the flight begins with a
-slew, as in the loop; the tables of the pointing law follow. The tables are renewed every REPLAN s, when the
-body leaves its path, and after a body far off its path has been damped
+slew, as in the loop; the tables of the pointing law follow. The tables are renewed in three cases: every
+REPLAN s, when the body leaves its path, and after a body far off its path has been damped
 (`knightcube.gnc.control.pointing_law`). The coils pause for a tenth of every two seconds for the
 magnetometer. Star attitudes are available every 10 s with a delay of two seconds.
 """
@@ -131,8 +131,8 @@ class PointingFlight:
     def _release(self, held: FreeFlight) -> TipOff:
         """Return the initial attitude and rate, as the pointing law requires them.
 
-        If an initial rotation is given, the attitude is rotated from the law's attitude about a random axis,
-        and the rate has a random direction.
+        If an initial rotation is given, the attitude is that of the law rotated about a random axis, and the
+        rate has a random direction.
         """
         way = law_of(self._target, AXES, held.motion.quaternion, held.ephemeris(60.0), 2.0)
         start = references(way, held.ephemeris(60.0), np.array([2.0]))

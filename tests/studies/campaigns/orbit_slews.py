@@ -12,7 +12,7 @@ then.
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
 worker (`pointing_job`). As in flight, the rest of the slew is planned again every EVERY cycles from the
-newest estimate, and less often after plans that do not improve the present plan. Each new path is followed
+newest estimate, but less often after plans that do not improve the present plan. Each new path is followed
 from its start.
 """
 

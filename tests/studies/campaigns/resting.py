@@ -1,9 +1,10 @@
 """Campaigns `resting` and `streaked`: attitudes from frames of cameras that differ from the model.
 
-The frames have each of `imperfections.IMPERFECTIONS`, streaks of 0, 1 and 3 px, an exposure of 0.2 s and the
-priors of a flight. The frames of `streaked` have streaks of 10, 20 and 40 px in the centre, and the rotation
-about the boresight is at most the rotation across it. Their additional cameras have rolling shutters of 0, 20
-and 30 us per row, with known and unknown line time. `supersampled` renders the frames.
+The frames of `resting` have each of `imperfections.IMPERFECTIONS`, and streaks of 0, 1 and 3 px. Exposures
+are 0.2 s, with the priors of a flight. The frames of `streaked` have streaks of 10, 20 and 40 px in the
+centre, and the rotation about the boresight is at most the rotation across it. Their additional cameras have
+rolling shutters of 0, 20 and 30 us per row, with known and unknown line time. `supersampled` renders the
+frames.
 
 The error of an attitude is given in claimed standard deviations (the square root of its NEES). An error of
 more than 6 counts as confidently wrong. A displaced optical axis, or a point spread function with a displaced

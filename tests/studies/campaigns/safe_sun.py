@@ -1,11 +1,12 @@
 """Campaign `safe-sun`: Sun acquisition and pointing in SAFE mode by solar cells, gyro and magnetometer.
 
-Both craft fly alternately in two orbits for two revolutions of 97 min, from a random attitude and a rate of
-0.5 deg/s, at which detumbling ends. Drag, sunlight and the rotation of the principal axes are `share` of the
-worst case; gravity gradient and residual dipole have their full magnitude. The solar cells have gain errors
-and also receive light from the sunlit Earth. `found` is the time at which the axis is first within NEAR deg
-of the Sun. `rms` is the rms angle between axis and Sun in sunlight after SETTLED s, including the time after
-each eclipse. `again` is the longest time from the end of an eclipse until the axis is within NEAR deg.
+Both craft fly alternately in two orbits for two revolutions of 97 min. They start with a random attitude and
+a rate of 0.5 deg/s, at which detumbling ends. Drag, sunlight and the rotation of the principal axes are
+`share` of the worst case; gravity gradient and residual dipole have their full magnitude. The solar cells
+have gain errors and also receive light from the sunlit Earth. `found` is the time at which the axis is first
+within NEAR deg of the Sun. `rms` is the rms angle between axis and Sun in sunlight after SETTLED s, including
+the time after each eclipse. `again` is the longest time from the end of an eclipse until the axis is within
+NEAR deg.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
 Each run has one unknown lens and FRAMES frames of random fields, at rotations of 5 to 30 % of the field in
 0.2 s. The lens differs from its description by its stated standard deviations: 2 px along each axis, 0.5 % of
-distortion and 30 us of line time. In the row `field`, the field of view is up to 5 % wrong; in the row
-`distortion`, it is known to 2 %; in the row `shift`, another lens of the same distribution replaces the lens
-after half of the frames. The frames are drawn by `supersampled`, not by the estimator's model. The prior of
-the rate is the true rate; it gives the sense of rotation, which streaks do not show. The bound is that of an
-exactly known camera.
+distortion and 30 us of line time. In the row `field`, the field of view is up to 5 % wrong. In the row
+`distortion`, the distortion is known to 2 %. In the row `shift`, another lens of the same distribution
+replaces the lens after half of the frames. The frames are drawn by `supersampled`, not by the estimator's
+model. The prior of the rate is the true rate; it gives the sense of rotation, which streaks do not show. The
+bound is that of an exactly known camera.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 Each run is some hours of the demonstration's loop without a break. A new target attitude is commanded every
 50 to 150 s. About once a minute a fault of the catalogue is injected on the device lines for some seconds. A
-command puts isolated axes back into use. Memory and files may not grow beyond their budget, no coil may carry
-more than its limit, and after a last minute without faults the body must point to its target. `--hours 24` is
-four flights of six hours: long enough to show growing memory, and short enough that an interrupted campaign
-loses little.
+command puts isolated axes back into use. Memory and files may not grow beyond their budget, and no coil may
+carry more than its limit. After a last minute without faults, the body must point to its target. `--hours 24`
+is four flights of six hours: long enough to show growing memory, and short enough that an interrupted
+campaign loses little.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def measured_bias(
 
 
 def _nearest(ends: FloatArray, true: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return distance (n,), px, and index of the true streak (m, 2, 2) nearest to each streak (n, 2, 2)."""
+    """Return distance (n,), px, and index of the nearest of the `true` streaks for each streak (n, 2, 2)."""
     distance = np.linalg.norm(true[None] - ends[:, None], axis=-1).max(axis=-1)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     star = distance.argmin(axis=1)

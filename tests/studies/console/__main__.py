@@ -1,8 +1,8 @@
 """Checks in Chromium that the console's page meets its requirements.
 
-The study measures by how much the page lags behind the log, and the memory and processor time of the server
-beside a 40 Hz flight. It checks that a replayed instant shows the same as live, that the browser reports no
-errors and makes no request beyond loopback, and that the status light turns red when telemetry stops.
+The study measures the lag of the page behind the log, and the memory and processor time of the server beside
+a 40 Hz flight. It checks that a replayed instant shows the same as live, that the browser reports no errors
+and makes no request beyond loopback, and that the status light turns red when telemetry stops.
 """
 
 from __future__ import annotations

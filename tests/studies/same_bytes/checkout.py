@@ -81,7 +81,7 @@ def run_python(checkout: Path, *arguments: str, folder: Path | None = None) -> s
 
 
 def cache_folder(root: Path, commit: str, name: str, key: object) -> Path:
-    """Return the cache folder of a commit's run: commit, name, and a hash of key, machine and libraries."""
+    """Return the cache folder of a run: commit, name, and a hash of key, machine and libraries."""
     text = json.dumps([key, _machine(), sys.version, _libraries()])
     return root / commit[:12] / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
