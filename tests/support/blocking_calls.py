@@ -1,9 +1,9 @@
 """Lists the system calls that the control loop's thread makes during a flight.
 
 `python -m tests.support.blocking_calls CONFIG OUT DEVICES` runs a flight on emulated devices in real time.
-The program prints a JSON list of all calls of C functions that may block, each with the product function that
-makes the call. Methods of non-blocking sockets are omitted. Calls at the start and at the end of the flight
-may block, and are omitted too.
+The program prints a JSON list of all calls of C functions that may block; each entry names the product
+function that makes the call. Methods of non-blocking sockets are omitted. Calls at the start and at the end
+of the flight may block, and are omitted too.
 """
 
 from __future__ import annotations

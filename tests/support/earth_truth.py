@@ -48,8 +48,8 @@ def limb_directions(
     """Return unit vectors (count, 3) along the limb, camera axes, and their solar cosines (count,).
 
     The lines of sight touch the ellipsoid that is `height` m above the ellipsoid of WGS 84. If the axes are
-    scaled so that this ellipsoid is the unit sphere, the tangent points q form a circle in the plane q p = 1,
-    where p is the camera's position. Raises ValueError if the camera is inside the ellipsoid.
+    scaled so that this ellipsoid is the unit sphere, the tangent points q form a circle in the plane q . p =
+    1, where p is the camera's position. Raises ValueError if the camera is inside the ellipsoid.
     """
     axes = semi_axes(height)
     origin = scene.in_earth(scene.position) / axes

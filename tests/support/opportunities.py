@@ -29,7 +29,7 @@ DEVICE = "observation opportunities"
 ORBITS = 10
 
 Attitude = Callable[[FloatArray], FloatArray]
-"""Function that returns camera attitudes (m, 4), ICRS to camera, at times (m,), s."""
+"""Function from times (m,), s, to camera attitudes (m, 4), ICRS to camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -208,7 +208,7 @@ def _opportunity(scenario: Scenario, index: int, start: float, exposure: float) 
 def _bisect(
     scenario: Scenario, index: int, low: FloatArray, high: FloatArray, before: BoolArray, precision: float
 ) -> FloatArray:
-    """Return the times (j,), s, between `low` and `high` (j,) at which the object's observability changes."""
+    """Return the times (j,), s, in the intervals `low` to `high` (j,), at which observability changes."""
     while low.size and np.max(high - low) > precision:
         middle = 0.5 * (low + high)
         same = observable(scenario, index, middle) == before

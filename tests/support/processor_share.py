@@ -2,9 +2,9 @@
 
 The kernel enforces the share on one core (CFS bandwidth of the controller `cpu`, cgroup v1 or v2). The period
 is 5 ms, and longer for shares below 20 %, because the kernel grants at least 1 ms per period. Within the
-share, the control process has priority over its workers, as on a board, because it is in a separate group
-with a far greater weight. A limitation by SIGSTOP and SIGCONT would not work, because the flight replaces a
-stopped worker.
+share, the control process has priority over its workers, as on a board: it is in a separate group with a far
+greater weight. A limitation by SIGSTOP and SIGCONT would not work, because the flight replaces a stopped
+worker.
 """
 
 from __future__ import annotations

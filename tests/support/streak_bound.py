@@ -112,8 +112,8 @@ def star_information(
 ) -> FloatArray:
     """Return the Fisher information (8, 8) of one star.
 
-    The parameters are rotation (3), rad, PSF sigma, px, position (2), px, electrons and background. `star`
-    (2,) is the pixel at mid-exposure. Signal off the detector gives no information.
+    The parameters are rotation (3), rad; PSF sigma, px; position (2), px; electrons; background. `star` (2,)
+    is the pixel at mid-exposure. Signal off the detector gives no information.
     """
     ends = paths(pinhole, motion, np.tile(star, (9, 1)), np.linspace(-0.5, 0.5, 9))
     length = float(np.sum(np.hypot(*np.diff(ends.position, axis=0).T)))

@@ -127,7 +127,7 @@ class Sky:
 
 
 Attitudes = Callable[[FloatArray], FloatArray]
-"""Function from times (m,) after mid-exposure, in exposures, to attitudes (m, 4), sky to camera."""
+"""Function from times (m,), in exposures since mid-exposure, to attitudes (m, 4), sky to camera."""
 
 
 def light(

@@ -55,7 +55,7 @@ def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -
 def with_other_body(
     world: Simulation, moments: Sequence[float], axes_deg: float, seed: int, fault: str = ""
 ) -> Simulation:
-    """Return a world with given principal moments (3,), kg m^2, and axes of the body, and a fault."""
+    """Return a world with given principal moments (3,), kg m^2, and axes of the body, and with a fault."""
     body = world.free_body
     assert body is not None
     craft = body.craft or CraftSection()
