@@ -247,7 +247,7 @@ Object = dict[str, Any]
 Body = Literal["testbed", "orbit"]
 """Kind of the controlled body: a body on a thread (testbed), or a satellite in orbit."""
 _FOREIGN = {"testbed": POINT.name, "orbit": SLEW.name}
-"""Command that each kind of body refuses."""
+"""For each kind of body, a command that it refuses."""
 _TENSOR = re.compile(r"(?:[xyz]{2} ){5}[xyz]{2}")
 """Pattern of the component names of a symmetric matrix in the description of a field."""
 _COMPONENTS = {3: list("xyz"), 4: list("xyzw"), 9: [a + b for a in "xyz" for b in "xyz"]}

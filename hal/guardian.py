@@ -329,8 +329,8 @@ class GuardianLine:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Signals to the flight's process group must not reach the guardian. When the flight process
-                # dies, the kernel continues a guardian that a signal had stopped.
+                # Signals to the flight's process group must not reach the guardian. If a signal has stopped
+                # the guardian, the kernel lets it continue when the flight process dies.
                 process_group=0,
             )
         except OSError as error:

@@ -1,9 +1,9 @@
 """The `simulation` section of a configuration: the true properties of the world.
 
-A true constant that the `simulation` section omits is taken from the flight configuration. A constant in the
-section `simulation` makes the world differ from the flight software's model. All values are in SI units
-unless the name of the key states another unit. In `free_body`, each disturbance is given as a multiple of its
-worst case, and zero switches the disturbance off.
+The true value of a constant that the `simulation` section omits is that of the flight configuration. A
+constant in the section `simulation` makes the world differ from the flight software's model. All values are
+in SI units unless the name of the key states another unit. In `free_body`, each disturbance is given as a
+multiple of its worst case, and zero switches the disturbance off.
 """
 
 from __future__ import annotations

@@ -257,7 +257,7 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
             release.end()
         ending = loop.ending()
         late = None
-        with suppress(OSError):  # the emulated devices have ended before the flight
+        with suppress(OSError):  # the emulated devices ended before the flight ended
             late = rig.lateness() if rig.lateness is not None else None
     faults = injected_faults(judged.request, judged.text) if simulated else ()
     folder, error = judged.request.out, opened.log.error()

@@ -24,13 +24,13 @@ by this gain.
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
 far too large or too small, all coils are commanded to zero. If current still flows although zero is
-commanded, there is a fault, and all bridges are braked at once. If braking stops the current, the bridges are
-released one by one. If the current returns when a bridge is released, that bridge is broken. During the
-search for a stuck leg, no healthy coil carries current, and no other fault is diagnosed. The search ends if
-neither commanding zero currents nor braking changes the current, as with a shorted coil or a faulty current
-monitor. If the commands change continuously, as in the windows of B-dot detumbling, the command that was in
-force during an ADC sample is ambiguous. While commands change continuously, all coils are commanded to zero
-every few seconds as a check, even if no fault is suspected.
+commanded, there is a fault, and all bridges are braked at once. If braking stops the current, braking is
+ended bridge by bridge. If the current returns when the braking of a bridge ends, that bridge is broken.
+During the search for a stuck leg, no healthy coil carries current, and no other fault is diagnosed. The
+search ends if neither commanding zero currents nor braking changes the current, as with a shorted coil or a
+faulty current monitor. If the commands change continuously, as in the windows of B-dot detumbling, the
+command that was in force during an ADC sample is ambiguous. While commands change continuously, all coils are
+commanded to zero every few seconds as a check, even if no fault is suspected.
 
 A reversed coil draws the same supply current as a healthy coil, so only the motion of the body can reveal it.
 A coil that rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil

@@ -469,7 +469,7 @@ class ModeControl:
             now_ns: time (ns) of the cycle.
             accurate: whether the estimate is accurate enough for driving the coils.
         """
-        # A body that acquires its attitude needs a known rate; it needs an estimate only for steering.
+        # While its attitude is acquired, a body needs only a known rate, except for steering.
         measured = estimate is not None and accurate
         if self._acquires:
             measured = rate is not None and (measured or estimate is None or self.mode not in STEERING)

@@ -370,7 +370,7 @@ class Gateway:
         return [(line, one) for line, one in self._connections.items() if not one.stream.authenticated]
 
     def _refuse(self, line: socket.socket, reason: str) -> None:
-        """Close and count a connection; closures without the token are reported at most once a second."""
+        """Close and count a connection. Those that sent no token are reported at most once a second."""
         self.refused += 1
         now = time.monotonic()
         if self._connections[line].stream.authenticated or now - self._reported > _REPORT_S:

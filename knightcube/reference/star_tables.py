@@ -206,9 +206,9 @@ def cosine_sigma(cosine: FloatArray, one: FloatArray, other: FloatArray) -> Floa
     """Return the standard deviations (k,) of the cosines of measured angles (Michalski, eq. 26 to 31).
 
     With the covariance R = sigma^2 (I - b b^T) of a direction b (eq. 25b), the variance of eq. 31 becomes
-    (sigma_1^2 + sigma_2^2) sin^2 + sigma_1^2 sigma_2^2 (1 + cos^2). The second term is the trace of R1 R2,
-    which matters only if the angle between two stars is of the order of the direction errors. The standard
-    deviations of the directions are `one` and `other` (k,), rad.
+    (sigma_1^2 + sigma_2^2) sin^2 a + sigma_1^2 sigma_2^2 (1 + cos^2 a) for the angle a. The second term is
+    the trace of R1 R2, which matters only if the angle between two stars is of the order of the direction
+    errors. The standard deviations of the directions are `one` and `other` (k,), rad.
     """
     first, second, square = one**2, other**2, cosine**2
     return np.asarray(np.sqrt((first + second) * (1.0 - square) + first * second * (1.0 + square)))

@@ -163,8 +163,8 @@ def _samples_numpy(
 ) -> tuple[Float32Array, FloatArray]:
     """Return the sampled pixels (down, across, k) of each block, minus the level of larger blocks `coarse`.
 
-    The second returned array (down, across) is the level of the larger blocks at the centre of each block. If
-    `coarse` is empty, the level of the larger blocks is zero. A float32 holds the sum of 16 pixels of 16 bits
+    The second returned array (down, across) is the level of the larger blocks, interpolated to the centre of
+    each block. If `coarse` is empty, this level is zero. A float32 holds the sum of 16 pixels of 16 bits
     exactly.
     """
     values = in_blocks(pixels, down, across, first, stride).astype(np.float32)

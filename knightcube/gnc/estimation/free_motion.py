@@ -88,8 +88,8 @@ def _step_numpy(
 
     The step begins with an attitude (4,) and a rate (3,), rad/s. The commanded dipole of the coils is
     `driven` (3,), A m^2. The sum of the estimated dipole of the coils and the residual dipole is `dipole`
-    (3,), A m^2. The components of the disturbance torques are `sizes` (9,), N m. The vectors `around` are the
-    magnetic field (3,), T, the position (3,), m, and the pressure vectors (1, 3) of air and sunlight, ICRS.
+    (3,), A m^2. The components of the disturbance torques are `sizes` (9,), N m. `around` contains, in ICRS,
+    the magnetic field (3,), T, the position (3,), m, and the pressures of air and sunlight, each (1, 3), Pa.
     `gravity` is the gravitational parameter of the Earth, m^3/s^2.
     """
     inertia, inverse, areas, trace = body

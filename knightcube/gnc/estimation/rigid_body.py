@@ -149,9 +149,9 @@ class RigidBody:
     def torquing(
         self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
     ) -> Torquing:
-        """Return dipole and field for coil currents (3,), A, in a field (3,), T, reference axes.
+        """Return the dipole that coil currents (3,), A, cause, and the field (3,), T, in reference axes.
 
-        The default field is the constant field of the body description.
+        The field is `reference_field`, by default the constant field of the body description.
         """
         x, y, z = np.asarray(currents, dtype=float).tolist()
         field = self.field if reference_field is None else reference_field

@@ -10,7 +10,7 @@ of the first node, the multipliers of the midpoint's equations (7), the state of
 multipliers of the equations at the end of the interval (7). The multipliers of the start conditions precede
 all intervals, and the multipliers of the end conditions follow all intervals. Each equation involves only
 neighbouring elements of this vector, so the Newton matrix is banded and is factored by LAPACK. LAPACK is
-imported only when it is used, because the control process imports this module without solving programs.
+imported only when a program is solved, because the control process imports this module but plans no slews.
 
 The vector of inequalities g >= 0 contains the lower and upper limits of the dipoles (2, k + 1, 3), followed
 by the exclusion cones (cones, 2 k), for k intervals. The interior point method is that of Wachter and Biegler

@@ -636,7 +636,7 @@ class SlewSearch:
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
     def _tried(self, paths: list[SolvedPath]) -> Iterator[SolvedPath]:
-        """Yield the paths; after each trial, reset the cones and the dipole limit of the solver."""
+        """Yield the paths. After the trial of each, cones and dipole limit of the solver are reset."""
         for path in paths:
             yield path
             self._widened, self.solver.share = 0, 1.0

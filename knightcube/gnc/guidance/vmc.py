@@ -243,8 +243,8 @@ class HorizonSearch:
 
 NODES = 24
 """Number of nodes of a path. With 24 nodes, the relative error of the cost is below 1e-4 for durations above
-1.1 times the shortest duration, and an extended duration is at most 1.5 % too long. With 16 nodes, planning
-takes half the time and an extended duration is at most 2.5 % too long."""
+1.1 times the shortest duration. If the requested duration is too short and is extended, the result is at
+most 1.5 % too long. With 16 nodes, planning takes half the time, and the result is at most 2.5 % too long."""
 FINE_NODES = 40
 """Number of nodes for paths that reach the current limit near the requested duration. With 24 nodes,
 a path at the limit costs up to 0.3 % more than the optimal path, and with 40 nodes up to 0.07 %."""

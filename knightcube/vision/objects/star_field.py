@@ -69,7 +69,7 @@ class StarField:
         If fewer than three points match stars of the field, the field is not updated, and all points are
         treated as stars. If three successive frames have fewer than three stars of the field, all stars of
         the field are removed, and the points of the third frame become the new field. The `predicted`
-        attitude (4,) of the camera relative to the field has the standard deviation `sigma`, rad.
+        attitude (4,) of the camera relative to the star field has the standard deviation `sigma`, rad.
         """
         self._frame += 1
         candidates = np.flatnonzero(~found.moving)

@@ -388,7 +388,7 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
     gaps = np.diff(along), np.diff(across)
     steps = np.hypot(*gaps)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
-    # Slope and spacing of the points are interpolated between the middles of adjacent nodes.
+    # Slope and spacing of the path's points are interpolated between the midpoints of adjacent segments.
     middles, slope, spacing = along[:-1] + 0.5 * gaps[0], gaps[1] / gaps[0], steps / np.diff(place)
     away = pixels - path[0]
     u, v = away @ tangent, away @ normal

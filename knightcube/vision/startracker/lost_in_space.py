@@ -481,7 +481,7 @@ def _runs(
     low, high = places[:, :, 0] // FINE, places[:, :, 1] // FINE
     spans = high - low
     here = np.arange(int(spans.max(initial=0)) + 1) <= spans[:, :, None]
-    # The ranges are sorted by observed triangle, because only the first ranges are read.
+    # The order is that of the observed triangles, because a limited number of the first ranges is read.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     cells = low[query] + np.stack([along_short, along_middle], axis=-1)
     form = ((left[query] * CELLS + cells[:, 0]) * CELLS + cells[:, 1]) * (SIZES >> RUN_BITS)

@@ -485,7 +485,7 @@ _TOO_WIDE = 1.5
 
 # Minimum ratio of measured to configured point-spread width for which a second attempt uses a binned frame.
 _BLURRED = 1.2
-# Point-spread width (px) for which the frame of a second attempt is binned.
+# Point-spread width (px) that a star has after the binning of the frame for a second attempt.
 _SECOND_WIDTH = 2.0
 
 

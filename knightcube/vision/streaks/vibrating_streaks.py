@@ -53,7 +53,7 @@ Rotations = Callable[[FloatArray], FloatArray]
 class _Instants(NamedTuple):
     """Instants at which the star of each of b blocks of pixels is near its block: i nodes of a quadrature.
 
-    The instants have the `time` (b, i), in exposures since mid-exposure, and the `weight` (b, i) in the
+    The instants have the `time` (b, i), in exposure times since mid-exposure, and the `weight` (b, i) in the
     integral over the exposure. The positions `place` of the stars include the vibration, the unit tangents
     `tangent` do not; both have the shape (b, i, 2). The array `flow` (b, i, 2, 3), px/rad, is the result of
     `image_flow`. The distances `along` (b, i), px, are along the path from the centre of the block.

@@ -236,7 +236,7 @@ LEAST_RATIO = 0.1
 _CIRCLES_APART = 0.7
 # Mean number of stars per circle in the first search, relative to the number of stars needed.
 _ENOUGH = 4.0
-# Mean number of compared stars within the distance `least` of a star, as a multiple of `rank`.
+# Number of stars that are compared with each star, on average, as a multiple of `rank`.
 _BRIGHTER = 2.0
 
 
@@ -276,10 +276,10 @@ class TriangleIndex:
 
     @cached_property
     def table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The arrays entry, corners and below, contiguous and read-only, and the layout (6,) of entries.
+        """The arrays entry, corners and below, contiguous and read-only, and the parameters (6,) of entries.
 
-        The layout is `CELLS`, `SIZES`, `OCTAVE`, `RUN_BITS`, and the minimum and maximum of all longest
-        sides.
+        The parameters are `CELLS`, `SIZES`, `OCTAVE` and `RUN_BITS`, and the minimum and maximum of the
+        encoded longest sides of all triangles.
         """
         size = self.entry >> np.uint32(16)
         limits = (int(size.min()), int(size.max())) if len(size) else (0, 0)
