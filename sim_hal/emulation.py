@@ -95,6 +95,7 @@ class EmulatedWires:
         line = self.lines.get(device)
         if not isinstance(line, EmulatedSerialLine):
             raise NotResponding(device, "no emulated device is connected to this line")
+        line.host.open()
         line.host.set_baud_rate(baud_rate)
         return line.host
 

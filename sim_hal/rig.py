@@ -428,6 +428,8 @@ class ServedWires:
         """Return the serial port of an emulated device. Raises NotResponding."""
         if device not in self._lines:
             raise NotResponding(device, "no emulated device is connected to this line")
+        if device in self._open and self._open[device].closed:
+            del self._open[device]
         port: PySerialPort = self._kept(
             device, lambda: PySerialPort(self._lines[device], baud_rate, self._clock)
         )

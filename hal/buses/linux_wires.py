@@ -130,6 +130,11 @@ class PySerialPort:
         except _PORT_ERRORS as error:
             raise NotResponding(self._device, f"does not support {baud_rate} baud ({error})") from error
 
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._closing.is_set()
+
     def close(self) -> None:
         """Stop the thread and close the port. Calling `close` again has no effect."""
         if self._closing.is_set():
@@ -481,7 +486,7 @@ class LinuxWires:
 
     def serial(self, device: str, baud_rate: int) -> PySerialPort:
         """Return the serial port of a device file. Raises NotResponding if the port cannot be opened."""
-        if device not in self._ports:
+        if device not in self._ports or self._ports[device].closed:
             self._ports[device] = PySerialPort(device, baud_rate, self._clock, self._patient)
             self._stack.callback(self._ports[device].close)
         return self._ports[device]

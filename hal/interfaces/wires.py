@@ -136,8 +136,8 @@ class SpiDevice(Protocol):
 class Wires(Protocol):
     """Connections to real or emulated devices, opened by name.
 
-    A second request for a connection returns the open connection, and all connections are closed at the end
-    of the flight.
+    A second request for a connection returns the open connection, or opens a serial port again that its
+    driver has closed. All connections are closed at the end of the flight.
     """
 
     def serial(self, device: str, baud_rate: int) -> SerialPort:

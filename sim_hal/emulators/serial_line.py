@@ -190,12 +190,13 @@ class HostEnd:
     Attributes:
         baud_rate: baud rate of this end, bits per second.
         unplugged: whether the cable is unplugged.
+        closed: whether the host has closed the port.
         rejected_rate: baud rate that the port does not support, or 0.
     """
 
     def __init__(self, line: EmulatedSerialLine, now_ns: Callable[[], int], baud_rate: int) -> None:
         self.baud_rate = baud_rate
-        self.unplugged = False
+        self.unplugged = self.closed = False
         self.rejected_rate = 0
         self._line, self._now_ns = line, now_ns
 
@@ -215,12 +216,18 @@ class HostEnd:
         if baud_rate == self.rejected_rate:
             raise NotResponding("serial line", f"does not support {baud_rate} baud")
 
+    def open(self) -> None:
+        """Open a closed port; bytes that arrived while it was closed are lost."""
+        if self.closed:
+            self.closed = False
+            self._line.to_host.pull(self._now_ns())
+
     def close(self) -> None:
-        """Close the port, with the same effect as unplugging the cable."""
-        self.unplugged = True
+        """Close the port."""
+        self.closed = True
 
     def _check(self) -> None:
-        if self.unplugged:
+        if self.unplugged or self.closed:
             raise NotResponding("serial line", "the port is closed or unplugged")
 
 

@@ -30,6 +30,7 @@ from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators import power
 from sim_hal.emulators.gps import GpsErrors
 from sim_hal.emulators.power import SolarCellsModel
+from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
 from sim_hal.settings import FaultEntry, SkySection
@@ -343,6 +344,23 @@ def test_a_slow_start_shifts_no_device_in_time() -> None:
     longitude, latitude, _ = geodetic(celestial_to_terrestrial(truth.utc) @ truth.position)
     assert seen.longitude * 1e-7 == pytest.approx(math.degrees(longitude), abs=1e-3)
     assert seen.latitude * 1e-7 == pytest.approx(math.degrees(latitude), abs=1e-3), "0.5 s are 0.034 deg"
+
+
+def test_an_emulated_port_that_its_driver_has_closed_is_opened_again() -> None:
+    clock = itertools.count(0, SECOND_NS)
+    wires = EmulatedWires(clock.__next__, 1, orbit_config().coils.bus)
+    assemble(orbit_config(), orbit_world(), clock.__next__, wires)
+    gps = orbit_config().gps
+    assert gps is not None
+    port, line = wires.serial(gps.device, gps.baud_rate), wires.lines[gps.device]
+    assert isinstance(line, EmulatedSerialLine)
+    port.close()
+    with pytest.raises(NotResponding, match="closed"):
+        port.receive()
+    line.device.write(b"lost", next(clock))
+    again = wires.serial(gps.device, gps.baud_rate)
+    line.device.write(b"again", next(clock))
+    assert b"".join(data for _, data in again.receive()) == b"again"
 
 
 @pytest.mark.parametrize("in_lamplight", [False, True])

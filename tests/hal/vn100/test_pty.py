@@ -11,7 +11,7 @@ import sys
 import termios
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ import serial
 
 from flight.schema.sections import CONTROL_RATE_HZ
 from hal.buses import linux_wires
-from hal.buses.linux_wires import PySerialPort
+from hal.buses.linux_wires import LinuxWires, PySerialPort
 from hal.buses.system import SystemClock
 from hal.drivers.vn100 import Vn100
 from hal.interfaces.devices import ImuReading
@@ -28,6 +28,7 @@ from hal.interfaces.errors import CorruptData, NotResponding, OutputFull
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.quaternion import angle_about_axis_y
 from sim_hal.emulators.serial_line import PtyLine
+from sim_hal.rig import ServedWires
 from tests.hal.vn100.bench_line import MISSION
 
 COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "vn100"]
@@ -141,6 +142,31 @@ class Cable:
 
     def plug(self) -> None:
         self.name.symlink_to(os.ttyname(self.second[1]))
+
+
+@pytest.mark.parametrize("served", [False, True])
+def test_a_port_that_its_driver_has_closed_is_opened_again(served: bool) -> None:
+    """A probe closes the port before the flight opens it."""
+    near, far = os.openpty()
+    clock, name = SystemClock(), os.ttyname(far)
+    with ExitStack() as stack:
+        wires = (
+            ServedWires(clock, Path(), {name: name}, "/dev/i2c-1", stack)
+            if served
+            else LinuxWires(clock, stack, "/dev/i2c-1")
+        )
+        first = wires.serial(name, 9600)
+        assert wires.serial(name, 9600) is first, "an open port is not opened twice"
+        first.close()
+        again = wires.serial(name, 9600)
+        os.write(near, b"again")
+        received = b""
+        while len(received) < 5:
+            clock.sleep_until_ns(clock.now_ns() + 1_000_000)
+            received += b"".join(data for _, data in again.receive())
+        assert received == b"again"
+    os.close(near)
+    os.close(far)
 
 
 def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(cable: Cable) -> None:
