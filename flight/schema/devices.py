@@ -678,6 +678,12 @@ def nothing(_: Any) -> tuple[()]:
     return ()
 
 
+def _own_file(section: Any) -> Sequence[str]:
+    """Return the device file in the key `device` of a section, if it has this key."""
+    device = getattr(section, "device", None)
+    return (device,) if isinstance(device, str) else ()
+
+
 def later(named: str) -> Callable[..., Any]:
     """Return a function that imports the function `module:function` at its first call, and calls it.
 
@@ -709,7 +715,8 @@ class Driver:
             device to the emulated wires, and returns the device. A camera driver needs no function `emulate`,
             because the simulator emulates the cameras of all drivers. Any other device without this function
             can only be used on hardware.
-        files: function that returns the device files that the section names.
+        files: function that returns the device files that the section names, which a service on a board may
+            open; by default the file in the key `device`, if the section has this key.
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils
             off in any state of the chips; the guardian executes these writes if the flight process fails.
@@ -721,7 +728,7 @@ class Driver:
     open: Callable[[Rig, Any], Any]
     probe: Callable[[Rig, Any], str]
     emulate: Callable[[Any, Any], Any] | None = None
-    files: Callable[[Any], Sequence[str]] = nothing
+    files: Callable[[Any], Sequence[str]] = _own_file
     check: Callable[[Any], object] = nothing
     off: Callable[[Any], Sequence[tuple[int, int, int]]] = nothing
     addresses: tuple[int, int] = (0, 0x7F)

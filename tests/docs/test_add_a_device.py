@@ -14,6 +14,7 @@ import pytest
 
 from flight.__main__ import main
 from flight.schema import reader
+from flight.schema.devices import Driver, UnitSection, later
 from flight.schema.document import MODULES, ConfigError
 from ground.telemetry import read_run
 from hal.interfaces import devices, wires
@@ -87,6 +88,20 @@ def test_the_interfaces_of_the_page_are_those_of_the_code() -> None:
         ), interface
         for name, parameters in re.findall(r"`([A-Z]\w+)\(([^`]*)\)`", results):
             assert [*inspect.signature(getattr(devices, name)).parameters] == _words(parameters), name
+
+
+class _Gyro(UnitSection, frozen=True, kw_only=True):
+    """Section of a unit on a serial line, whose registration names no files."""
+
+    device: str = "/dev/ttyS7"
+
+
+def test_a_device_file_in_the_key_device_is_registered_without_a_function() -> None:
+    function = later("module:function")
+    named = Driver("inertial_unit", _Gyro, function, function)
+    assert [*named.files(_Gyro(device="/dev/ttyS3"))] == ["/dev/ttyS3"]
+    without = Driver("inertial_unit", UnitSection, function, function)
+    assert [*without.files(UnitSection())] == [], "it has no such key"
 
 
 def _words(text: str) -> list[str]:
