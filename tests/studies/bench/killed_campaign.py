@@ -145,7 +145,7 @@ class UserCampaign:
 def killed(
     folder: Path, runs: int, duration: float, kills: int, seed: int, dask: bool = False
 ) -> dict[str, Comparison]:
-    """Return the comparison of the killed campaign, and that on a cluster if `dask` is true."""
+    """Return the comparison of the killed campaign and, if `dask` is true, of the campaign on a cluster."""
     chance = np.random.default_rng(seed)
     whole = UserCampaign(folder / "whole", runs, duration)
     expected = whole.finish()

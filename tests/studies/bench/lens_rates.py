@@ -34,7 +34,7 @@ _CALIBRATED = CameraKnowledge(focal_length=2e-4, centre=0.2, distortion=2e-4)
 
 
 def lens_of(camera: StarCameraModel, optics: Optics) -> Lens:
-    """Return the lens that images like the renderer's optics."""
+    """Return the lens model that is equivalent to the optics of the renderer."""
     pinhole = camera.pinhole
     square = (math.hypot(*pinhole.centre) / pinhole.focal_length) ** 2
     centre = pinhole.centre[0] + optics.offset[0], pinhole.centre[1] + optics.offset[1]

@@ -1,6 +1,6 @@
 """Processor time of a flight in lock-step.
 
-The command simulates the first seconds of config/orbit.yaml, from the tip-off to pointing, or of another
+The command simulates the first seconds of config/orbit.yaml (from the tip-off to pointing) or of another
 configuration. It reads the processor time of a control cycle and of the workers' jobs from the log. The time
 of a cycle includes the emulated devices on the coils' bus, but not the jobs. On a slow machine, times are
 scaled to those of a standard machine.

@@ -109,7 +109,7 @@ def judge(flown: Run, entry: FaultEntry) -> Result:
 
 
 def estimate_beyond(flown: Run) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], FloatArray]:
-    """Return whether the error exceeds the limit at each cycle with an estimate, and the times (s)."""
+    """Return, for each cycle with an estimate, whether the error exceeds the limit, and its time (s)."""
     control, truth = flown["control"], flown["truth"]
     known = np.isfinite(control["rate"])
     control = control[known]

@@ -55,7 +55,7 @@ OWN_OF_KIND: dict[str, frozenset[str]] = {
     "imu: intermittent": OWN["imu"] | {"stream-poor"},
     "imu: cut": OWN["imu"] | {"stream-poor"},
 }
-"""Events that report a fault, for the kinds of fault that differ from the entries of `OWN`."""
+"""Events that report a fault, for kinds of fault whose events differ from those of their part in `OWN`."""
 
 REACTION: Mapping[str, str] = {
     "imu": "control-lost",
@@ -92,8 +92,7 @@ DRIVEN = 6.0e-3
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
 """Largest absolute (A) and relative differences, due to noise, of two readings of the same current."""
 LOOKED_FROM, LOOKED = 2.0, 3.0
-"""Time (s) from which the monitor's mean is complete, and time (s) after a bit flip within which an effect
-is expected.
+"""Start (s) of the monitor's complete mean, and longest time (s) from a bit flip to its effect.
 """
 FEW = 3
 """Largest difference in the number of IMU samples that does not count as an effect."""

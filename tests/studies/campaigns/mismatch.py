@@ -167,7 +167,7 @@ def mean_rate(attitudes: Attitudes, exposure: float) -> FloatArray:
 def seen_stars(
     camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float
 ) -> tuple[IntArray, int]:
-    """Return the stars that may contribute to the frame, and the number of usable ones."""
+    """Return the stars that may contribute to the frame, and the number of usable stars."""
     vectors = np.einsum("tij,nj->tni", attitude_matrix(attitudes(np.array([-0.5, 0.0, 0.5]))), sky.directions)
     reach = np.cos(camera.pinhole.half_diagonal + 0.4 * camera.field_of_view)
     near = np.flatnonzero(vectors[1, :, 2] > reach)

@@ -33,7 +33,7 @@ from tests.studies.campaigns.fault_judgement import (
 FIELD_GRACE = 8.2
 """Longest time (s) to zero current after the last valid field.
 
-The detumbler predicts the field for `SILENT_PERIODS` periods of the schedule in config/orbit.yaml, 8 s.
+The detumbler predicts the field for `SILENT_PERIODS` periods (8 s) of the schedule in config/orbit.yaml.
 """
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 """Largest errors of an acceptable attitude, in claimed standard deviations and in rad."""

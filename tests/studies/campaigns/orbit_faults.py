@@ -5,9 +5,9 @@ fault on the device lines, at a random time and for a random duration; faults of
 end. Some runs have a wrong initial condition instead: an element set that is a week old, no element set, or a
 wall clock that is wrong from the start. The campaign checks whether a specific event reported the fault, and
 whether the body meets the requirements of its mode at the end. It checks the current of coils that were
-driven without valid readings, field or attitude, each separately. It also checks for how long the coils were
-driven by an attitude whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an
-unused part (a coil that is not driven, a camera that is idle) counts as not exercised.
+driven without valid readings, without a valid field, or without a valid attitude. It also checks for how long
+the coils were driven by an attitude whose error exceeded both five claimed standard deviations and 0.1 deg. A
+fault of an unused part (a coil that is not driven, a camera that is idle) counts as not exercised.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ def unknown_body(craft: str, seed: int) -> DescriptionErrors:
 
 
 def _stars(passed: Sequence[bool]) -> Result:
-    """Return the numbers of star attitudes and of rejected ones, and the largest number rejected in a row."""
+    """Return the numbers of all and of rejected star attitudes, and the largest number rejected in a row."""
     longest = row = 0
     for one in passed:
         row = 0 if one else row + 1

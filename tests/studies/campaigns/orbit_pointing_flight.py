@@ -3,8 +3,8 @@
 The planner worker's job (`pointing_job`) makes the tables. If the target is far, the flight begins with a
 slew, as in the loop; the tables of the pointing law follow. The tables are renewed in three cases: every
 REPLAN s, when the body leaves its path, and after a body far off its path has been damped
-(`knightcube.gnc.control.pointing_law`). The coils pause for a tenth of every two seconds for the
-magnetometer. Star attitudes are available every 10 s with a delay of two seconds.
+(`knightcube.gnc.control.pointing_law`). The coils pause for 0.2 s in every 2 s for the magnetometer. Star
+attitudes are available every 10 s with a delay of two seconds.
 """
 
 from __future__ import annotations

@@ -219,8 +219,7 @@ def _inertial(quaternion: FloatArray) -> PointingTarget:
 def cases(runs: int, seed: int) -> list[Case]:
     """Return `runs` flights of each craft and kind of body, alternately in two orbits.
 
-    The kinds of bodies are a body as configured, with each of `SHARES` of the worst disturbances, and an
-    unknown body.
+    A body is as configured, with each of `SHARES` of the worst disturbances, or unknown.
     """
     bodies: list[tuple[str, dict[str, Any]]] = [(str(share), {"share": share}) for share in SHARES]
     bodies.append(("unknown", {"share": UNKNOWN_SHARE, "unknown": True, "learn": FIRST}))

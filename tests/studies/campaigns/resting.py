@@ -1,9 +1,9 @@
 """Campaigns `resting` and `streaked`: attitudes from frames of cameras that differ from the model.
 
 The frames of `resting` have each of `imperfections.IMPERFECTIONS`, and streaks of 0, 1 and 3 px. Exposures
-are 0.2 s, with the priors of a flight. The frames of `streaked` have streaks of 10, 20 and 40 px in the
-centre, and the rotation about the boresight is at most the rotation across it. Their additional cameras have
-rolling shutters of 0, 20 and 30 us per row, with known and unknown line time. `supersampled` renders the
+last 0.2 s, and the priors are those of a flight. The frames of `streaked` have streaks of 10, 20 and 40 px in
+the centre, and the rotation about the boresight is at most the rotation across it. Their additional cameras
+have rolling shutters of 0, 20 and 30 us per row, with known and unknown line time. `supersampled` renders the
 frames.
 
 The error of an attitude is given in claimed standard deviations (the square root of its NEES). An error of
@@ -93,9 +93,9 @@ def streaked_run(case: Case) -> Result:
 
 
 def look_at(case: Case, imperfection: Imperfection, about: float) -> Result:
-    """Solve one frame whose stars move by `trail` px in its centre, and evaluate its attitude.
+    """Solve one frame in which stars at the centre move by `trail` px, and evaluate its attitude.
 
-    The rotation about the boresight is up to `about` times that across it.
+    The rotation about the boresight is up to `about` times the rotation across it.
     """
     rng, trail = np.random.default_rng(case.seed), case.parameters["trail"]
     middle, way = normalise(rng.normal(size=4)), rng.uniform(0.0, 2.0 * np.pi)

@@ -118,7 +118,7 @@ def config_for(rng: np.random.Generator, seconds: float, cleared: tuple[CommandS
 
 @contextmanager
 def without_what_is_there() -> Iterator[None]:
-    """Exclude the present objects from garbage collection, which would take longer than the flight."""
+    """Exclude present objects from garbage collection, which would last longer than the flight."""
     gc.freeze()
     try:
         yield

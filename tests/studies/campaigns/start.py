@@ -7,9 +7,9 @@ after and before the opening of the configuration alternate as long as both rema
 before the opening only read modules. With as many runs as points, the campaign covers the whole list.
 
 A case is a board whose emulated devices run in a separate process. The flight of the board starts repeatedly,
-each time with one point. The campaign replaces the service manager: it restarts a process that ends, without
-the fault, unless its exit status is 78. With that status the board would stay grounded, which must not
-happen.
+each time with one point. The campaign replaces the service manager: if a process ends, it is restarted
+without the fault, unless its exit status is 78. With that status the board would stay grounded, which must
+not happen.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A cell is one theta (axis to boresight) and one rotation in percent of the field (3.28). All estimators get
 the same frames. The error of the magnitude is the thesis's metric for the rate. The error of the vector has
 its own column; it is larger, because the component about the boresight is poorly determined. The attitude at
-an end of the exposure is computed by ESOQ2 with the true identifications. Its error is given in px by 3.29,
-across the boresight and in total.
+an end of the exposure is computed by ESOQ2 with the true identifications. Its error is given in px (eq.
+3.29), across the boresight and in total.
 
 `streaks-thesis` has the thesis's camera, bilinear spots and uniform noise (2.5-2.11). The bound, given for
 comparison, is that of a camera with Poisson noise. As in the thesis (3.28), the camera rotates at 0.05 rad/s,

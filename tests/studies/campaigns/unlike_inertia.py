@@ -5,8 +5,8 @@ magnetometer differ from the configuration by at most the accuracies that the co
 has one of two phases. In the phase `tumble`, the satellite is released at 10 deg/s and detumbled. In the
 phase `slow`, it is released at 0.2 deg/s, rotates to the Sun and holds this attitude. The coils are then
 driven so little that only the self-test can find a fault. The self-test runs every minute, ten times as often
-as by default. The cameras are left out, because a tumble does not use the cameras, and rendering would cost
-most of the time. In the phase `slow`, the solar cells and the magnetometer give the attitude.
+as by default. The cameras are left out, because a tumble does not use them, and rendering would cost most of
+the time. In the phase `slow`, the solar cells and the magnetometer give the attitude.
 
 The coils are healthy, or one of them becomes reversed or open at a random time in the first ten seconds. The
 log shows which healthy coils were suspected, isolated or corrected, and how long after its onset the fault
