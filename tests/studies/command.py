@@ -87,7 +87,7 @@ def say(**facts: Any) -> None:
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Yield an empty folder that the end of the block removes."""
+    """Yield an empty folder that is removed at the end of the block."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as folder:
         yield Path(folder)
 

@@ -53,7 +53,7 @@ _FIRST, _LAST = 400, 440
 class Piece:
     """A file, class or function with its length in lines.
 
-    `excused` is true if its docstring gives a reason for the length.
+    `excused` is true if the docstring of the piece gives a reason for its length.
     """
 
     kind: str
@@ -97,7 +97,7 @@ def _definitions(node: ast.AST, place: str) -> Iterator[Piece]:
 
 
 class Touched:
-    """Recorder of the product's files whose functions a measured block calls, relative to `ROOT`."""
+    """Recorder of the product files (relative to `ROOT`) whose functions a measured block calls."""
 
     def __init__(self) -> None:
         self.files: set[str] = set()

@@ -237,7 +237,7 @@ def _changes(node: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str, ast.AST 
 
 
 def _other(value: float) -> str:
-    """Return another value of the same type; adding 1 ns to 2 s would have no effect."""
+    """Return a value of the same type that differs enough; adding 1 ns to 2 s would have no effect."""
     if isinstance(value, bool):
         return str(not value)
     if isinstance(value, int):

@@ -1,4 +1,4 @@
-"""Draws an object's pass that a satellite followed, from a log.
+"""Draws the pass of an object that a satellite followed, from a flight log.
 
 The frame is rendered with the attitude that the flight estimated and the object position of its track.
 """

@@ -147,7 +147,7 @@ def test_killed_survived_and_equivalent(
 
 
 def test_a_hang_is_killed(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time limit kills a mutant whose loop never ends, in a test file other than that of the module."""
+    """The time limit kills a mutant with an endless loop, in a test file other than that of the module."""
     monkeypatch.setattr(mutants, "LIMIT_S", 3.0)
     found = mutants_of(PRODUCT, "knightcube/product.py")
     [endless] = [mutant for mutant in found if mutant.text == "(number >= 0)"]

@@ -27,7 +27,7 @@ def test_attitudes_of_the_model_s_own_camera_are_known_as_well_as_they_claim(tmp
     json.dumps(facts, allow_nan=False)
     own = facts["all"]
     assert own["attitudes"] == own["frames"] == 12
-    # The 99.9 % interval of chi-square(36) / 12 is within 1.1 and 5.9.
+    # The 99.9 % interval of chi-square(36) / 12 lies between 1.1 and 5.9.
     assert 1.1 < own["nees"] < 5.9
     assert own["worst"] < np.sqrt(bound(1e-4, 3))
     assert own["claim"] < 0.004

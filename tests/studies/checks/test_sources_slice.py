@@ -15,7 +15,7 @@ SEED = 77
 
 
 def test_image_matching_reaches_the_q_method_and_a_wrong_prior_needs_further_steps() -> None:
-    """In three lists per cell, a prior error of 5 deg has no effect after four steps, but has after one."""
+    """In three lists per cell, a prior error of 5 deg has an effect after one step, but none after four."""
     head, *rows = sources.image_matching_errors(3, SEED)
     assert head[-1] == "4 steps"
     assert [row[1] for row in rows] == 2 * ["0.01", "0.1", "1", "5"]

@@ -1,7 +1,7 @@
 """Runs a slice of the campaign `unknown-body`: a KnightCube from a slow tumble to the start of its slew.
 
-The limits are the requirements, widened by the scatter that few samples of a filter with correct covariance
-have.
+The limits are the requirements plus the scatter that even a filter with correct covariance has over few
+samples.
 """
 
 from __future__ import annotations

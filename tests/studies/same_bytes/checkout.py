@@ -26,7 +26,7 @@ sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(fin
 
 
 class CheckoutError(UsageError):
-    """Error for a revision that cannot be checked out, or a process in a checkout that failed."""
+    """Error for a revision that cannot be checked out, or for a failed process in a checkout."""
 
 
 def repository() -> Path:

@@ -115,8 +115,8 @@ FLIGHTS: tuple[Run, ...] = (
         *("bus: nack @ 12 for 4", "pwm: brown-out @ 25", "monitor: bits @ 30 for 10", "bus: hang @ 48 for 3"),
     ),
     # The KnightCube starts at 0.6 deg/s. Its flight has streak rates, detumbling, attitude acquisition, slews
-    # to Sun and nadir that avoid exclusion cones, the Earth in star frames, and Sun and limb in the horizon
-    # cameras. GPS and a camera fail for a time.
+    # to Sun and nadir that avoid exclusion cones, star frames with the Earth, and horizon frames with Sun and
+    # limb. GPS and a camera fail for a time.
     Run(
         "orbit",
         flight="config/orbit.yaml --duration 240"
