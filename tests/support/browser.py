@@ -66,7 +66,7 @@ class Page:
         return float(time), values
 
     def fill(self, name: str, **values: str) -> None:
-        """Select a command, and fill in its form. The values are given by the names of the inputs."""
+        """Select a command, and fill in its form. The values are given by the name of their input."""
         self.page.select_option("#which", name)
         for label, value in values.items():
             self.fill_one(label, value)

@@ -18,7 +18,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
 
 compiles = True
-"""Whether implementations are also compiled and compared."""
+"""Whether compiled implementations are also compared."""
 compiling_s = 0.0
 """Processor time (s) that the compiled implementations have taken in this process."""
 

@@ -37,7 +37,7 @@ class Pass:
 
 
 def a_pass(rng: np.random.Generator, rate: float, times: FloatArray, before: float) -> Pass:
-    """Return a pass with its closest approach, at `rate` (rad/s), `before` s after its start."""
+    """Return a pass; its closest approach, at `rate` (rad/s), is `before` s after its start."""
     radius = 6.878e6
     place = np.array([radius, 0.0, 0.0])
     velocity = np.array([0.0, np.sqrt(EARTH / radius), 0.0])

@@ -208,7 +208,7 @@ def _opportunity(scenario: Scenario, index: int, start: float, exposure: float) 
 def _bisect(
     scenario: Scenario, index: int, low: FloatArray, high: FloatArray, before: BoolArray, precision: float
 ) -> FloatArray:
-    """Return the times (j,), s, in the intervals `low` to `high` (j,), at which observability changes."""
+    """Return the times (j,), s, at which observability changes, one in each interval `low` to `high`."""
     while low.size and np.max(high - low) > precision:
         middle = 0.5 * (low + high)
         same = observable(scenario, index, middle) == before

@@ -81,7 +81,7 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """Use of a limited control group: periods (throttled, total), memory (bytes), and times at its limit.
+    """Resource use of a control group: periods (total, throttled), memory (bytes), hits of its limit.
 
     The memory is NaN if the kernel is older than Linux 5.19, in which cgroup v2 does not record the largest
     use.

@@ -127,7 +127,7 @@ def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0,
 def feasible_problems(
     count: int, seed: int, share: tuple[float, float] = (1.1, 2.5)
 ) -> list[tuple[Problem, float]]:
-    """Return slews that last `share` times their shortest feasible duration, which is also returned (s).
+    """Return slews of `share` times their shortest feasible duration, and these shortest durations (s).
 
     A third of the plants has no suspension thread; the others have a thread of one of two stiffnesses. Half
     of the plants have a disturbance, and half of the slews end with a rate.

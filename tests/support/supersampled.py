@@ -195,7 +195,7 @@ def _reach(radius: float) -> int:
 def _lay(grid: Cells, pinhole: Pinhole, edge: int, place: FloatArray, weight: FloatArray) -> None:
     """Add points of light to a grid that extends `edge` cells beyond the detector.
 
-    Each point is shared by the four nearest cells, and by the two layers nearest in radius.
+    Each point is distributed over the four nearest cells, and over the two layers nearest in radius.
     """
     cell = CELLS * (place + 0.5) - 0.5 + edge
     corner = np.floor(cell).astype(np.int64)

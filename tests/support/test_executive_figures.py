@@ -26,7 +26,10 @@ _IN_TIME = np.full(12, 100_000)
 
 
 def _grid(late_ns: npt.ArrayLike) -> Grid:
-    """Return a loop with a given lateness at each slot. A lateness above one period skips the next slot."""
+    """Return a loop with a given lateness at each slot.
+
+    If a slot is more than a period late, the next slot is skipped.
+    """
     late = np.asarray(late_ns, dtype=np.int64)
     starts = np.maximum.accumulate((FIRST + np.arange(len(late))) * PERIOD_NS + late)
     return on_grid(np.unique(starts), PERIOD_NS, FIRST, len(late))

@@ -1,4 +1,4 @@
-"""Tests that the sensors of three satellites are mounted as in the paper, and wrong files are refused."""
+"""Tests that sensors of three satellites are mounted as in the paper, and that wrong files are refused."""
 
 from __future__ import annotations
 
