@@ -289,10 +289,10 @@ of a measured field's direction is about as large, so the predicted field is nea
 field."""
 SHORTEST = 9
 """Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
-PAUSES, DECAYING, LARGEST_CHANGE = 8, 4.0, 25.0
+PAUSES, DECAYING, LARGEST_CHANGE = 8, 4.0, 12.0
 """Number of coil pauses over which the normalised square of the field change during a pause is averaged, mean
-square above which the pauses become longer, and value at which each square is clipped. Noise alone causes a
-mean square of 1."""
+square above which the pauses become longer, and value at which each square is clipped, so that two outliers
+do not lengthen the pauses. Noise alone causes a mean square of 1."""
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 CHANGED = 30.0

@@ -209,6 +209,13 @@ def test_the_pauses_become_longer_if_the_coil_field_decays_slowly() -> None:
     speeds, law = fly(np.array([0.1, 0.05, 0.03]), 240.0, lag=0.5e-9 * SCHEDULE.settle_ns)
     assert speeds[-1] < math.radians(0.5)
     assert law.restarts <= 2
+    assert not law.listens(law.next_pause_ns + SCHEDULE.settle_ns)
+
+
+def test_outliers_do_not_make_the_pauses_longer() -> None:
+    """One sample in 50 is an outlier, so 4 % of the pauses begin or end with an outlier."""
+    _, law = fly(np.array([0.1, 0.05, 0.03]), 150.0, spikes=0.02)
+    assert law.listens(law.next_pause_ns + SCHEDULE.settle_ns)
 
 
 def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
