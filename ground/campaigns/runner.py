@@ -286,7 +286,7 @@ def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
                 if found.get(key) != label.get(key)
             )
             raise UsageError(
-                f"{out} contains a campaign with {differing}: give another folder with --out, or continue "
+                f"{out} contains another campaign ({differing}): give another folder with --out, or continue "
                 "the campaign in this folder with its own options"
             )
     else:

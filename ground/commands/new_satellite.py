@@ -195,6 +195,7 @@ class Answers:
             if not line:
                 raise EOFError
             if not (answer := line.strip() or default):
+                sys.stderr.write("  this value has no default: give one\n")
                 continue
             try:
                 return self._take(question, answer.split() if coils else [answer])

@@ -265,7 +265,9 @@ def test_the_folder_of_another_campaign_is_refused(
 ) -> None:
     fly(TOY, 3, 5, tmp_path)
     in_process.clear()
-    with pytest.raises(UsageError, match=f"campaign with {difference}: give another folder with --out"):
+    with pytest.raises(
+        UsageError, match=rf"another campaign \({difference}\): give another folder with --out"
+    ):
         fly(TOY, **({"runs": 3, "seed": 5} | other), out=tmp_path)
     assert in_process == []
     assert len(results_in(tmp_path)) == 3

@@ -304,12 +304,13 @@ class Terminal(io.StringIO):
 
 def test_on_a_terminal_the_values_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "mine.yaml"
-    answers = ["", "heavy", "4", "3u", "550", "", "", "9.5", "", GIVEN[-1], "none", "no", "5"]
+    answers = ["", "heavy", "", "4", "3u", "550", "", "", "9.5", "", GIVEN[-1], "none", "no", "5"]
     monkeypatch.setattr(sys, "stdin", Terminal("\n".join(answers) + "\n"))
     done = command("new-satellite", "--out", path)
     assert done.returncode == 0, done.stderr
     assert done.stderr.startswith("name of the satellite [my_satellite]: mass, kg: ")
     assert "--mass heavy: give a number from 0.1 to 500 kg" in done.stderr, "asked again"
+    assert "mass, kg:   this value has no default: give one\nmass, kg: " in done.stderr
     asked = path.read_text(encoding="utf-8")
     words = (*GIVEN, "--altitude", "550", "--local-time", "9.5", "--star-camera", "none", "--release", "5")
     other = command("new-satellite", *words, "--horizon-cameras", "no", "--out", tmp_path / "other.yaml")
