@@ -402,7 +402,7 @@ def event_line(event: LoggedEvent, utc: str = "") -> str:
 
 def state_line(state: FlightState) -> str:
     """Return a line with times, mode, attitude, coils, cycle slips, active alarms and faults of a flight."""
-    parts = [f"{state.time:9.3f} s ", state.utc(state.time), state.mode or "mode not known"]
+    parts = [f"{state.time:9.3f} s", state.utc(state.time), state.mode or "mode not known"]
     parts.append(attitude_text(state))
     written, dipole = state.value("control", "current_written"), state.value("attitude", "dipole")
     if written is not None:
