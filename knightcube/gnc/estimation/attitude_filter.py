@@ -13,7 +13,8 @@ the angle and the rate.
 The class `CommandCheck` compares the gyro samples with the commands to check whether the coils carry the
 commanded currents. With a broken coil, the innovations of the gyro become inconsistent with their covariance
 within a few samples. The filter then treats the coil currents, including the currents of the last half
-second, as unknown and follows the gyro. A change of the rate that no coil current can cause is not evidence
+second, as unknown and follows the gyro. The gyro bias may have changed instead, so it counts as unknown, too,
+until attitude measurements determine it. A change of the rate that no coil current can cause is not evidence
 of wrong coil currents, because the gyro may be faulty. The filter uses the commanded currents again when the
 rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the last second, where c
 is the change of the rate that the commands should cause. The commands are confirmed if the response g is well
@@ -406,7 +407,8 @@ class AttitudeFilter:
         self._commands = CommandHistory(body, settings.history_ns)
         self._layout = error_state(body, settings, self._prior)
         noise, gates = process_noise(body, settings, self._layout), gate_bounds(settings.gate_sigma)
-        self._model = PropagationModel(body, noise, self._commands, gates)
+        bias_prior = slow_prior(body, settings).bias_covariance
+        self._model = PropagationModel(body, noise, self._commands, gates, bias_prior)
         self._check = CommandCheck(self._model)
         self._history = CheckpointHistory(settings.history_ns)
         self._branch: _Branch | None = None
@@ -429,17 +431,20 @@ class AttitudeFilter:
         check = self._check
         self._commands.record(max(time_ns, check.ended_ns), currents, field, known and not check.active)
 
-    def mark_unknown(self, since_ns: int) -> None:
+    def mark_unknown(self, since_ns: int, *, gyro: bool = False) -> None:
         """Treat the coil currents recorded since `since_ns` as unknown.
 
-        The filter may have attributed the effect of wrong currents to a disturbance or a change of
-        parameters. The measurements since `since_ns` are therefore applied again, a few at each call of
-        `catch_up`.
+        If `gyro` is true, the gyro bias may also have changed at this time, and counts as unknown until
+        attitude measurements determine it. The filter may have attributed the effect of wrong currents to a
+        disturbance or a change of parameters. The measurements since `since_ns` are therefore applied again,
+        a few at each call of `catch_up`.
         """
         self.catch_up()
-        self._commands.mark_unknown(since_ns)
-        self._refused_in_a_row = {}
         index = max(self._history.index_before(since_ns), 1)
+        if self._history:  # the replay must contain the time of the change
+            since_ns = max(since_ns, self._history[index - 1].time_ns)
+        self._commands.mark_unknown(since_ns, gyro=gyro)
+        self._refused_in_a_row = {}
         again = self._history.measurements_from(index)
         if again:
             base = self._history[index - 1]
@@ -501,7 +506,7 @@ class AttitudeFilter:
         if self._history and self._history.newest.measurement is measurement:
             since_ns = self._check.judge(self._history.newest)
             if since_ns is not None:
-                self.mark_unknown(since_ns)
+                self.mark_unknown(since_ns, gyro=True)
         if self._branch is None:  # the base checkpoint of a branch must not be dropped
             self._history.forget(measurement.time_ns)
         return used

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.errors import ArgumentError, UsageError
 
 
@@ -183,6 +183,15 @@ def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
     among = moved[:, at].dot(turn.T)
     covariance[at], covariance[:, at] = moved, moved.T
     covariance[at, at] = 0.5 * (among + among.T)
+
+
+def widen(covariance: FloatArray, at: IntArray, prior: FloatArray) -> None:
+    """Reset, in place, the covariance of the states with indices `at` (k,) to `prior` (k, k).
+
+    The states count as unknown again, so they are not correlated with any other state.
+    """
+    covariance[at] = covariance[:, at] = 0.0
+    covariance[np.ix_(at, at)] = prior
 
 
 def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: FloatArray) -> None:

@@ -75,6 +75,7 @@ from knightcube.gnc.estimation.error_state import (
     slices,
     updated,
     weigh,
+    widen,
     with_role,
 )
 from knightcube.gnc.estimation.estimate import Knowledge, check_measured
@@ -534,8 +535,7 @@ class FreeFilter:
             values = constants[at]
             dropped = drop & (at >= INERTIA.start) & (at < COILS.stop)
             constants[at] = np.where(plausible(values, prior.diagonal()) & ~dropped, values, 0.0)
-            covariance[at] = covariance[:, at] = 0.0
-            covariance[np.ix_(at, at)] = prior
+            widen(covariance, at, prior)
 
     def _with(self, memories: Sequence[FreeMemory]) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield constant states and covariance of the present estimate, and then of each of its copies."""

@@ -50,9 +50,10 @@ from knightcube.astro.quaternion import (
     twist,
 )
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.gnc.estimation.error_state import direction_error, reset, updated, weigh
+from knightcube.gnc.estimation.error_state import direction_error, reset, updated, weigh, widen
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
+    BIAS,
     FIELD_BIAS,
     LATENCY,
     RATE,
@@ -500,6 +501,11 @@ _EVER_NS = -(1 << 63)
 """Time (ns) before all measurements, from which the oldest stored command applies."""
 
 
+_BIASES = np.arange(BIAS.start, BIAS.stop)
+_GYRO_DOUBTS = 8
+"""Number of stored times at which the gyro bias may have changed."""
+
+
 class CommandHistory:
     """The recent coil commands in order of time.
 
@@ -511,6 +517,7 @@ class CommandHistory:
         self.idle = body.torquing(np.zeros(3))
         self._history_ns = history_ns
         self._times, self._torquings = [_EVER_NS], [self.idle]
+        self._gyro_doubts: deque[int] = deque(maxlen=_GYRO_DOUBTS)
 
     def record(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True
@@ -526,13 +533,19 @@ class CommandHistory:
             del self._times[:oldest], self._torquings[:oldest]
             self._times[0] = _EVER_NS
 
-    def mark_unknown(self, since_ns: int) -> None:
-        """Treat the coil currents since `since_ns` as unknown."""
+    def mark_unknown(self, since_ns: int, *, gyro: bool = False) -> None:
+        """Treat the coil currents since `since_ns` as unknown, and the gyro bias too if `gyro` is true."""
+        if gyro:
+            self._gyro_doubts.append(since_ns)
         first = bisect.bisect_left(self._times, since_ns)
         if first == len(self._times) or self._times[first] > since_ns:
             self._torquings.insert(first, self.at(since_ns))
             self._times.insert(first, since_ns)
         self._torquings[first:] = [torquing._replace(known=False) for torquing in self._torquings[first:]]
+
+    def doubts_gyro(self, from_ns: int, to_ns: int) -> bool:
+        """Return whether the gyro bias may have changed between two times."""
+        return any(from_ns <= time_ns < to_ns for time_ns in self._gyro_doubts)
 
     def at(self, time_ns: int) -> Torquing:
         """Return the coils' dipole and field at a time, as `Torquing`."""
@@ -596,20 +609,25 @@ class PropagationModel:
     """The model that propagates a state: body, process noise, coil commands and gate.
 
     The mapping `gate` assigns the threshold of the normalised squared innovation to each number of measured
-    components. The last steps are stored, because the propagation to the next measurement often repeats a
-    step of the previous estimate.
+    components. After the gyro bias may have changed, it has the covariance `bias_prior` (3, 3). The last
+    steps are stored, because the propagation to the next measurement often repeats a step of the previous
+    estimate.
     """
 
     body: RigidBody
     noise: ProcessNoise
     commands: CommandHistory
     gate: Mapping[int, float]
+    bias_prior: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     _steps: deque[_Step] = field(default_factory=lambda: deque(maxlen=2), compare=False)
 
     def propagate(
         self, state: FilterState, covariance: FloatArray, from_ns: int, to_ns: int
     ) -> tuple[FilterState, FloatArray]:
         """Return state and covariance propagated between two times under the recorded coil commands."""
+        if self.commands.doubts_gyro(from_ns, to_ns):
+            covariance = covariance.copy()
+            widen(covariance, _BIASES, self.bias_prior)
         for torquing, span_ns in self.commands.spans(from_ns, to_ns):
             for step in self._steps:
                 if (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -89,6 +90,25 @@ def test_a_gyro_that_jumps_further_than_any_current_pushes_raises_no_doubt(flown
         filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
     assert filter_.refused > 0
     assert not filter_.doubts_commands
+
+
+def test_a_jump_of_the_gyro_bias_is_estimated() -> None:
+    """A jump like that of wrong currents makes the bias unknown, and the attitudes determine the new bias."""
+    flown, jump = fly(5, END, suspended=True), np.array([0.0, 2e-3, 0.0])
+    filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, bias_start=2e-3))
+    follow(filter_, flown, 1, STUCK)
+    before = filter_.at(STUCK * CYCLE_NS).bias
+    for cycle in range(STUCK, END):
+        filter_.catch_up(16)
+        for sample in flown.samples[cycle]:
+            is_rate = isinstance(sample, RateMeasurement)
+            filter_.measure(dataclasses.replace(sample, rate=sample.rate + jump) if is_rate else sample)
+        filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
+    filter_.catch_up()
+    found = filter_.at((END - 1) * CYCLE_NS)
+    assert filter_.restarts == 0
+    assert found.bias[1] - before[1] == pytest.approx(jump[1], abs=4e-4)
+    assert abs(found.rate[1] - flown.rates[-1, 1]) < 5.0 * math.sqrt(found.covariance[4, 4])
 
 
 def judged(body: RigidBody, departures: list[float]) -> tuple[int, int | None]:
