@@ -41,6 +41,13 @@ def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> F
     return found
 
 
+def check_finite(**given: FloatArray | float) -> None:
+    """Raise ArgumentError, with the name, for an argument that contains NaN or infinity."""
+    for name, value in given.items():
+        if not np.isfinite(value).all():
+            raise ArgumentError(name, f"{brief(np.asarray(value).tolist())}: give finite numbers")
+
+
 def checked_number(name: str, value: float, unit: str) -> float:
     """Return the argument `name` in `unit`. Raises ArgumentError unless it is a positive, finite number."""
     number = real_number(value)

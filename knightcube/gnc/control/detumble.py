@@ -14,14 +14,14 @@ The rate is unambiguous if the body rotates by less than half a revolution per w
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, check_finite, checked_number
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import UsageError
+from knightcube.gnc.estimation.error_state import check_amounts
 from knightcube.gnc.estimation.field_rate import rate_across
 
 MAXIMUM_SHARE = 0.5
@@ -40,9 +40,11 @@ class WindowSchedule:
     act_ns: int
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a window without time to measure the field or to drive the coils."""
-        if self.settle_ns < 0 or self.measure_ns <= 0 or self.act_ns <= 0:
-            raise UsageError(f"detumble window {self}: `measure` and `act` must be above zero")
+        """Raise ArgumentError for a window without time to measure the field or to drive the coils.
+
+        The durations must be whole numbers.
+        """
+        check_amounts(self, "measure_ns", "act_ns")
 
     @property
     def period_ns(self) -> int:
@@ -83,10 +85,7 @@ class DetumblerSettings:
 
     def __post_init__(self) -> None:
         """Raise UsageError for settings out of range."""
-        for name in ("inertia", "dipole_per_ampere", "current_limit", "share"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise UsageError(f"detumble {name} is {value}: it must be finite and positive")
+        check_amounts(self, "inertia", "dipole_per_ampere", "current_limit", "share")
         if self.share >= 1.0:
             raise UsageError(
                 f"detumble share is {self.share}: the fraction of the rate to remove in a window must be "
@@ -110,8 +109,11 @@ def braking_current(
 ) -> FloatArray:
     """Return the currents (3,), A, that reduce a rate (3,), rad/s, across a field (3,), T, in `act_time` s.
 
-    If a coil would exceed its current limit, one factor scales all currents to preserve the direction.
+    If a coil would exceed its current limit, one factor scales all currents to preserve the direction. Raises
+    ArgumentError unless rate and field are finite and the time is positive.
     """
+    check_finite(rate=rate, field=field)
+    checked_number("act_time", act_time, "s")
     square = float(field @ field)
     if square == 0.0:
         return np.zeros(3)
@@ -151,9 +153,9 @@ class Detumbler:
     def sample(self, time_ns: int, field: FloatArray) -> None:
         """Accept a field (3,), T, measured at `time_ns`.
 
-        The sample is ignored unless the coils were off and their field had decayed.
+        The sample is ignored unless it is finite, the coils were off and their field had decayed.
         """
-        if not self.listens(time_ns):
+        if not self.listens(time_ns) or not np.isfinite(field).all():
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:

@@ -57,7 +57,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_matrix, cross_product
+from knightcube.astro.arrays import (
+    FloatArray,
+    brief,
+    check_finite,
+    cross_matrix,
+    cross_product,
+    finite_array,
+    float_rows,
+    unit_vector,
+)
 from knightcube.astro.quaternion import (
     attitude_matrix,
     compose,
@@ -66,7 +75,7 @@ from knightcube.astro.quaternion import (
     matrix,
     times,
 )
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.estimation.error_state import check_amounts
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
@@ -108,10 +117,18 @@ def momentum_plan(
     The predicted field after `times` (n,), s, is `field` (n, 3), T, in the inertial axes of the momentum. The
     mean dipole limit of the body axes is `limit`, A m^2. If the field prediction ends too early, the plan
     removes as much momentum as possible until the end of the prediction. Raises UsageError for fewer than
-    three instants.
+    three instants, and ArgumentError for values that are not finite, for a field that is always zero, for
+    times that do not increase, and for a limit that is not positive.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
+    check_finite(momentum=momentum, field=field, times=times, limit=limit, rest=rest)
+    if not field.any():
+        raise ArgumentError("field", "zero at all instants: give the field in T")
+    if not (np.diff(times) > 0.0).all():
+        raise ArgumentError("times", f"{brief(times.tolist())}: give increasing times in s")
+    if limit <= 0.0:
+        raise ArgumentError("limit", f"{limit}: give a dipole limit above zero A m^2")
     size = math.sqrt(float(momentum @ momentum))
     if size <= rest:
         return MomentumPlan(np.zeros(3), 0.0)
@@ -181,10 +198,9 @@ def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> 
     """Return the predicted field (n, 3), T, after `times` (n,), s, if the field rotates at its present rate.
 
     The field (3,), T, and the time derivative `change` (3,), T/s, of the field are in inertial axes. The
-    field strength is assumed to be constant.
+    field strength is assumed to be constant. Raises ArgumentError for a field that is zero or not finite.
     """
-    strength = math.sqrt(float(field @ field))
-    along = field / strength
+    along, strength = unit_vector("field", field), math.sqrt(float(field @ field))
     across = change - along * float(along @ change)
     speed = math.sqrt(float(across @ across)) / strength
     if speed == 0.0:
@@ -196,10 +212,10 @@ def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> 
 def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     """Return `fields` (n, 3), rotated so that the first predicted field has the direction of `field` (3,).
 
-    The measured field is more accurate than fields predicted with a coarse attitude.
+    The measured field is more accurate than fields predicted with a coarse attitude. Raises ArgumentError for
+    a field that is zero or not finite.
     """
-    first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
-    wanted = field / math.sqrt(float(field @ field))
+    first, wanted = unit_vector("fields", fields[0]), unit_vector("field", field)
     middle = first + wanted
     square = float(middle @ middle)
     if square < 1.0:  # a predicted direction with an error of more than 120 deg is not corrected
@@ -440,13 +456,13 @@ class FieldDetumbler:
         The argument `rate` (3,), rad/s, is the gyro rate measured at the same time, or None. The sample may
         be older than the last command.
         """
-        age_ns = self._time_ns - time_ns
+        age_ns, field = self._time_ns - time_ns, float_rows("field", field, 3)
         if not self.listens(time_ns) or age_ns > OLDEST_NS:
             return
+        starts, revisions = self._filter.restarts, self._filter.revisions
         if age_ns < 0:
             self._advance(time_ns)
         self._watch_decay(time_ns, field)
-        starts, revisions = self._filter.restarts, self._filter.revisions
         accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
         if accepted:
             self._accepted_ns = time_ns
@@ -486,7 +502,11 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,), A m^2, of the currents sent to the coils until the next command."""
+        """Set the dipole moment (3,), A m^2, of the currents sent to the coils until the next command.
+
+        Raises ArgumentError for a dipole moment that is not finite.
+        """
+        dipole = finite_array("dipole", dipole, (3,))
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole

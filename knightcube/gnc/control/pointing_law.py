@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_product
+from knightcube.astro.arrays import FloatArray, check_finite, cross_product
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -22,8 +22,10 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.errors import ArgumentError
 from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.pointing_table import PointingTable
+from knightcube.gnc.estimation.estimate import check_length
 from knightcube.gnc.guidance.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
@@ -84,8 +86,13 @@ class PointingLaw:
         The magnetic field `field` (3,), T, is in body axes. The estimated residual dipole moment
         `residual_dipole` (3,) A m^2 is cancelled directly, except for the component along the field. The
         effects of the disturbance torques with the estimated components `sizes` (n,), N m, are reduced as far
-        as the field allows.
+        as the field allows. In a field of zero, the dipole moment is zero. Raises ArgumentError for values
+        that are not finite, and for an attitude that is not a unit quaternion.
         """
+        check_finite(
+            time=time, quaternion=quaternion, rate=rate, residual_dipole=residual_dipole, sizes=sizes
+        )
+        check_length("quaternion", quaternion)
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
         # The rotation error rotates the reference rate into body axes, in which the rates are compared.
@@ -97,8 +104,19 @@ class PointingLaw:
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond + residual_dipole
         # The dipole moment along the field is removed, because a dipole along the field causes no torque.
-        dipole = field * (float(field @ pull) / float(field @ field)) - pull
+        dipole = field * (float(field @ pull) / _square(field)) - pull if field.any() else _NO_DIPOLE
         return PointingCommand(limited(dipole, self._limit), rotation, missed)
+
+
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+def _square(field: FloatArray) -> float:
+    """Return the square of a magnetic field (3,). Raises ArgumentError if the square is not finite."""
+    square = float(field @ field)
+    if not math.isfinite(square):
+        raise ArgumentError("field", f"{field.tolist()}: give a finite field in T")
+    return square
 
 
 def _cut(vector: FloatArray, longest: float) -> FloatArray:
@@ -147,6 +165,10 @@ class PathRecovery:
 def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
     """Return the dipole (3,) A m^2 that damps a rate (3,) rad/s in a field (3,) T, body axes.
 
-    The inertia tensor in body axes is `inertia` (3, 3), kg m^2.
+    The inertia tensor in body axes is `inertia` (3, 3), kg m^2. In a field of zero, the dipole is zero.
+    Raises ArgumentError for a rate or a field that is not finite.
     """
-    return np.asarray(cross_product(field, (-2.0 * DAMPING * inertia) @ rate) / float(field @ field))
+    check_finite(rate=rate)
+    if not field.any():
+        return _NO_DIPOLE
+    return np.asarray(cross_product(field, (-2.0 * DAMPING * inertia) @ rate) / _square(field))

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_product, unit_vector
+from knightcube.astro.arrays import FloatArray, cross_product, finite_array, unit_vector
 from knightcube.astro.inertia import checked_inertia
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.gnc.control.coil_map import limited
@@ -111,7 +111,7 @@ class ResidualDipole:
         Each component of the estimated dipole moment is limited to +-`bound`, A m^2. The bound is equal for
         all axes or has shape (3,).
         """
-        self._inertia, self._bound = inertia, bound
+        self._inertia, self._bound = checked_inertia("inertia", inertia), bound
         self._inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
         self._rate: FloatArray | None = None
         self.dipole: FloatArray = np.zeros(3)
@@ -232,8 +232,11 @@ class SunAcquisition:
             self._sun.measure(time_ns, sun / length)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,), A m^2, that actually acts until the next command."""
-        self._acts = dipole
+        """Set the dipole moment (3,), A m^2, that actually acts until the next command.
+
+        Raises ArgumentError for a dipole moment that is not finite.
+        """
+        self._acts = finite_array("dipole", dipole, (3,))
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
         """Accept a gyro rate (3,) rad/s and a field (3,) T; the field is used only in pauses of the coils."""

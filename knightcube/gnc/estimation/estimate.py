@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, float_rows
+from knightcube.astro.arrays import FloatArray, check_finite, float_rows
 from knightcube.astro.quaternion import Quaternion, Vector
 from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import slices
@@ -42,7 +42,7 @@ _LENGTH = 0.1
 """Largest accepted difference between one and the length of a measured quaternion or direction."""
 
 
-def _check_length(name: str, value: FloatArray) -> None:
+def check_length(name: str, value: FloatArray) -> None:
     """Raise ArgumentError for a vector whose length is not one. NaN is permitted, as in `_check_arrays`."""
     length = math.hypot(*value.tolist())
     if abs(length - 1.0) > _LENGTH:
@@ -50,17 +50,26 @@ def _check_length(name: str, value: FloatArray) -> None:
         raise ArgumentError(name, f"{value.tolist()}: length {length:g}: give a {kind} of length 1")
 
 
-def check_measured(covariance: FloatArray, *units: str, **measured: FloatArray) -> None:
+def check_measured(covariance: FloatArray, *units: str, finite: bool = False, **measured: FloatArray) -> None:
     """Raise ArgumentError unless the covariance is (3, 3), and the arrays `measured` are vectors (3,).
 
     An array called `quaternion` must be (4,). The arrays named in `units` must be unit vectors or unit
-    quaternions.
+    quaternions. Values that are not finite are permitted unless `finite` is true.
     """
+    if finite:
+        check_finite(covariance=covariance, **measured)
     _check_shape("covariance", covariance, (3, 3))
     for name, value in measured.items():
         _check_shape(name, value, (4,) if name == "quaternion" else (3,))
     for name in units:
-        _check_length(name, measured[name])
+        check_length(name, measured[name])
+
+
+def check_span(seconds: float, **given: FloatArray | float) -> None:
+    """Raise ArgumentError unless a propagation time (s) is finite and not negative, and `given` is finite."""
+    if not 0.0 <= seconds < math.inf:
+        raise ArgumentError("seconds", f"{seconds}: give a finite time of 0 s or more")
+    check_finite(**given)
 
 
 class _AtOneTime:
@@ -92,7 +101,7 @@ class AttitudeMeasurement(_AtOneTime):
     def __post_init__(self) -> None:
         """Raise ArgumentError for arrays of another shape, and for a quaternion whose length is not one."""
         _check_arrays(self, quaternion=(4,), covariance=(3, 3))
-        _check_length("quaternion", self.quaternion)
+        check_length("quaternion", self.quaternion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,8 +162,8 @@ class DirectionMeasurement(_AtOneTime):
     def __post_init__(self) -> None:
         """Raise ArgumentError for arrays of another shape, and for vectors whose length is not one."""
         _check_arrays(self, observed=(3,), reference=(3,), covariance=(3, 3))
-        _check_length("observed", self.observed)
-        _check_length("reference", self.reference)
+        check_length("observed", self.observed)
+        check_length("reference", self.reference)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, check_type
+from knightcube.astro.arrays import (
+    FloatArray,
+    check_finite,
+    check_type,
+    checked_number,
+    finite_array,
+    float_rows,
+)
 from knightcube.astro.inertia import checked_inertia
 from knightcube.astro.quaternion import (
     Matrix,
@@ -42,7 +49,9 @@ from knightcube.astro.quaternion import (
     times,
 )
 from knightcube.compiled import compiled_floats, loop_helper
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import Weighed, check_amounts, slices, updated, weigh
+from knightcube.gnc.estimation.estimate import check_span
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     by_inertia,
@@ -57,6 +66,8 @@ RATE, FIELD, CHANGE, INERTIA, BIAS, COILS = slices(SIZES)
 SIZE = COILS.stop
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
+LONGEST_PROPAGATION = 600.0
+"""Longest time (s) over which the rate is propagated without a measurement."""
 COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
 """Longest time (s) and largest rotation (rad) of the body in one propagation step of the covariance."""
 _LINEARISED = 0.2
@@ -146,8 +157,11 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
     """Return the body rate (3,) rad/s that rotated the field `before` into `after`, both (3,) T in body axes.
 
     The component of the rate along the field is not observable. The returned rate across the field is exact
-    for a steady rotation of less than half a revolution, and zero if a field is zero.
+    for a steady rotation of less than half a revolution, and zero if a field is zero. Raises ArgumentError
+    unless the fields are finite and the time is positive.
     """
+    checked_number("seconds", seconds, "s")
+    check_finite(before=before, after=after)
     rotated = np.cross(after, before)  # in body axes, the field rotates opposite to the body
     length = float(np.linalg.norm(rotated))
     if length == 0.0:
@@ -263,7 +277,15 @@ class FieldRate:
         return self._estimates[0] if self._estimates else self._unknown
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
-        """Propagate the state by `seconds` under a commanded dipole moment (3,), A m^2, body axes."""
+        """Propagate the state by `seconds` under a commanded dipole moment (3,), A m^2, body axes.
+
+        After more than `LONGEST_PROPAGATION` s the rate is unknown, and the filter restarts. Raises
+        ArgumentError for values that are not finite, and for a negative time.
+        """
+        dipole = finite_array("dipole", dipole, (3,))
+        check_span(seconds)
+        if seconds > LONGEST_PROPAGATION:
+            self._restart_counted(self._gyro_refused >= self._settings.refusals)
         self._is_reset = False
         self._since += seconds
         self._noise.advance(seconds)
@@ -274,8 +296,13 @@ class FieldRate:
     def measure(self, field: FloatArray, age: float = 0.0) -> bool:
         """Apply a field (3,), T, measured `age` s ago with coils off, and return whether it passed the gate.
 
-        The measured field is rotated into the present body axes with the body rate.
+        The measured field is rotated into the present body axes with the body rate. A field that is not
+        finite is rejected. Raises ArgumentError for another shape, and for an age that is negative or not
+        finite.
         """
+        field = float_rows("field", field, 3)
+        if field.ndim > 1 or not 0.0 <= age < math.inf:
+            raise ArgumentError("field", f"shape {field.shape}, age {age} s: give one field (3,) and its age")
         if not np.all(np.isfinite(field)):
             return False
         self._is_reset = False
@@ -301,7 +328,7 @@ class FieldRate:
         excluded until `restart`. The gyro is also excluded if the field predictions fail after a gyro rate
         was used. If the gyro contradicts an estimate that used the gyro, the filter restarts.
         """
-        settings = self._settings
+        settings, rate = self._settings, float_rows("rate", rate, 3)
         self._is_reset = False
         if not self._estimates or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
             return

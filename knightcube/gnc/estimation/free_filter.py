@@ -78,7 +78,7 @@ from knightcube.gnc.estimation.error_state import (
     widen,
     with_role,
 )
-from knightcube.gnc.estimation.estimate import Knowledge, check_measured
+from knightcube.gnc.estimation.estimate import Knowledge, check_measured, check_span
 from knightcube.gnc.estimation.free_motion import Bodies, step
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
@@ -415,8 +415,8 @@ class FreeFilter:
         (`doubted`), the covariance of the slow states is reset to the prior of the settings, and implausible
         values are set to zero.
         """
+        check_measured(covariance, "quaternion", finite=True, quaternion=quaternion, gyro=gyro)
         self.changes += 1
-        check_measured(covariance, "quaternion", quaternion=quaternion, gyro=gyro)
         if doubted:
             self.widen(np.arange(SLOW.start, SLOW.stop))
             self.field_error = max(self.field_error, self._settings.field)
@@ -434,7 +434,7 @@ class FreeFilter:
             self.rate = np.asarray(np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), measured), dtype=float)
             first[RATE, GYRO], first[RATE, GYRO_MATRIX] = -_EYE, -by_matrix(self.rate)
         else:
-            alone[RATE, RATE] = spread
+            alone[RATE, RATE] = finite_array("spread", spread, (3, 3))
         self.covariance = joined(self.covariance, first, alone)
         self.begin_mean()
         self.started = True
@@ -616,10 +616,10 @@ class FreeFilter:
     ) -> None:
         """Propagate over the time `seconds`, with the mean commanded dipole (3,), A m^2, in body axes.
 
-        The value `doubt` (A m^2) is the standard deviation per axis of a dipole that may differ from the
-        command. If the dipole changes during `seconds`, `uneven` (3,), A m^2 s^2, is the double time integral
-        of the dipole minus the double time integral of the mean dipole.
+        The standard deviation per axis of a dipole that may differ from the command is `doubt`, A m^2. If the
+        dipole changes, `uneven` (3,), A m^2 s^2, is the double time integral of its deviation from the mean.
         """
+        check_span(seconds, dipole=dipole, field=around.field, doubt=doubt)
         before = self.rate
         steps = max(1, math.ceil(math.sqrt(float(before @ before)) * seconds / LARGEST_ROTATION))
         for _ in range(steps):

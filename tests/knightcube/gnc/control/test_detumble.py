@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -195,8 +196,28 @@ def test_a_share_that_does_not_brake_is_refused(share: float) -> None:
 
 
 def test_a_window_without_time_to_measure_is_refused() -> None:
-    with pytest.raises(UsageError, match="must be above zero"):
+    with pytest.raises(UsageError, match="above zero"):
         WindowSchedule(0, 0, 1)
+
+
+@pytest.mark.parametrize("seconds", [0.1, math.nan])
+def test_a_window_in_seconds_is_refused_because_its_unit_is_the_nanosecond(seconds: Any) -> None:
+    with pytest.raises(UsageError, match=r"act_ns: .*whole number"):
+        WindowSchedule(0, 50_000_000, seconds)
+
+
+def test_a_rate_follows_only_from_finite_fields_and_a_positive_time() -> None:
+    field = np.array([1e-5, 2e-5, 3e-5])
+    for name, given in (("seconds", (field, -field, 0.0)), ("after", (field, math.nan * field, 1.0))):
+        with pytest.raises(UsageError, match=name):
+            rate_across(*given)
+
+
+def test_currents_follow_only_from_finite_values_and_a_positive_time() -> None:
+    braking, field = DetumblerSettings(1e-3, 0.6, 0.1, 0.2), np.array([1e-5, 2e-5, 3e-5])
+    for name, rate, act_time in (("rate", math.nan, 1.0), ("act_time", 0.1, 0.0)):
+        with pytest.raises(UsageError, match=name):
+            braking_current(braking, np.full(3, rate), field, act_time)
 
 
 @pytest.mark.parametrize("length_ms", [20, 40, 100, 99, 300])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -536,3 +536,42 @@ def test_detumbling_by_the_magnetometer_is_as_recorded() -> None:
     rate = np.array([0.1, -0.05, 0.08])
     with_gyro, _ = fly(rate, 12.0, gyro=lambda true: true + 1e-3)
     check(__file__, "detumbled", [fly(rate, 12.0, spikes=0.05)[0], with_gyro], 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("momentum", np.full(3, np.nan)),
+        ("field", np.zeros_like(FIELD_AHEAD)),
+        ("field", np.full_like(FIELD_AHEAD, np.inf)),
+        ("times", TIMES[::-1]),
+        ("limit", 0.0),
+    ],
+)
+def test_a_plan_without_a_solution_is_refused_with_the_name_of_the_value(name: str, value: Any) -> None:
+    given: dict[str, Any] = {"momentum": np.full(3, 1e-3), "field": FIELD_AHEAD, "times": TIMES}
+    with pytest.raises(ArgumentError, match=name):
+        momentum_plan(**{**given, "limit": DIPOLE_LIMIT, "rest": REST, name: value})
+
+
+def test_a_field_of_zero_has_no_direction_and_no_rotation() -> None:
+    with pytest.raises(ArgumentError, match="field"):
+        rotating_field(np.zeros(3), np.ones(3), TIMES)
+    with pytest.raises(ArgumentError, match="field"):
+        aligned_to(FIELD_AHEAD, np.zeros(3))
+
+
+def test_a_dipole_that_is_not_finite_and_a_field_of_another_shape_are_refused() -> None:
+    law = detumbler()
+    with pytest.raises(ArgumentError, match="dipole"):
+        law.acts(np.full(3, np.nan))
+    with pytest.raises(ArgumentError, match="field"):
+        law.sample(0, np.zeros(2))
+
+
+def test_after_a_time_stamp_far_ahead_the_rate_is_estimated_again_before_the_coils_act() -> None:
+    law, _ = driven(gyro=False)
+    ahead_ns = 86_400_000_000_000
+    for now_ns in range(ahead_ns, ahead_ns + LONG.period_ns, 100_000_000):
+        assert not law.dipole(now_ns).any()
+    assert law.restarts == 1

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import AIR, CONSTANT, SIZES, pressures, shapes
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
-from knightcube.errors import PlanningError, UsageError
+from knightcube.errors import ArgumentError, PlanningError, UsageError
 from knightcube.gnc.control.pointing_law import (
     DAMPING_TIMEOUT,
     FAR,
@@ -226,3 +228,36 @@ def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() ->
     astray.update(1.1 * LEAVING, SLOW, 1.0)
     astray.planned()
     assert not astray.leaving
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("time", math.nan),
+        ("quaternion", np.array([0.0, 0.0, 0.0, 2.0])),
+        ("rate", np.full(3, math.nan)),
+        ("field", np.array([math.inf, 0.0, 0.0])),
+        ("residual_dipole", np.full(3, math.nan)),
+    ],
+)
+def test_the_law_refuses_values_from_which_no_dipole_follows(law: PointingLaw, name: str, value: Any) -> None:
+    good: dict[str, Any] = {
+        "time": law.span[0],
+        "quaternion": law.reference(law.span[0]).quaternion,
+        "rate": np.zeros(3),
+        "field": np.array([2e-5, 0.0, 1e-5]),
+        "residual_dipole": np.array([0.01, 0.02, 0.03]),
+        "sizes": np.zeros(SIZES),
+    }
+    assert law.command(**good).dipole.any()
+    assert not law.command(**{**good, "field": np.zeros(3)}).dipole.any()
+    with pytest.raises(ArgumentError, match=name):
+        law.command(**{**good, name: value})
+
+
+def test_the_damping_in_a_field_of_zero_is_zero_and_values_that_are_not_finite_are_refused() -> None:
+    inertia, rate, field = np.eye(3), np.full(3, 0.01), np.array([0.0, 0.0, 3e-5])
+    np.testing.assert_array_equal(damping_dipole(inertia, rate, np.zeros(3)), np.zeros(3))
+    for name, given in (("rate", (math.nan * rate, field)), ("field", (rate, math.nan * field))):
+        with pytest.raises(ArgumentError, match=name):
+            damping_dipole(inertia, *given)

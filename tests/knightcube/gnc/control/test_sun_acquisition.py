@@ -297,3 +297,9 @@ def test_impossible_settings_are_refused(
 ) -> None:
     with pytest.raises(ArgumentError, match=words):
         SunAcquisitionSettings(inertia=inertia, axis=axis, limit=limit)
+
+
+def test_a_dipole_that_is_not_finite_is_refused() -> None:
+    settings = SunAcquisitionSettings(inertia=np.eye(3), axis=np.array([0.0, 0.0, 1.0]), limit=0.1)
+    with pytest.raises(ArgumentError, match="dipole"):
+        SunAcquisition(SCHEDULE, settings).acts(np.full(3, np.nan))

@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, derivative, from_rotation_vector
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.field_rate import INERTIA as INERTIA_ERROR
 from knightcube.gnc.estimation.field_rate import RATE, FieldNoise, FieldRate, FieldRateSettings, _stepped
 from tests.support.compiled_forms import assert_forms_agree
@@ -230,3 +231,34 @@ def test_the_compiled_step_equals_the_plain_step() -> None:
     inverse = ((910.0, -9.0, 0.2), (-9.0, 950.0, -19.0), (0.2, -19.0, 1010.0))
     state = (0.1, 0.12, -0.05), (1e-5, 2e-5, -3e-5), (1e-8, -2e-8, 1e-8), (0.1, -0.5, 0.1, 0.73**0.5)
     assert_forms_agree(_stepped, *state, (0.01, -0.02, 0.03), inertia, inverse, 0.025, relative=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("name", "dipole", "seconds"),
+    [("dipole", [np.nan, 0.0, 0.0], 0.2), ("dipole", [0.0, 0.0], 0.2), ("seconds", [0.0] * 3, -0.2)],
+)
+def test_a_propagation_that_would_make_the_estimate_wrong_is_refused(
+    name: str, dipole: list[float], seconds: float
+) -> None:
+    found, _ = follow(np.radians([3.0, -4.0, 5.0]), INERTIA, 5.0)
+    before = found.rate
+    with pytest.raises(ArgumentError, match=name):
+        found.advance(np.array(dipole), seconds)
+    np.testing.assert_array_equal(found.rate, before)
+
+
+def test_a_rate_is_not_propagated_over_a_long_gap() -> None:
+    """Without this limit, a wrong time stamp of a day would take minutes of computing time."""
+    found, _ = follow(np.radians([3.0, -4.0, 5.0]), INERTIA, 5.0)
+    found.advance(np.zeros(3), 86_400.0)
+    assert not found.started
+    assert found.restarts == 1
+
+
+def test_a_field_of_another_shape_or_with_an_impossible_age_is_refused() -> None:
+    found, _ = follow(np.radians([3.0, -4.0, 5.0]), INERTIA, 5.0)
+    for field, age in ((np.zeros(2), 0.0), (np.ones((3, 3)), 0.0), (FIELD, np.nan), (FIELD, -1.0)):
+        with pytest.raises(ArgumentError, match="field"):
+            found.measure(field, age)
+    with pytest.raises(ArgumentError, match="rate"):
+        found.measure_rate(np.zeros(2))

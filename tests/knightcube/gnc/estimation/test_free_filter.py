@@ -341,4 +341,10 @@ def test_measurements_of_another_shape_or_length_are_refused_and_change_nothing(
         found.direction(np.zeros(3), down, np.eye(3))
     with pytest.raises(ArgumentError, match="quaternion of length 1"):
         found.start(np.zeros(4), np.eye(3), still)
+    with pytest.raises(ArgumentError, match=r"quaternion: .*finite"):
+        found.start(np.nan * IDENTITY, np.eye(3), still)
+    with pytest.raises(ArgumentError, match="seconds"):
+        found.advance(-1.0, still, around(0.0))
+    with pytest.raises(ArgumentError, match="dipole"):
+        found.advance(1.0, np.nan * down, around(0.0))
     np.testing.assert_array_equal(found.covariance, before)

@@ -101,8 +101,10 @@ def test_a_jump_of_the_gyro_bias_is_estimated() -> None:
     for cycle in range(STUCK, END):
         filter_.catch_up(16)
         for sample in flown.samples[cycle]:
-            is_rate = isinstance(sample, RateMeasurement)
-            filter_.measure(dataclasses.replace(sample, rate=sample.rate + jump) if is_rate else sample)
+            if isinstance(sample, RateMeasurement):
+                filter_.measure(dataclasses.replace(sample, rate=sample.rate + jump))
+            else:
+                filter_.measure(sample)
         filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
     filter_.catch_up()
     found = filter_.at((END - 1) * CYCLE_NS)
