@@ -380,14 +380,15 @@ class _Pause(NamedTuple):
         field: first field (3,) T without the estimated bias, body axes.
         rate: estimated body rate (3,), rad/s.
         bias: estimated bias (3,) of the magnetometer, T.
-        square: normalised square of the change from the first to the newest field; its mean is 1 for noise.
+        square: normalised square of the change from the first to the newest field, or None for one field. Its
+            mean is 1 for noise.
     """
 
     time_ns: int
     field: FloatArray
     rate: FloatArray
     bias: FloatArray
-    square: float = 1.0
+    square: float | None = None
 
 
 class FieldDetumbler:
@@ -522,7 +523,8 @@ class FieldDetumbler:
         if not found.started or not np.isfinite(field).all():
             return
         if pause is None:
-            self._pause = _Pause(time_ns, field - found.bias, found.rate, found.bias)
+            if self.trusted:  # otherwise the coils were off, and their field has decayed
+                self._pause = _Pause(time_ns, field - found.bias, found.rate, found.bias)
             return
         rotation = from_rotation_vector((time_ns - pause.time_ns) * _SECOND * pause.rate)
         change = field - pause.bias - attitude_matrix(rotation) @ pause.field
@@ -532,9 +534,9 @@ class FieldDetumbler:
     def _judge_decay(self) -> None:
         """End a pause, and lengthen the pauses if the coil field usually decays during the measurement."""
         pause, schedule = self._pause, self._schedule
-        if pause is None:
-            return
         self._pause = None
+        if pause is None or pause.square is None:
+            return
         self._unsettled += (min(pause.square, LARGEST_CHANGE) - self._unsettled) / PAUSES
         if self._unsettled > DECAYING and 2 * self._settle_ns < schedule.act_ns:
             self._settle_ns += max(schedule.settle_ns, schedule.measure_ns)

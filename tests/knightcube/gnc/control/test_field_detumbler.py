@@ -212,6 +212,23 @@ def test_the_pauses_become_longer_if_the_coil_field_decays_slowly() -> None:
     assert not law.listens(law.next_pause_ns + SCHEDULE.settle_ns)
 
 
+def test_the_pauses_become_longer_although_the_filter_restarts_after_each_of_them() -> None:
+    """The coil field falsifies the first sample of each pause, and the coils are off after a restart."""
+    law, driven_ns, restarts = detumbler(), 0, 0
+    law.begin(0)
+    for now_ns in range(0, 12 * SCHEDULE.period_ns, 25_000_000):
+        field = attitude_matrix(from_rotation_vector(np.array([1e-10 * now_ns, 0.0, 0.0]))) @ FIELD
+        off_ns = now_ns - driven_ns
+        law.sample(now_ns, field + 2e-6 * (off_ns <= SCHEDULE.settle_ns + 25_000_000))
+        if driven_ns and off_ns == 375_000_000:
+            law.renew_magnetometer()
+            restarts += 1
+        if law.dipole(now_ns).any():
+            driven_ns = now_ns
+    assert restarts >= 3
+    assert not law.listens(law.next_pause_ns + SCHEDULE.settle_ns)
+
+
 def test_outliers_do_not_make_the_pauses_longer() -> None:
     """One sample in 50 is an outlier, so 4 % of the pauses begin or end with an outlier."""
     _, law = fly(np.array([0.1, 0.05, 0.03]), 150.0, spikes=0.02)
