@@ -820,15 +820,20 @@ def _keeps_stars(rotation: FloatArray, pinhole: Pinhole) -> bool:
 
 
 def _problem_of_rate(report: ObjectReport) -> str:
-    """Return why the assumed rate is wrong, or an empty text.
+    """Return why most streaks contradict the assumed rate, or an empty text if they agree with it.
 
     With a wrong rate, the streaks of stars would be mistaken for objects.
     """
-    deviation = float(np.median(np.abs(report.indicators.deviations).max(axis=1)))
+    each = np.abs(report.indicators.deviations).max(axis=1)
+    deviation = float(np.median(each))
     if deviation <= _WRONG_RATE:
         return ""
-    cure = "give the rate in rad/s, camera axes, and the exposure in s"
-    return f"the streaks deviate from the rate by {deviation:.0f} standard deviations (median): {cure}"
+    agreeing = np.count_nonzero(each <= _WRONG_RATE)
+    return (
+        f"the streaks deviate from the rate by {deviation:.0f} standard deviations (median; {agreeing} of "
+        f"{len(each)} agree): the rate (rad/s, camera axes) or the exposure (s) is wrong, or most streaks "
+        "are not stars, for instance cosmic rays or hot columns"
+    )
 
 
 def detect_objects(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -495,6 +496,24 @@ def test_a_wrong_rate_is_named_and_gives_no_false_objects(wrong: float) -> None:
     found = detect_objects(pixels, _FRAME_CAMERA.pinhole, rate, 0.5, settings)
     assert found.objects == ()
     assert "the streaks deviate from the rate by" in found.reason
+
+
+def test_tracks_of_cosmic_rays_are_named_as_a_cause_of_streaks_unlike_the_stars() -> None:
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 0.5, 5, [], _FAINTEST).astype(np.float64)
+    rng, (rows, columns) = np.random.default_rng(3), pixels.shape
+    for _ in range(60):
+        along, angle = np.arange(0.0, 40.0, 0.5), rng.uniform(0.0, np.pi)
+        x = rng.uniform(50.0, columns - 50.0) + along * np.cos(angle)
+        y = rng.uniform(50.0, rows - 50.0) + along * np.sin(angle)
+        np.add.at(pixels, (y.astype(int), x.astype(int)), 2000.0)
+    settings = ObjectSettings(gain=_SETTINGS.gain, saturation=_SETTINGS.saturation)
+    rate, whole = _ROTATION / 0.5, pixels.clip(0.0, 65_535.0).astype(np.uint16)
+    found = detect_objects(whole, _FRAME_CAMERA.pinhole, rate, 0.5, settings)
+    assert found.objects == ()
+    assert "cosmic rays or hot columns" in found.reason
+    agreeing = re.search(r"(\d+) of (\d+) agree", found.reason)
+    assert agreeing is not None
+    assert 4 <= int(agreeing[1]) < 0.5 * int(agreeing[2])
 
 
 def test_the_public_search_accepts_numbers_of_every_type() -> None:
