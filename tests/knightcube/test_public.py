@@ -469,6 +469,12 @@ def test_settings_of_rates_and_objects_have_their_kinds() -> None:
         ObjectSettings(bounds=(8.0, 10.0))  # type: ignore[arg-type]  # wrong on purpose
 
 
+@pytest.mark.parametrize("reach", [1e6, 0.5, -3.6, math.nan])
+def test_a_reach_that_exhausts_the_memory_is_refused(reach: float) -> None:
+    with pytest.raises(ArgumentError, match=r"settings.reach: .*: give 1 to 20 point-spread widths"):
+        estimate_rate(IMAGE, CAMERA, 1.0, settings=LikelihoodSettings(reach=reach))
+
+
 @pytest.mark.parametrize("line_time", [0.02, -0.02, float("inf")])
 def test_a_line_time_in_another_unit_is_refused(line_time: float) -> None:
     with pytest.raises(ArgumentError, match=r"settings.line_time: .* s per row"):

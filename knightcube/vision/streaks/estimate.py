@@ -199,8 +199,13 @@ def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
     inside = complete_streaks(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     # Stars fainter than all stars in the fit are ignored, because they were not compared with the motion.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
-    light = scene.light[bright]
-    return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
+    # Errors of lens and shutter exclude bright stars from the fit although their streaks end in place.
+    excluded = np.flatnonzero(bright & ~scene.trusted)
+    if not len(excluded):
+        return False
+    in_place = (true_ends(camera, scene.select(excluded)) == 1.0).all(axis=1)
+    wrong = float(scene.light[excluded[~in_place]].sum())
+    return wrong > (1.0 - _AGREEING_LIGHT) * float(scene.light[bright].sum())
 
 
 # Largest distance (px) between the positions of one star in the fits with both signs of the rotation.
@@ -259,11 +264,7 @@ def _rolling_result(
     both = [found for found in (fit_along(axis), fit_along(-axis)) if found is not None]
     if not both:
         return None
-    known = [found for found in both if found.result.rate is not None]
-    if len(known) < 2:
-        # If the fit succeeds for only one sign, the other sign may still be correct, so no rate is returned.
-        return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
-    one, other = known
+    one, other = both[0], both[-1]
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
     of_one, of_other = np.nonzero(distance < _SAME_STAR)
     better = np.clip(other.excess[of_other] - one.excess[of_one], -_MOST_DIFFERENCE, _MOST_DIFFERENCE)
@@ -271,9 +272,10 @@ def _rolling_result(
     if abs(total) >= max(_LEAST_MARGIN, _LEAST_AGREEMENT * scatter):
         return (one if total > 0.0 else other).result
     first, second = one.result, other.result
-    assert first.rate is not None
+    if len(both) < 2 or first.rate is None or second.rate is None:
+        # If the fit succeeds for only one sign, the other sign may still be correct, so no rate is returned.
+        return replace(first, status=StreakStatus.FAILED, rate=None, covariance=None)
     assert first.covariance is not None
-    assert second.rate is not None
     assert second.covariance is not None
     sum_of_both = first.rate + second.rate
     covariance = 0.5 * (first.covariance + second.covariance) + 0.25 * np.outer(sum_of_both, sum_of_both)
@@ -413,6 +415,8 @@ _AT_REST = 4.0
 _SPOT = 2.2
 # Number of the brightest regions whose median length shows whether a frame is free of streaks.
 _BRIGHTEST = 12
+# Smallest and largest half width of the fitted strips of pixels, in point-spread widths.
+_REACHES = (1.0, 20.0)
 # Reason reported if the streak check rejects a motion.
 _WRONG_ENDS = "the motion divides streaks into segments or joins several"
 # Reason reported if no fitted motion passes the streak check.
@@ -460,6 +464,9 @@ def estimate_rate(
     if settings.rate_model not in get_args(RateModel):
         text = f"{brief(settings.rate_model)}: give one of {', '.join(get_args(RateModel))}"
         raise ArgumentError("settings.rate_model", text)
+    if not _REACHES[0] <= settings.reach <= _REACHES[1]:
+        text = f"{settings.reach}: give {_REACHES[0]:g} to {_REACHES[1]:g} point-spread widths"
+        raise ArgumentError("settings.reach", text)
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     settings = settings.in_units_of(unit, zero)
     prior = None if prior_rate is None else finite_array("prior_rate", prior_rate, (3,))

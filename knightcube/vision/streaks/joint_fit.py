@@ -185,9 +185,9 @@ class StreakFit:
     """A fitted scene with the solution and the normal equations of the last step.
 
     The normal equations are those of the scene `before` the last step. The attribute `last_step` is the last
-    step of the shared parameters, in standard deviations, or 0 if the fit is converged. The mask `free`
-    (SHARED,) selects the fitted parameters among the shared parameters. The stars `hidden` were subtracted
-    from the frame instead of fitted; None if the fit did not subtract stars.
+    step of the motion, in standard deviations, or 0 if the fit is converged. The mask `free` (SHARED,)
+    selects the fitted parameters among the shared parameters. The stars `hidden` were subtracted from the
+    frame instead of fitted; None if the fit did not subtract stars.
     """
 
     scene: StreakScene
@@ -255,8 +255,11 @@ def iterate(
         if not valid or not np.linalg.norm(scene.motion.rotation) <= np.pi:
             return None
         deviation = np.sqrt(np.maximum(np.diag(solution.covariance)[free], 1e-30))
-        last_step = float(np.max(np.abs(solution.shared[free]) / deviation))
-        if last_step <= how.settled or wanted <= how.tolerance:
+        steps = np.abs(solution.shared[free]) / deviation
+        # The width, the last parameter, oscillates by several of its small standard deviations if the set of
+        # excluded pixels changes with it.
+        last_step = float(np.max(steps[:-1] if how.clipped else steps, initial=0.0))
+        if np.max(steps) <= how.settled or wanted <= how.tolerance:
             last_step = 0.0
             break
         # Two consecutive steps of the fit in the same direction also count as progress.
@@ -345,8 +348,8 @@ _WITHIN = 10
 _WITHIN_SAMPLES = 10
 # Distances (px) from a star's path at which the pixels are sampled.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
-# Mean counts of the three central pixels across a streak, as a fraction of the flux per px along it.
-_MIDDLE = 0.287
+# Number of central pixels across a streak whose mean counts are the intensity of the streak.
+_MIDDLE = 3
 # Ratio of measured to expected intensity below which a segment of a streak counts as dark.
 _HALF = 0.5
 # Minimum fraction of usable pixels in a streak segment whose intensity is measured.
@@ -355,6 +358,8 @@ _LEAST_VALID = 0.7
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
+# Intensity on both sides of a streak end, as a multiple of the streak's intensity, that hides the end.
+_HIDDEN = 3.0
 # Lower limit of the star's speed from which the intensity is predicted, as a fraction of the mean speed. The
 # PSF keeps the intensity finite at points at which the star is nearly at rest.
 _SLOW = 0.5
@@ -368,7 +373,9 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
     """Return 1 for each confirmed and 0 for each wrong end of the streaks of `scene`, as an array (n, 2).
 
     A streak end is confirmed if the pixels on its inner side contain starlight and the pixels on its outer
-    side do not. The value is NaN for an end outside the detector and for the ends of very short streaks.
+    side do not, or if the intensity decreases at the end by as much as expected, in spite of light of other
+    stars. The value is NaN for an end outside the detector, for the ends of very short or very faint streaks,
+    and for an end that is hidden by brighter streaks.
     """
     out = np.full((len(scene.stars), 2), np.nan)
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
@@ -387,11 +394,13 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
         last = progress[-1 if sign > 0.0 else 0]
         begin, stop = (np.interp(last - sign * distance, progress, instants) for distance in (near, far))
         relative = np.abs(stop - begin) / np.maximum(far - near, 1e-9)
-        expected = expected_brightness(scene.light, length) * relative
+        expected = expected_brightness(scene, length) * relative
         time = sign * away / speed[:, None]
-        within, beyond = (brightness(camera, steady, there, t)[0] for t in (-time, time))
-        known = np.isfinite(within) & np.isfinite(beyond)
-        true = (within > _HALF * expected) & (beyond < _HALF * expected)
+        (within, error), (beyond, other) = (brightness(camera, steady, there, t) for t in (-time, time))
+        known = expected > _LEAST_SIGNIFICANCE * np.hypot(error, other)
+        known &= np.isfinite(within) & (np.fmin(within, beyond) < _HIDDEN * expected) & np.isfinite(beyond)
+        half = _HALF * expected
+        true = ((within > half) & (beyond < half)) | (within - beyond > half)
         out[long, end] = np.where(known, true, np.nan)
     return out
 
@@ -402,7 +411,7 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
     A wrong angular acceleration in the fit causes trails of flux beyond streak ends.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
-    faint = _TRAIL * expected_brightness(scene.light, length)
+    faint = _TRAIL * expected_brightness(scene, length)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * _LEAST_STRETCH
     judged, lit = np.zeros((2, len(scene.stars)), dtype=np.bool_)
     for _, sign, steady, there, speed in _end_motions(camera, scene):
@@ -448,7 +457,7 @@ def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
     mean, deviation = brightness(camera, scene.motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
     rate = np.clip(scene.motion.relative_rate(time.reshape(-1)), _SLOW, None)
     rate = rate.reshape(len(each), _WITHIN_SAMPLES)
-    expected = np.repeat(expected_brightness(scene.light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
+    expected = np.repeat(expected_brightness(scene, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
     known = np.isfinite(mean) & (expected > _LEAST_SIGNIFICANCE * deviation)
     dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
     known_of = known.reshape(-1, _WITHIN).sum(axis=1)
@@ -456,9 +465,10 @@ def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
     return np.asarray(dark[judged] <= _DARK * known_of[judged], dtype=float)
 
 
-def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the expected intensity (n,) of streaks with flux `light` (n,), counts, and `length` (n,), px."""
-    return np.asarray(_MIDDLE * light / length)
+def expected_brightness(scene: StreakScene, length: FloatArray) -> FloatArray:
+    """Return the expected intensity (n,), counts, of the n streaks of `scene` with the `length` (n,), px."""
+    share = math.erf(0.5 * _MIDDLE / (math.sqrt(2.0) * scene.width)) / _MIDDLE
+    return np.asarray(share * scene.light / length)
 
 
 def brightness(
@@ -565,7 +575,7 @@ def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray,
     reach = np.clip(_REACH * own, _LEAST_REACH, _MOST_REACH)
     outward = np.linspace(-1.0, 1.0, _STEPS) * reach[:, None]
     times = exposure_bounds(camera.pinhole, motion, camera.shutter, stars)
-    expected = expected_brightness(scene.light[long], own)[:, None]
+    expected = expected_brightness(scene.select(long), own)[:, None]
     for end, sign in ((0, -1.0), (1, 1.0)):
         time = times[:, end, None] + sign * outward / own[:, None]
         repeated = np.repeat(stars, _STEPS, axis=0)

@@ -57,7 +57,8 @@ class LikelihoodSettings:
         most_neighbours: maximum number of fainter stars that are fitted because they overlap bright stars.
         most_faint: maximum number of faint stars that are detected and subtracted without a fit.
         faint_sigmas: minimum significance of a detected streak, in standard deviations.
-        reach: half width of the strip of pixels that is fitted along a star's path, in point-spread widths.
+        reach: half width of the strip of pixels that is fitted along a star's path, 1 to 20 point-spread
+            widths.
         clip: residual above which a pixel is excluded from the fit, in standard deviations.
         least_stars: minimum number of stars for which a rate is reported. Two stars determine a rate, but do
             not allow a check of their agreement.

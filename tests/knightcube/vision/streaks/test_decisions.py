@@ -88,7 +88,7 @@ def test_a_motion_is_confirmed_by_its_streak_ends_and_by_streaks_without_gaps(
 
 
 def test_chains_and_trails_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "true_ends", lambda *_: np.ones((8, 2)))
+    monkeypatch.setattr(estimate, "true_ends", lambda _, scene: np.ones((len(scene.stars), 2)))
     monkeypatch.setattr(estimate, "unbroken", lambda *_: np.ones(8))
     scene = _scene(np.random.default_rng(1).uniform(50.0, 90.0, (9, 2)), np.full(9, 5000.0), 8)
     for count, verdict in ((3, StreakVerdict.CONFIRMED), (4, StreakVerdict.REJECTED)):
@@ -103,7 +103,7 @@ def test_chains_and_trails_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> N
         assert check_streaks(_problem(), growing, _NOBODY) is verdict
         assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.CONFIRMED
     # The ends of short streaks are not confirmed, so that trails reject any motion of short streaks.
-    monkeypatch.setattr(estimate, "true_ends", lambda *_: np.full((8, 2), np.nan))
+    monkeypatch.setattr(estimate, "true_ends", lambda _, scene: np.full((len(scene.stars), 2), np.nan))
     assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.REJECTED
     monkeypatch.setattr(estimate, "trailing_fraction", lambda *_: 0.45)
     assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.CONFIRMED
@@ -115,6 +115,15 @@ def test_a_motion_is_doubtful_if_most_flux_of_complete_streaks_contradicts_it() 
     for others, disagree in ((5500.0, False), (6500.0, True)):
         light = np.array([6000.0, others, 3000.0, 9e4])
         assert estimate._most_disagree(_problem(), _scene(stars, light, 1)) == disagree
+
+
+def test_a_star_with_two_confirmed_ends_does_not_contradict_the_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = _scene(np.array([[60.0, 60.0], [80.0, 70.0]]), np.array([6000.0, 9000.0]), 1)
+    for ends, disagree in (([1.0, 1.0], False), ([1.0, np.nan], True), ([0.0, 1.0], True)):
+        monkeypatch.setattr(estimate, "true_ends", lambda *_, ends=ends: np.array([ends]))
+        assert estimate._most_disagree(_problem(), scene) == disagree
 
 
 def _candidate(rate: list[float] | None, excess: list[float], place: float = 0.0) -> estimate._Candidate:
@@ -182,11 +191,20 @@ def test_a_prior_rate_decides_on_the_sign_of_the_rotation() -> None:
     failed = _candidate(None, [0.0])
     found, asked = _rolling(failed, back, np.array([0.05, 0.0, 0.0]))
     assert (found is failed.result, asked) == (True, [1.0])
-    # If only one sign can be fitted, the other may still be correct.
-    found, _ = _rolling(ahead, None)
-    assert found is not None
-    assert (found.status, found.rate, found.covariance) == (StreakStatus.FAILED, None, None)
     assert _rolling(None, None)[0] is None
+
+
+def test_a_rolling_shutter_needs_a_fit_of_the_other_sign() -> None:
+    """The rate is that of a much better sign, even if checks reject the motion with the other sign."""
+    ahead, better, worse = [0.1, 0.002, 0.0], [0.0] * 12, [20.0] * 12
+    found, _ = _rolling(_candidate(ahead, better), _candidate(None, worse))
+    assert found is not None
+    assert found.rate == pytest.approx(ahead)
+    # Otherwise the other sign may be the correct one.
+    for other in (None, _candidate(None, better), _candidate(None, [-20.0] * 12)):
+        found, _ = _rolling(_candidate(ahead, better), other)
+        assert found is not None
+        assert (found.status, found.rate, found.covariance) == (StreakStatus.FAILED, None, None)
 
 
 @pytest.mark.parametrize("delay", [1e-3, -1e-3, 0.0])

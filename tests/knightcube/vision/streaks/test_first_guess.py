@@ -14,6 +14,7 @@ from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.first_guess import (
     Circles,
     find_axis,
+    frame_angles,
     guess_axis,
     measured_rate_change,
     motion_by_course,
@@ -312,6 +313,20 @@ def test_a_box_is_significant_relative_to_both_its_sides() -> None:
         padded = np.pad(held, ((room, room), (0, 0)), mode="edge").astype(np.float32)
         found = first_guess._box_significance(padded, room, width)
         assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
+
+
+def test_variations_along_bright_streaks_are_not_streaks() -> None:
+    """The angle from the whole frame is that of the streaks, and not that of the variations along them."""
+    pinhole, rng, angle = Pinhole(320, 300, 900.0), np.random.default_rng(5), 0.15
+    image, along = np.zeros((300, 320)), np.arange(135)
+    across = np.exp(-0.5 * np.arange(-4.0, 5.0) ** 2) / np.sqrt(2.0 * np.pi)
+    light = 4000.0 * (1.0 + 0.4 * np.sin(2.0 * np.pi * along / 24.0))
+    for row in range(20, 290, 15):
+        first = int(rng.integers(5, 180))
+        image[row - 4 : row + 5, first : first + 135] += across[:, None] * light
+    frame = reduce_frame(rng.normal(image + 100.0, 4.0).astype(np.uint16), SATURATION, 1.0)
+    found = frame_angles(frame, pinhole, np.array([0.0, angle, 0.0]), 1)
+    assert found == pytest.approx([angle], rel=0.05)
 
 
 def test_refined_lengths_are_within_half_a_step_of_the_search() -> None:

@@ -383,6 +383,76 @@ def test_the_brightest_stars_are_affordable_after_those_of_the_motion(
     assert joint_fit._affordable(camera, scene, 2.0).all()
 
 
+def _along_a_row(*stars: tuple[float, float], width: float = 1.1) -> tuple[FitProblem, StreakScene]:
+    """Return a frame of streaks of 70 px along row 50 without noise, and its stars (x, counts)."""
+    column, across = np.arange(120.0), np.arange(100.0) - 50.0
+    signal, motion = np.zeros((100, 120)), CameraMotion.steady(np.array([0.0, 0.1, 0.0]))
+    for x, light in stars:
+        inside = np.clip(np.minimum(column + 0.5, x + 35.0) - np.maximum(column - 0.5, x - 35.0), 0.0, 1.0)
+        profile = np.exp(-0.5 * (across / width) ** 2) / (np.sqrt(2.0 * np.pi) * width)
+        signal += light / 70.0 * profile[:, None] * inside
+    camera = _small_problem()
+    floor, nowhere = np.full(12_000, 16.0, dtype=np.float32), np.zeros(12_000, dtype=np.bool_)
+    frame = replace(camera.frame, signal=signal.astype(np.float32).reshape(-1), floor=floor, bad=nowhere)
+    places, n = np.array([[x, 50.0] for x, _ in stars]), len(stars)
+    light = np.array([each for _, each in stars])
+    scene = StreakScene(motion, width, places, light, np.zeros(n), np.ones(n, dtype=np.bool_))
+    return replace(camera, frame=frame), scene
+
+
+@pytest.mark.parametrize(
+    ("light", "other", "last"),
+    [
+        (7000.0, 0.0, 1.0),
+        (7000.0, 1.5, 1.0),  # the intensity decreases from 2.5 to 1.5 at the last end
+        (7000.0, 20.0, np.nan),  # a much brighter streak hides the end
+        (500.0, 0.0, np.nan),  # the streak is too faint
+    ],
+)
+def test_an_end_is_confirmed_by_the_decrease_of_the_intensity(
+    light: float, other: float, last: float
+) -> None:
+    """The streak of the second star begins at the centre of the first and continues beyond its end."""
+    camera, scene = _along_a_row((60.0, light), (96.0, other * light))
+    ends = joint_fit.true_ends(camera, scene)[0]
+    # The motion is towards lower columns, so that the first end is at column 95.
+    np.testing.assert_equal(ends[0], last)
+    # With three quarters of the rotation, the streak continues beyond both ends.
+    short = replace(scene, motion=CameraMotion.steady(0.75 * scene.motion.rate), light=0.75 * scene.light)
+    assert not np.any(joint_fit.true_ends(camera, short)[0] == 1.0)
+
+
+@pytest.mark.parametrize("width", [0.66, 1.04, 2.1])
+def test_the_expected_intensity_is_that_of_the_central_pixels(width: float) -> None:
+    camera, scene = _along_a_row((60.0, 7000.0), width=width)
+    time = np.linspace(-0.3, 0.3, 31)[None]
+    seen = joint_fit.brightness(camera, scene.motion, scene.stars, time)[0]
+    assert joint_fit.expected_brightness(scene, np.array([70.0])) == pytest.approx(seen, rel=0.06)
+
+
+def test_the_last_step_is_that_of_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A width that oscillates by several standard deviations does not count as an unfinished motion."""
+    camera, scene = _taken(60.0, 300.0)
+    done = iterate(camera, scene, camera.free, ROUGH)
+    assert done is not None
+    solve, sign = joint_fit.solve, [1.0]
+
+    def oscillating(*arguments: Any) -> Solution | None:
+        found = solve(*arguments)
+        assert found is not None
+        sign[0] = -sign[0]
+        deviation = np.sqrt(np.diag(found.covariance))
+        shared = moved[0] * deviation * camera.free
+        shared[joint_fit.WIDTH] = sign[0] * 5.0 * deviation[joint_fit.WIDTH]
+        return replace(found, shared=shared)
+
+    monkeypatch.setattr(joint_fit, "solve", oscillating)
+    for moved in ([0.5], [3.0]):
+        again = iterate(camera, done.scene, camera.free, replace(ROUGH, tolerance=0.0))
+        assert again is not None
+        assert again.last_step == pytest.approx(moved[0])
+
+
 def test_the_brightness_along_a_path_is_the_mean_of_three_rows_of_pixels() -> None:
     """The mean of a band of pixels is that of a linear image. Its error is that of the mean of samples."""
     row, column = np.mgrid[:100, :120]
