@@ -214,6 +214,8 @@ _SAME_STAR = 3.0
 _LEAST_MARGIN = 50.0
 # Minimum ratio of the chi-square difference between both signs to its scatter, for a decision on the sign.
 _LEAST_AGREEMENT = 3.0
+# Reason reported if a motion with only one sign of the rotation fits the frame of a rolling shutter.
+_ONE_SIGN = "the streaks of the rolling shutter do not show the direction of the rotation: give a prior rate"
 # Upper limit of a single star's chi-square difference in the decision on the sign of the rotation.
 _MOST_DIFFERENCE = 50.0
 
@@ -264,7 +266,12 @@ def _rolling_result(
     both = [found for found in (fit_along(axis), fit_along(-axis)) if found is not None]
     if not both:
         return None
-    one, other = both[0], both[-1]
+    known = [found for found in both if found.result.rate is not None]
+    if len(known) < 2:
+        # If the fit succeeds for only one sign, the other sign may still be correct, so no rate is returned.
+        reason = _ONE_SIGN if known else both[0].result.reason
+        return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None, reason=reason)
+    one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
     of_one, of_other = np.nonzero(distance < _SAME_STAR)
     better = np.clip(other.excess[of_other] - one.excess[of_one], -_MOST_DIFFERENCE, _MOST_DIFFERENCE)
@@ -272,10 +279,9 @@ def _rolling_result(
     if abs(total) >= max(_LEAST_MARGIN, _LEAST_AGREEMENT * scatter):
         return (one if total > 0.0 else other).result
     first, second = one.result, other.result
-    if len(both) < 2 or first.rate is None or second.rate is None:
-        # If the fit succeeds for only one sign, the other sign may still be correct, so no rate is returned.
-        return replace(first, status=StreakStatus.FAILED, rate=None, covariance=None)
+    assert first.rate is not None
     assert first.covariance is not None
+    assert second.rate is not None
     assert second.covariance is not None
     sum_of_both = first.rate + second.rate
     covariance = 0.5 * (first.covariance + second.covariance) + 0.25 * np.outer(sum_of_both, sum_of_both)
