@@ -250,14 +250,11 @@ def iterate(
         if solution is None:
             return None
         before_step, (scene, wanted) = scene, _stepped(scene, solution, camera.pinhole)
-        valid = 0.3 < scene.width < _WIDEST and scene.width <= widest
-        valid &= bool(np.all(np.isfinite(scene.stars)))
+        valid = 0.3 < scene.width < _WIDEST and scene.width <= widest and bool(np.isfinite(scene.stars).all())
         if not valid or not np.linalg.norm(scene.motion.rotation) <= np.pi:
             return None
-        deviation = np.sqrt(np.maximum(np.diag(solution.covariance)[free], 1e-30))
-        steps = np.abs(solution.shared[free]) / deviation
-        # The width, the last parameter, oscillates by several of its small standard deviations if the set of
-        # excluded pixels changes with it.
+        steps = np.abs(solution.shared / np.sqrt(np.maximum(np.diag(solution.covariance), 1e-30)))[free]
+        # The width, the last parameter, oscillates if the set of excluded pixels changes with it.
         last_step = float(np.max(steps[:-1] if how.clipped else steps, initial=0.0))
         if np.max(steps) <= how.settled or wanted <= how.tolerance:
             last_step = 0.0

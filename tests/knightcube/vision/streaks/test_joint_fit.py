@@ -28,9 +28,11 @@ from knightcube.vision.streaks.joint_fit import (
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
     SHARED,
+    WIDTH,
     EliminatedEquations,
     Evaluation,
     Solution,
+    solve,
 )
 from knightcube.vision.streaks.scene_images import light_of
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
@@ -387,10 +389,10 @@ def _along_a_row(*stars: tuple[float, float], width: float = 1.1) -> tuple[FitPr
     """Return a frame of streaks of 70 px along row 50 without noise, and its stars (x, counts)."""
     column, across = np.arange(120.0), np.arange(100.0) - 50.0
     signal, motion = np.zeros((100, 120)), CameraMotion.steady(np.array([0.0, 0.1, 0.0]))
-    for x, light in stars:
+    for x, counts in stars:
         inside = np.clip(np.minimum(column + 0.5, x + 35.0) - np.maximum(column - 0.5, x - 35.0), 0.0, 1.0)
         profile = np.exp(-0.5 * (across / width) ** 2) / (np.sqrt(2.0 * np.pi) * width)
-        signal += light / 70.0 * profile[:, None] * inside
+        signal += counts / 70.0 * profile[:, None] * inside
     camera = _small_problem()
     floor, nowhere = np.full(12_000, 16.0, dtype=np.float32), np.zeros(12_000, dtype=np.bool_)
     frame = replace(camera.frame, signal=signal.astype(np.float32).reshape(-1), floor=floor, bad=nowhere)
@@ -435,7 +437,7 @@ def test_the_last_step_is_that_of_the_motion(monkeypatch: pytest.MonkeyPatch) ->
     camera, scene = _taken(60.0, 300.0)
     done = iterate(camera, scene, camera.free, ROUGH)
     assert done is not None
-    solve, sign = joint_fit.solve, [1.0]
+    sign = [1.0]
 
     def oscillating(*arguments: Any) -> Solution | None:
         found = solve(*arguments)
@@ -443,7 +445,7 @@ def test_the_last_step_is_that_of_the_motion(monkeypatch: pytest.MonkeyPatch) ->
         sign[0] = -sign[0]
         deviation = np.sqrt(np.diag(found.covariance))
         shared = moved[0] * deviation * camera.free
-        shared[joint_fit.WIDTH] = sign[0] * 5.0 * deviation[joint_fit.WIDTH]
+        shared[WIDTH] = sign[0] * 5.0 * deviation[WIDTH]
         return replace(found, shared=shared)
 
     monkeypatch.setattr(joint_fit, "solve", oscillating)
