@@ -237,12 +237,14 @@ _PROTOCOLS: Mapping[str, type[Any]] = {
 
 
 def _check_methods(kind: str, section: Any, device: Any, key: str) -> None:
-    """Raise NotResponding if a driver of another package lacks a method of its Protocol."""
+    """Close the device and raise NotResponding if a driver of another package lacks a required method."""
     named = getattr(section, "driver", None) or section.__struct_config__.tag
     if ":" not in named:
         return
     for name, value in vars(_PROTOCOLS[kind]).items():
         if callable(value) and not name.startswith("_") and not callable(getattr(device, name, None)):
+            if callable(close := getattr(device, "close", None)):
+                close()
             problem = f"whose driver {type(device).__name__} has no method `{name}`: add it"
             raise NotResponding(f"`{key}`", f"is {named!r}, {problem}")
 

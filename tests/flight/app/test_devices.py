@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import Mock
@@ -31,6 +32,16 @@ def test_sensors_that_were_opened_to_be_checked_are_closed(
         with pytest.raises(NotResponding):
             devices.probe_sensors(Mock(), section)
     unit.close.assert_called_once_with()
+
+
+def test_a_device_that_lacks_a_method_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A patient start opens the device again every few seconds."""
+    device = Mock(spec=["close"])
+    monkeypatch.setattr(devices, "driver_of", lambda *_: SimpleNamespace(open=lambda *_: device))
+    config = cast(Any, SimpleNamespace(gps=SimpleNamespace(driver="other:GPS")))
+    with ExitStack() as stack, pytest.raises(NotResponding, match="has no method"):
+        devices.opened("gps", config, Mock(), stack)
+    device.close.assert_called_once_with()
 
 
 @pytest.mark.parametrize(("period", "arrival"), [(1.0, 2.4), (5.0, 5.4)])
