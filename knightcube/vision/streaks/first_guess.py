@@ -634,7 +634,7 @@ _LEAST_SIGMAS = 5.0
 _FRAME_ENOUGH = 40.0
 # Upper limit of a sample in the search on all circles, in standard deviations. Variations of the samples
 # along a bright streak, for instance because the streak crosses several circles, would look like streaks.
-_FRAME_CAP = 10.0
+_FRAME_CAP = 12.0
 
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
