@@ -18,6 +18,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.faint_stars import find_faint
 from knightcube.vision.streaks.first_guess import (
+    FRAME_CAP,
     SCANNED_STARS,
     Circles,
     MotionGuess,
@@ -181,9 +182,16 @@ def _likelier(
 
 
 def likely_angles(camera: FitProblem, rotation: FloatArray) -> list[float]:
-    """Return the likely rotation angles (rad) about the axis of `rotation` (3,) from a whole-frame scan."""
-    camera.work.passed(camera.frame.signal.size)
-    return frame_angles(camera.frame, camera.pinhole, rotation, _MOST_ANGLES)
+    """Return the likely rotation angles (rad) about the axis of `rotation` (3,), from scans of the frame.
+
+    Bright streaks show the angle best, unless the light along them varies. A second scan therefore limits the
+    samples.
+    """
+    angles: list[float] = []
+    for cap in (np.inf, FRAME_CAP):
+        camera.work.passed(camera.frame.signal.size)
+        angles += frame_angles(camera.frame, camera.pinhole, rotation, _MOST_ANGLES, cap)
+    return angles
 
 
 def fits_near_angles(camera: FitProblem, rotation: FloatArray, angles: list[float]) -> Iterator[_FirstFit]:

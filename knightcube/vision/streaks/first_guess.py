@@ -634,15 +634,20 @@ _LEAST_SIGMAS = 5.0
 _FRAME_ENOUGH = 40.0
 # Upper limit of a sample in the search on all circles, in standard deviations. Variations of the samples
 # along a bright streak, for instance because the streak crosses several circles, would look like streaks.
-_FRAME_CAP = 12.0
+FRAME_CAP = 8.0
 
 
-def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
-    """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
+def frame_angles(
+    frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int, cap: float = FRAME_CAP
+) -> list[float]:
+    """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first.
+
+    Samples are limited to `cap` standard deviations.
+    """
     # The sampling of the grid is that for a rotation of one radian.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step, noise = grid.angle / grid.length, np.float32(SAMPLE_NOISE * frame.usual_noise)
-    most_counts = np.float32(_FRAME_CAP) * noise
+    most_counts = np.float32(cap) * noise
     held = cumulative_sums(np.clip(frame.sums, -most_counts, most_counts), pinhole, grid)
     held *= np.float32(1.0) / noise
     longest = min(len(grid.azimuth) // 2, int(np.pi / step))

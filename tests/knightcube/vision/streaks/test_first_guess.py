@@ -318,7 +318,7 @@ def test_a_box_is_significant_relative_to_both_its_sides() -> None:
 def test_variations_along_bright_streaks_are_not_streaks() -> None:
     """The angle from the whole frame is near that of the streaks, and not that of the variations along them.
 
-    The later fit converges to the angle. Without the limit, the angle is wrong by a factor of eight.
+    Without the limit of the samples, the angle is wrong by a factor of eight.
     """
     pinhole, rng, angle = Pinhole(320, 300, 900.0), np.random.default_rng(5), 0.15
     image, along = np.zeros((300, 320)), np.arange(135)
@@ -329,7 +329,7 @@ def test_variations_along_bright_streaks_are_not_streaks() -> None:
         image[row - 4 : row + 5, first : first + 135] += across[:, None] * light
     frame = reduce_frame(rng.normal(image + 100.0, 4.0).astype(np.uint16), SATURATION, 1.0)
     found = frame_angles(frame, pinhole, np.array([0.0, angle, 0.0]), 1)
-    assert found == pytest.approx([angle], rel=0.15)
+    assert found == pytest.approx([angle], rel=0.05)
 
 
 def test_refined_lengths_are_within_half_a_step_of_the_search() -> None:
