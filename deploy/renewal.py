@@ -880,7 +880,7 @@ class Renewal:
             text = f"no authentic frame for {state.silent_s:.0f} s: the {what} is used"
             if self._go_back(step, "", "command-loss", text):
                 return
-            # If there is no version to which this step can return, the next step follows at once.
+            # This step found no version to which it can return, so the next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _age_note(self) -> None:

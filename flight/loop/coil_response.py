@@ -559,12 +559,12 @@ def _bin_equations_numpy(
         free: indices (f,) of the axes about which the body can rotate.
         sums: the integrals (2, 3 n + 6): their values at the end of the first bin, and their means over it.
         motion: rotation vector (rad) up to the first bin, and mean rate (rad/s) in the first bin, (2, 3).
-        span: time (s) between the bins, or 0.0 if there is no first bin.
+        span: time (s) between the bins, or 0.0 if the first bin is missing.
 
     Returns:
         The sums and the motion of the second bin, the equations (3, 2 f + k + n + 1), and the largest body
         rate in the second bin. The columns of the equations are the coefficients of torsions, dampings, error
-        modes and coil gains, then the acceleration. Without a first bin, the equations are zero.
+        modes and coil gains, then the acceleration. If the first bin is missing, the equations are zero.
     """
     count, coils, rates = len(samples), samples.shape[1] - 7, samples[:, 1:4]
     products = rate_products(rates)

@@ -151,8 +151,8 @@ class HorizonCameraJob:
         frames: images (rows, columns) by the index of their camera.
         cameras: all cameras.
         knowledge: prior knowledge, with directions and attitude in body axes.
-        strings: model of the solar strings, and their currents (n,), A; None if there is no recent reading of
-            the currents.
+        strings: model of the solar strings, and their currents (n,), A; None if the newest reading of the
+            currents is too old.
         response: response of the cameras' detectors to light intensity, or None for linear detectors.
         structure: maps of the spacecraft's own structure in the images, by the index of the camera.
         earth_only: indices of the cameras in whose images the Sun is not searched.

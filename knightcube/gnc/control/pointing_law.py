@@ -104,11 +104,8 @@ class PointingLaw:
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond + residual_dipole
         # The dipole moment along the field is removed, because a dipole along the field causes no torque.
-        dipole = field * (float(field @ pull) / _square(field)) - pull if field.any() else _NO_DIPOLE
+        dipole = field * (float(field @ pull) / _square(field)) - pull if field.any() else np.zeros(3)
         return PointingCommand(limited(dipole, self._limit), rotation, missed)
-
-
-_NO_DIPOLE: FloatArray = np.zeros(3)
 
 
 def _square(field: FloatArray) -> float:
@@ -170,5 +167,5 @@ def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> 
     """
     check_finite(rate=rate)
     if not field.any():
-        return _NO_DIPOLE
+        return np.zeros(3)
     return np.asarray(cross_product(field, (-2.0 * DAMPING * inertia) @ rate) / _square(field))

@@ -652,7 +652,7 @@ def _random_tensors(inertia: FloatArray, errors: BodyErrors, generator: np.rando
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return T (..., 3, 3, 3) of inertia tensors, with w'_i = T_ijk w_j w_k if there is no torque."""
+    """Return T (..., 3, 3, 3) of inertia tensors, with w'_i = T_ijk w_j w_k in torque-free motion."""
     crosses = cross_matrices(np.eye(3))
     return np.asarray(-np.einsum("...il,jlm,...mk->...ijk", np.linalg.inv(inertia), crosses, inertia))
 

@@ -75,7 +75,7 @@ def nadirs_of_triples(
     size = np.linalg.norm(normal, axis=1)
     directions = normal / np.where(size > _PARALLEL, size, np.nan)[:, None]
     cosines = np.einsum("ij,ij->i", directions, first)
-    # Of the two normals, nadir is the one within 90 deg of the rays: the limb is within 90 deg of nadir.
+    # Nadir is the normal within 90 deg of the rays, because the limb is within 90 deg of nadir.
     sign = np.where(cosines < 0.0, -1.0, 1.0)
     return directions * sign[:, None], cosines * sign
 

@@ -632,13 +632,13 @@ _SPARSE = 2
 _LEAST_SIGMAS = 5.0
 # Upper limit of the significance (standard deviations) of one possible streak in the sum over all streaks.
 _FRAME_ENOUGH = 40.0
-# Upper limit of a sample in the search on all circles, in standard deviations. Variations of the samples
-# along a bright streak, for instance because the streak crosses several circles, would look like streaks.
+# Upper limit of a sample in the second search on all circles, in standard deviations. Without the limit,
+# variations of the samples along a bright streak, which may cross several circles, would look like streaks.
 FRAME_CAP = 8.0
 
 
 def frame_angles(
-    frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int, cap: float = FRAME_CAP
+    frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int, cap: float
 ) -> list[float]:
     """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first.
 

@@ -88,7 +88,7 @@ def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> d
 
 
 def _wait_for_port(tcp: int) -> None:
-    """Wait until a link listens on the port. Raises TimeoutError if there is no link."""
+    """Wait until a link listens on the port. Raises TimeoutError if none does in time."""
     until = time.monotonic() + 2.0 * _START_S
     while time.monotonic() < until:
         with suppress(OSError):

@@ -12,6 +12,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import first_guess
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.first_guess import (
+    FRAME_CAP,
     Circles,
     find_axis,
     frame_angles,
@@ -328,7 +329,7 @@ def test_variations_along_bright_streaks_are_not_streaks() -> None:
         first = int(rng.integers(5, 180))
         image[row - 4 : row + 5, first : first + 135] += across[:, None] * light
     frame = reduce_frame(rng.normal(image + 100.0, 4.0).astype(np.uint16), SATURATION, 1.0)
-    found = frame_angles(frame, pinhole, np.array([0.0, angle, 0.0]), 1)
+    found = frame_angles(frame, pinhole, np.array([0.0, angle, 0.0]), 1, FRAME_CAP)
     assert found == pytest.approx([angle], rel=0.05)
 
 
