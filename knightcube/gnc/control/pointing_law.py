@@ -89,9 +89,8 @@ class PointingLaw:
         as the field allows. In a field of zero, the dipole moment is zero. Raises ArgumentError for values
         that are not finite, and for an attitude that is not a unit quaternion.
         """
-        check_finite(
-            time=time, quaternion=quaternion, rate=rate, residual_dipole=residual_dipole, sizes=sizes
-        )
+        if not math.isfinite(time):
+            check_finite(time=time)
         check_length("quaternion", quaternion)
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
@@ -104,7 +103,9 @@ class PointingLaw:
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond + residual_dipole
         # The dipole moment along the field is removed, because a dipole along the field causes no torque.
-        dipole = field * (float(field @ pull) / _square(field)) - pull if field.any() else np.zeros(3)
+        dipole = field * (float(field @ pull) / _square(field)) - pull if field.any() else 0.0 * pull
+        if not math.isfinite(float(dipole @ dipole)):  # one check per cycle instead of one for each argument
+            check_finite(quaternion=quaternion, rate=rate, residual_dipole=residual_dipole, sizes=sizes)
         return PointingCommand(limited(dipole, self._limit), rotation, missed)
 
 
