@@ -22,7 +22,7 @@ from knightcube.vision.camera.lens import CameraKnowledge, Lens
 from knightcube.vision.streaks.camera_motion import CameraMotion
 from knightcube.vision.streaks.estimate import chained_stars, estimate_motion, estimate_rate
 from knightcube.vision.streaks.faint_stars import find_faint
-from knightcube.vision.streaks.first_guess import frame_angles, sharper_widths
+from knightcube.vision.streaks.first_guess import FRAME_CAP, frame_angles, sharper_widths
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import Course, Shutter, StreakScene
 from knightcube.vision.streaks.joint_fit import FitProblem, true_ends, unbroken
@@ -389,14 +389,15 @@ def test_streaks_are_unbroken_along_the_true_path_and_not_along_a_longer_one(
     assert least <= np.mean(whole) <= most
 
 
+@pytest.mark.parametrize("cap", [np.inf, FRAME_CAP])
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 450.0), (60.0, 300.0), (20.0, 120.0)])
 def test_the_light_of_the_whole_frame_gives_the_angle_about_an_approximate_axis(
-    theta: float, length: float
+    theta: float, length: float, cap: float
 ) -> None:
     scene = real_sky(34, np.radians(theta), length, 0.2)
     frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     turn = scene.rate * scene.exposure
-    told = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2)
+    told = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2, cap)
     assert abs(told[0] / np.linalg.norm(turn) - 1.0) < 0.08
 
 
