@@ -60,7 +60,7 @@ def everything_arrived(run: Run, orbit: bool) -> bool:
 
 
 def frames_with_rate(run: Run) -> PacketArray:
-    """Return the packets of frames whose streaks gave a rate. The sign of the rate may be unknown."""
+    """Return the packets of frames whose streaks gave a rate. The sign of a rate is not always known."""
     frames = run["streak"]
     found: PacketArray = frames[np.isfinite(frames["rate"]).all(axis=1)]
     return found

@@ -68,7 +68,7 @@ class FakeBoard:
     def python(self, label: str) -> Path:
         """Return a script that acts as a Python interpreter.
 
-        The virtual environments of this interpreter contain the release `label`.
+        The virtual environments that this interpreter makes contain the release `label`.
         """
         home = self.root.parent / f"python-{label}"
         path = home / "bin/python"
@@ -96,7 +96,7 @@ class FakeBoard:
         return done.stdout
 
     def unit_words(self, unit: str, setting: str = "ExecStart") -> list[str]:
-        """Return the command of a unit, as words, up to the launcher, with the file paths of this board."""
+        """Return the words of a unit's command up to the launcher, with the file paths of this board."""
         text = (DEPLOY / unit).read_text(encoding="utf-8").replace("\\\n", "")
         (line,) = re.findall(rf"^{setting}=-?(/bin/sh -c '.*)$", text, re.MULTILINE)
         return shlex.split(line.replace("$$", "$").replace("/opt/knightcube", str(self.prefix)))[:4]

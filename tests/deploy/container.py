@@ -29,7 +29,7 @@ _FACTS = "/run/knightcube-devices/facts.json"
 COMMANDS = "/run/knightcube/commands"
 """Path of the socket on which the service receives commands."""
 LINK, KEYS = "127.0.0.1:5010", "/var/lib/knightcube-link/keys"
-"""Address of the link, and folder of its keys on board, in the scenario `RENEWALS`."""
+"""Address of the link and its key folder on the board, in the scenario `RENEWALS`."""
 
 _OPENED = f"""[Service]
 ProtectHome=no

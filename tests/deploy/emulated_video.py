@@ -2,8 +2,8 @@
 
 `python -m tests.deploy.emulated_video CONFIG SOCKET WORDS... [-- WORDS...]` runs the commands `knightcube
 WORDS...` in order until a command fails. The device server at SOCKET renders the frames for the cameras of
-CONFIG, which are numbered in the order of CONFIG. The program replaces only the kernel's side of /dev/videoN,
-which performs the driver's ioctls. The memory maps of the driver are real.
+CONFIG, which are numbered in the order of CONFIG. The program replaces only the ioctls of /dev/videoN, which
+the kernel otherwise performs. The driver's memory-mapped buffers are real files.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ServedVideo(IoctlCamera):
     """
 
     def __init__(self, camera: Camera | WideCamera, source: RemoteFrameSource, clock: SystemClock) -> None:
-        """Create the device file of `camera` in a separate folder, which has the same name."""
+        """Create the device file of `camera` at its configured path."""
         device = camera.device
         assert isinstance(device, V4l2Device)
         folder = Path(device.path).parent
@@ -56,7 +56,7 @@ class ServedVideo(IoctlCamera):
 
     @property
     def inode(self) -> int:
-        """File descriptor of an opened device."""
+        """Inode number of the memory file that represents the device."""
         return os.fstat(self._memory).st_ino
 
     def _streamon(self, argument: Any) -> None:

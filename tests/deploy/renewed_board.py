@@ -49,7 +49,7 @@ class _Board(_SCRIPT_BOARD):  # type: ignore[misc]  # the script is imported wit
     """Files and services of a board. The bundles are opened in the process of the test."""
 
     def run(self, words: Sequence[object], limit_s: float = 1800.0) -> subprocess.CompletedProcess[str]:
-        """Run a program. The Python interpreter of a release is started only to show that it can start."""
+        """Run a program. Only the code of `open_bundle.py` runs in this process."""
         python, *options = words
         if len(options) < 3 or Path(str(options[2])).name != "open_bundle.py":
             found: subprocess.CompletedProcess[str] = super().run(words, limit_s)

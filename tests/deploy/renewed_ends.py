@@ -23,7 +23,7 @@ FLIGHT, LINK, SAFE = "knightcube.service", "knightcube-link.service", "knightcub
 
 
 def linked_text() -> str:
-    """Return a simulated configuration with a link, and without a camera, whose sky index takes seconds."""
+    """Return a simulated configuration with a link and no camera, because building a sky index is slow."""
     text = CONFIG.read_text(encoding="utf-8")
     text = re.sub(r"^camera:.*?^(?=\S)", "camera: none\n", text, flags=re.MULTILINE | re.DOTALL)
     link = json.dumps({"keys": KEYS, "udp": "127.0.0.1:5000"})

@@ -145,7 +145,7 @@ def _renewal(service: Service) -> dict[str, Any]:
 def _damaged(service: Service) -> dict[str, Any]:
     """Flip one bit of the configuration while the board has no accepted copy of it.
 
-    The service must wait until the file is intact.
+    The service must wait until the file is restored.
     """
     systemctl("reset-failed", SERVICE)
     shutil.rmtree("/var/lib/knightcube/flown", ignore_errors=True)
@@ -212,6 +212,6 @@ if __name__ == "__main__":
     for name in WORLDS:
         try:
             facts_seen["boards"][name] = fly_board(name)
-        except (OSError, ValueError) as error:  # store the observations that were made before the error
+        except (OSError, ValueError) as error:  # observations made before the error are stored too
             facts_seen["boards"][name] = {"problem": repr(error)}
     (place / "seen.json").write_text(json.dumps(facts_seen, indent=1), encoding="utf-8")

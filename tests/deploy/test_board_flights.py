@@ -204,7 +204,7 @@ def test_packets_of_every_device_arrive(flown: Flown) -> None:
 def test_the_rates_of_the_frames_are_those_of_the_gyro(flown: Flown) -> None:
     """The rates in streak packets agree with the gyro within 4 sigma plus 2 %.
 
-    The sign of a rate may be unknown.
+    The sign of a rate is not always known.
     """
     imu, frames = flown.run["imu"], frames_with_rate(flown.run)
     middle = frames["exposure_start_ns"] + 0.5e9 * frames["exposure"]

@@ -77,7 +77,7 @@ def tools(tmp_path: Path) -> Tools:
 
 
 def test_the_program_of_the_sources_needs_no_installation(tmp_path: Path) -> None:
-    """On a bench, `deploy/coils-off` of a clone finds its tool in the sources."""
+    """In a clone of the repository, `deploy/coils-off` finds `smbus_byte.py` among the sources."""
     (tmp_path / "i2cset").write_text("#!/bin/sh\nexit 1\n")
     (tmp_path / "i2cset").chmod(0o755)
     environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "KNIGHTCUBE_I2C": str(tmp_path / "none")}

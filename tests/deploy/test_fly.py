@@ -202,7 +202,7 @@ def test_a_release_that_cannot_start_is_replaced_by_the_other(
 
 
 def test_a_proven_release_that_no_longer_starts_is_replaced_too(board: FakeBoard) -> None:
-    """The starts of an accepted release are not counted, but a failed start leads to the previous release."""
+    """Starts of an accepted release are not counted; if it fails to start, the previous release starts."""
     (board.root / "state" / TRIALS).write_bytes(starts_record({}, SECOND))
     PYTHONS["cannot import the flight"](_python(board, "current"))
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4

@@ -424,7 +424,7 @@ def test_a_refused_bundle_leaves_no_files(board: RenewedBoard) -> None:
 
 
 def test_a_release_that_cannot_open_bundles_is_refused(board: RenewedBoard) -> None:
-    """Such a release could never be replaced once both releases of the board are of this kind."""
+    """If neither release of a board could open bundles, the board could never be updated again."""
     opened = open_bundle.main
 
     def main(words: Sequence[str]) -> int:
@@ -905,7 +905,7 @@ def test_what_an_interrupted_step_left_is_removed_after_a_confirmed_trial(
 def test_a_file_that_does_not_fit_on_the_disk_leaves_no_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A part of an index of 256 MiB would fill the disk, on which then no state could be stored."""
+    """An incomplete index of 256 MiB would fill the disk, so that no state could be stored."""
     _fail_once(monkeypatch, renewal.os, "fsync", *range(3, 100))
     with pytest.raises(OSError, match="Input/output"):
         renewal.replace_file(tmp_path / "index", bytes(9))

@@ -29,7 +29,7 @@ from tests.support.flights import CONFIG
 
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"
-"""Link sections: a network alone, and a network with a serial line that is built in or not connected."""
+"""Link section with a UDP address and a serial device."""
 CAMERA = "{device: {driver: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
@@ -266,7 +266,7 @@ def test_the_coil_bus_may_have_a_persistent_name_in_each_unit(tmp_path: Path) ->
 
 @pytest.mark.parametrize("bus", ["-1", "knightcube-i2c", "/dev/a b", "/dev/100%", "true", "1.5", "'1'"])
 def test_a_bus_that_is_neither_number_nor_path_is_refused(tmp_path: Path, bus: str) -> None:
-    """A path is written into units and into a note of ASCII words, where blanks and % have other meanings."""
+    """Blanks and % in a path have special meanings in units and in the file that `coils-off` reads."""
     with pytest.raises(ConfigError, match=r"`coils\.bus`"):
         dropin(changed_testbed(tmp_path, coils_bus=bus))
 

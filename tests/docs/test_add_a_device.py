@@ -36,7 +36,7 @@ def snippet(name: str) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder with the files that a reader writes who follows the page."""
+    """Return a folder with the files that a reader of the page writes."""
     blocks = [block for block in blocks_of(PAGE) if "--8<--" in block.text and "ina226" in block.text]
     shown = {language: "" for language in ("python", "yaml")}
     for block in blocks:
