@@ -35,7 +35,7 @@ def test_sensors_that_were_opened_to_be_checked_are_closed(
 
 
 def test_a_device_that_lacks_a_method_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A patient start opens the device again every few seconds."""
+    """A start that waits for its devices opens them again every few seconds, so the device must be closed."""
     device = Mock(spec=["close"])
     monkeypatch.setattr(devices, "driver_of", lambda *_: SimpleNamespace(open=lambda *_: device))
     config = cast(Any, SimpleNamespace(gps=SimpleNamespace(driver="other:GPS")))

@@ -244,7 +244,7 @@ def test_a_mistake_in_a_satellite_s_targets_gets_one_line(right: str, wrong: str
 
 
 def _without_description(kind: Any, found: dict[str, None]) -> None:
-    """Add the required numbers and vectors of the sections in a type that have no description to `found`."""
+    """Add to `found` all required numbers and vectors without a description in the sections of a type."""
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         for one in msgspec.structs.fields(kind):
             texts = [meta.description for meta in getattr(one.type, "__metadata__", ())]

@@ -83,7 +83,7 @@ def test_a_damaged_configuration_is_refused_in_one_line_or_usable(chance: Random
         assert "\n" not in message
         assert len(message) < 8000
         return
-    except DeviceError:  # the devices cannot be set as this configuration states
+    except DeviceError:  # a driver refuses a setting of this configuration
         return
     assert_finite(msgspec.to_builtins(config))
     assert msgspec.convert(msgspec.to_builtins(config), type(config)) == config

@@ -102,9 +102,9 @@ def _default(field: dataclasses.Field[object]) -> object:
 
 
 def _disagreements(kind: type, section: type[msgspec.Struct]) -> list[str]:
-    """Return the values whose two defaults differ. Times in ns are compared with times in s.
+    """Return the values whose two defaults differ. Times in s are converted to ns for the comparison.
 
-    If a section has no default (None), only the settings class has a default, which is not compared.
+    Values without a default, and values whose default in the section is None, are not compared.
     """
     of_section = {field.name: field.default for field in msgspec.structs.fields(section)}
     found = []

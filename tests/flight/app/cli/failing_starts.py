@@ -3,9 +3,9 @@
 `python -m tests.flight.app.cli.failing_starts FOLDER [all]` runs in a separate process, because the audit
 hook that makes calls fail cannot be removed. The program prints one JSON object per start.
 
-Python raises an audit event before it opens a file or a socket. If `all` is given, each call fails with each
-error, and calls without an audit event fail too. Calls without an audit event are replaced by test doubles in
-the modules that use the calls.
+Python raises an audit event before it opens a file or a socket. If `all` is given, each call is tested with
+each error, and calls without an audit event are made to fail too. Calls without an audit event are replaced
+by test doubles in the modules that use the calls.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ REPLACED: tuple[tuple[Any, tuple[str, ...]], ...] = (
     (fcntl, ("flock",)),
     (socket.socket, ("setsockopt", "listen", "setblocking")),
 )
-"""Calls without an audit event, by the module or class whose attribute the link process calls."""
+"""Names of calls without an audit event, with the module or class to which they belong."""
 ERRORS = (errno.EIO, errno.ENOSPC, errno.ENOENT, errno.EACCES, errno.EROFS)
 NETWORK_ERRORS = (errno.EADDRINUSE, errno.EADDRNOTAVAIL)
 
@@ -45,7 +45,7 @@ class Faults:
     """Injector of failing calls during the starts of a link.
 
     Attributes:
-        seen: calls of the present start, each with its arguments.
+        seen: name and one argument of each call during the present start.
         waits: number of times that the present start has waited.
     """
 
@@ -55,7 +55,7 @@ class Faults:
         self._error_of: Callable[[str, str], int] | None = None
 
     def start(self, error_of: Callable[[str, str], int]) -> None:
-        """Begin to count the calls of a new start.
+        """Clear the record of calls, and select the calls that fail during the next start.
 
         `error_of` returns the errno with which a call must fail, or 0 if the call must succeed.
         """
@@ -72,7 +72,7 @@ class Faults:
         self._fail(event, str(arguments[-1] if event == "socket.bind" else arguments[0]))
 
     def failing(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that fails if the call is selected, and otherwise calls `called`."""
+        """Return a function that calls `called`, unless `error_of` selects the call to fail."""
 
         def call(*arguments: Any, **named: Any) -> Any:
             if self._error_of is not None:

@@ -115,9 +115,9 @@ def test_a_command_goes_by_each_line_and_each_stage_is_shown(
 def test_authentic_frames_with_any_counter_end_no_process(
     lines: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No counter of an authentic frame ends the link.
+    """Authentic frames with any counter do not end the link.
 
-    A frame that is stored and ends the link would end the link again after each restart. The highest counters
+    If a stored frame could end the link, it would end the link again after each restart. The highest counters
     are sent first, because the link reports only four refusals a second.
     """
     assert command(lines, "udp", "ping") == 0  # this command uses counter 0

@@ -95,7 +95,7 @@ def test_the_filter_gets_noises_and_uniform_errors_of_the_configuration() -> Non
     assert settings.torque == given.torque_sizes()
     assert settings.magnet[0] == pytest.approx(uniform * given.inertial_unit.accuracy.field_bias)
     assert settings.gate_sigma == section.gate_sigma
-    # A current that scatters in each cycle of 25 ms has the noise density of its variance times 25 ms.
+    # The noise density is the standard deviation per cycle times the square root of the cycle of 25 ms.
     assert settings.coil_noise == pytest.approx(section.current_noise * 0.648 * math.sqrt(0.025))
     assert settings.coils is None, "coils along the body axes have independent errors"
     assert body.filter_settings(config("orbit_1u_tilted")).coils is not None
@@ -219,7 +219,7 @@ class Estimating:
 
 
 def diagonal(rate: float) -> Any:
-    """Return an estimate with variances of the attitude, and of the rate about z (the largest one)."""
+    """Return an estimate whose rate about z has the largest variance of the three rates, `rate` squared."""
     variances = np.array([1.0, 1.0, 1.0, 0.25 * rate**2, 0.5 * rate**2, rate**2])
     return SimpleNamespace(covariance=np.diag(variances), rate=np.array([0.1, 0.2, 0.3]), time_ns=5,
                            quaternion=normalise(np.array([0.1, 0.2, 0.3, 0.9])))  # fmt: skip
@@ -347,7 +347,7 @@ def test_a_matrix_of_redundant_coils_is_not_stored_while_a_coil_is_isolated() ->
 
 
 def test_a_change_of_devices_reaches_the_detumbler() -> None:
-    """The detumbler must not apply a reversed coil twice, in its estimated matrix and in the commands."""
+    """A reversed coil must not be corrected twice: in the detumbler's matrix and in the commands."""
     calls: list[str] = []
     found: Any = estimation()
     found.detumbler = SimpleNamespace(

@@ -119,7 +119,7 @@ def test_a_star_attitude_that_contradicts_a_coarse_one_replaces_it_at_once() -> 
 
 
 def test_a_filter_that_began_after_a_reading_of_the_strings_is_kept() -> None:
-    """A string reading from before a restart of the filter does not change the filter.
+    """A reading of the solar strings from before a restart of the filter does not change the filter.
 
     Star fixes restart the filter at 15.4 s, and the reading of 15.25 s is checked afterwards.
     """

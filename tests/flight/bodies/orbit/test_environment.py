@@ -127,12 +127,12 @@ def dragged(drag: str) -> TwoLineElements:
 
 
 def ahead(degrees: float) -> TwoLineElements:
-    """Return the elements of a satellite on the orbit of FIRST and SECOND, but ahead by an angle."""
+    """Return elements like FIRST and SECOND with a mean anomaly that is larger by `degrees`."""
     return TwoLineElements(FIRST, summed(f"{SECOND[:43]}{(64.3547 + degrees) % 360.0:8.4f}{SECOND[51:]}"))
 
 
 class Flight:
-    """The GPS receiver of a satellite that follows its true elements. The receiver is read every ten seconds.
+    """The GPS receiver, read every ten seconds, of a satellite that moves as the elements `true` describe.
 
     The readings start `days` days after the epoch of the elements.
     """
@@ -169,7 +169,7 @@ class Flight:
 @pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
 @pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
 def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
-    """Good fixes replace elements that are 1 to 60 days old, and a jump of 40 km is then refused.
+    """Good fixes replace elements that are 1 to 60 days old; afterwards a jump of 40 km is refused.
 
     The elements have B* 0, but the satellite has B* 2.5e-4 or 5e-4. Each fix is compared with earlier fixes.
     """
@@ -291,7 +291,7 @@ def test_a_magnetometer_that_contradicts_both_orbits_decides_nothing() -> None:
 def test_the_sun_refutes_an_orbit_in_the_shadow() -> None:
     """One half of the orbit is in sunlight and the other half in shadow.
 
-    Sunlight refutes an orbit in shadow.
+    Measured sunlight contradicts elements whose present position is in shadow.
     """
     lit, dark = TwoLineElements(FIRST, SECOND), ahead(180.0)
     used = {}

@@ -112,10 +112,10 @@ def test_a_satellite_with_coils_in_a_plane_detumbles_and_no_coil_is_accused(
     section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
     run = fly(configuration.replace(config, coils=coils), tmp_path, section=section)
     count = len(axes)
-    # The records of more than three coils are separate.
+    # The packet `truth` contains three currents; the currents of more coils are in a separate packet.
     carried = np.abs(run["truth" if count < 3 else "true_coil_currents"]["current"]).max(axis=0)
     assert (carried[:count] > 0.1).all()
-    # The flight application treats the axis normal to the plane as a broken coil.
+    # The flight application assumes a coil normal to the plane, and treats it as broken.
     assert carried[count] == 0.0
     assert np.isnan(run["run"]["coil_resistance"][0]).tolist() == [k >= count for k in range(3)]
     assert {int(used) for used in run["health"]["coils_in_use"]} == {2**count - 1}

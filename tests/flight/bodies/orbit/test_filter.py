@@ -400,7 +400,7 @@ def test_uncertain_currents_increase_the_uncertainty() -> None:
 def test_the_attitude_error_stays_within_its_claim_if_a_coil_fails() -> None:
     """The attitude error stays within 5 sigma if a coil fails in the middle of a step.
 
-    The gyro measures the effect.
+    The gyro measures the resulting rate.
     """
     flown = acquired(pulses=True)
     flown.carries = 0.0

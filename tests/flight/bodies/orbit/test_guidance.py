@@ -47,7 +47,7 @@ def paths() -> PointingPaths:
 
 ALL = np.ones(3, dtype=bool)
 COILS = CoilMap(0.8 * np.eye(3), np.full(3, 0.5), np.array([10.0, 20.0, 30.0]))
-"""Coils with a limit of 2 LIMIT each, which are driven for half of the time."""
+"""Coils with a dipole limit of 2 LIMIT on each axis. They are driven for half of the time."""
 
 
 def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int, usable: BoolArray = ALL) -> PointingJob:
@@ -67,7 +67,7 @@ def submitted(
 ) -> list[PointingJob]:
     """Return the jobs that a planner submits for a goal if only the given coils (n,) are usable.
 
-    The texts of the planner's events are added to `told`.
+    The texts of the planner's events are appended to `told`.
     """
     jobs: list[PointingJob] = []
 

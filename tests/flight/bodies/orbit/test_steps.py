@@ -57,8 +57,8 @@ def test_the_mean_dipole_is_that_on_the_wire() -> None:
 def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean() -> None:
     """The impulse of a dipole is the final rate minus the mean rate that the dipole causes.
 
-    A dipole in the last quarter of a second changes the mean rate by an eighth of its effect on the final
-    rate.
+    A dipole that acts in the last quarter of a second changes the mean rate of this second by an eighth of
+    the change of the final rate.
     """
     history = DipoleHistory(10 * SECOND_NS)
     history.record(0, (0.0, 0.0, 0.0), True)

@@ -10,7 +10,7 @@ from tests.support.flights import demo_config
 
 
 def test_the_acceleration_noise_is_the_scatter_of_the_rate_by_current_errors_in_each_cycle() -> None:
-    """The acceleration noise is the random walk of the rate by 40 independent current errors per second."""
+    """The acceleration noise is the random walk of the rate by 40 independent current errors a second."""
     config = demo_config(10.0)
     plant, error = config.plant, config.estimation.current_noise
     torque = plant.coil_turns * plant.coil_area * plant.field * error

@@ -76,7 +76,7 @@ def test_the_axes_of_the_local_frame_are_nadir_and_the_direction_of_flight() -> 
 
 
 class _Fixed:
-    """A test double of field, sensor and tracker with a constant field, angle and current."""
+    """A test double of field model, sensor and tracker, with constant field, angle and current."""
 
     def __init__(self, field: FloatArray, angle: float, current: float) -> None:
         self._field, self._angle, self._current = field, angle, current

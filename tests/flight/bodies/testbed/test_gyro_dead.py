@@ -91,7 +91,7 @@ def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_
 def test_an_estimate_that_the_field_with_coils_off_contradicts_is_discarded(current: float) -> None:
     """An estimate is discarded if measurements with coils off contradict it repeatedly.
 
-    Inaccurate measurements with driven coils, in between, are accepted.
+    Between these measurements, inaccurate measurements with driven coils are accepted.
     """
     feed, filter_ = feed_of()
     for step in range(40):
