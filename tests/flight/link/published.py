@@ -1,6 +1,6 @@
 """Published numbers of events, commands, directives and parameters.
 
-Ground stations, archives and documents use these numbers, so a row may change only with the interface.
+Ground stations, archives and documents use these numbers, so every change of a row changes the interface.
 """
 
 from __future__ import annotations

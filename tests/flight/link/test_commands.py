@@ -116,7 +116,7 @@ def test_values_that_cannot_be_obeyed_are_refused_before_they_are_sent(
 
 
 def test_values_out_of_range_are_refused_again_on_arrival() -> None:
-    """A complete packet with a value out of range is refused on arrival, whatever its sender accepts."""
+    """A complete packet with a value out of range is refused on arrival, even if the sender accepts it."""
     for packet, fields in (("slew", {"q2": math.nan}), ("mode", {"mode": 99}), ("mode", {"mode": 0})):
         layout = LAYOUTS[packet]
         head = (layout.identifier, 0xC000, layout.length - 7, 1, 0)

@@ -75,7 +75,7 @@ def test_a_key_or_counter_that_was_never_written_is_not_read(folder: Path, chanc
 def test_only_new_genuine_frames_are_admitted(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     """Only new authentic frames are admitted.
 
-    Hypothesis draws only the seed, because new keys change each run.
+    Hypothesis draws only the seed, because frames depend on the keys, which are new in each run.
     """
     attacker, chance = LinkAttacker(tmp_path_factory.mktemp("link")), Random(seed)
     for _ in range(60):

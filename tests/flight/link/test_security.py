@@ -131,7 +131,7 @@ def test_a_frame_is_accepted_once_and_forged_frames_are_refused_with_their_cause
 def test_a_satellite_that_received_nothing_for_years_accepts_the_next_command(
     sky: Vault, ground: Vault
 ) -> None:
-    """A month of the fastest frames on a serial line, or decades of the gateway's pings, are lost."""
+    """The ground has used the counters of a month of fastest frames, or of decades of gateway pings."""
     skip(ground, 30 * 86_400 * 1000)
     assert gate(sky).admit(Ground(ground).frame(b"command")).spi == 1
 
@@ -351,7 +351,7 @@ def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(grou
 
 
 def test_a_block_of_counters_ends_when_the_key_was_changed(ground: Vault) -> None:
-    """A sender does not use the rest of a reserved block of counters after the key was changed."""
+    """A sender does not use the remaining counters of a reserved block after a change of the key."""
     sealer = Sealer(ground, 1, bytes(5), 64, shared=True)
     sealer.seal(bytes(5), b"x")
     old = ground.read(1)

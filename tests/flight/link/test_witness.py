@@ -206,7 +206,7 @@ def test_lost_copies_of_one_association_are_restored_at_once(keys: Path, spi: in
 def test_each_copy_of_the_second_record_is_at_most_one_command_old(
     keys: Path, ground: Vault, damaged: str, restarts: bool
 ) -> None:
-    """One undamaged copy suffices to detect a folder of keys that is older than one command."""
+    """The second record is at most one command behind, even if only one of its copies is undamaged."""
     at = opened(keys)
     commands, telemetry = Ground(ground, 1), Sealer(at, 3, TELEMETRY_MASK)
     for _ in range(5):

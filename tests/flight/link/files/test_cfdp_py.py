@@ -154,7 +154,7 @@ class Ends:
     def _give(self, unit: Any) -> None:
         """Pass a data unit to the handler of its transfer.
 
-        If the transfer has ended, reply as its handler would.
+        If the transfer has ended, send the reply that its handler would send.
         """
         if isinstance(unit, EofPdu) and unit.condition_code > CANCELLED:
             # spacepackets 0.32 leaves the condition code in the upper half of its byte.

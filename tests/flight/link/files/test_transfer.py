@@ -430,7 +430,8 @@ def test_without_an_end_missing_data_are_requested_ten_seconds_after_the_last_da
 def _sliced(missing: set[int]) -> list[tuple[int, int]]:
     """Return the first gap in the bytes 0 to 25, and the last gap in the bytes 7 to 25.
 
-    A gap is a pair (begin, end) of a range of `missing` bytes. The second gap starts at byte 7 or later.
+    A gap is a range of `missing` bytes, given as a pair (begin, end). The second gap starts at byte 7 or
+    later.
     """
     edges = [n for n in range(26) if (n in missing) != (n - 1 in missing)]
     gaps = list(zip(edges[::2], edges[1::2], strict=True))
@@ -451,7 +452,7 @@ def test_a_repeated_request_of_a_file_continues_its_transfer_and_a_ninth_transfe
 
 @pytest.mark.parametrize("displaced", [False, True])
 def test_a_file_that_was_received_whole_is_not_reported_as_cancelled(tmp_path: Path, displaced: bool) -> None:
-    """The sender has not yet acknowledged the end when the transfer is cancelled or others need its place."""
+    """The transfer is cancelled or displaced by new ones before the sender has acknowledged its end."""
     pair, transaction, data = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE), b"data"
     end = pair.ends[SATELLITE]
     end.take(pack(transaction, Metadata(4, "a", "a", CRC32)), 0)
@@ -607,7 +608,7 @@ def test_failed_syncs_are_counted_until_new_data_are_kept(
 
 
 class _WithoutSegments(io.BufferedReader):
-    """A file whose segments cannot be read, although longer reads succeed, as for the checksum."""
+    """A file in which reads of segments (below 1,000 bytes) fail, but reads for the checksum succeed."""
 
     def read(self, size: int | None = -1) -> bytes:
         if size is not None and size < 1000:
@@ -826,7 +827,7 @@ def test_only_the_folder_itself_is_closed_to_other_users(tmp_path: Path) -> None
 def test_records_are_written_on_a_file_system_without_constant_inode_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On such a file system, a folder that is not open has a new inode number at each access."""
+    """Some file systems give a folder that is not open a new inode number at each access."""
     place, stat, numbers = tmp_path / "transfers", os.stat, iter(range(1, 1000))
 
     def renumbered(path: object, **options: bool) -> os.stat_result:

@@ -32,7 +32,7 @@ class Wire:
     def __init__(self) -> None:
         self.up: list[bytes] = []
         self.down: list[bytes] = []
-        self.takes: int | None = None  # most frames that the line takes in a call, or None for any number
+        self.takes: int | None = None  # most frames that the line accepts in one call, or None for no limit
         self.listened = True
 
     def receive(self) -> list[tuple[bytes, Any]]:

@@ -84,5 +84,5 @@ class FiledEnds(BothEnds):
         return failed(reports) or reports[-1].stage.name.lower()
 
     def _left(self, frames: list[bytes]) -> list[bytes]:
-        """Return the given frames without those that the line loses."""
+        """Return the frames that the line does not lose."""
         return [frame for frame in frames if self.draw.random() >= self.loss]

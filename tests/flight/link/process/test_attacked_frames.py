@@ -85,7 +85,7 @@ def _attack(link: BothEnds, start: int, seed: tuple[int, ...]) -> dict[str, Any]
             for _ in range(PORTION):
                 kind = KINDS[draw.integers(len(KINDS))] if draw.random() > 0.04 or not waiting else "genuine"
                 kinds[kind] += 1
-                if kind == "genuine":  # a genuine frame is one of the next three, in any order
+                if kind == "genuine":  # the next genuine frame is one of the first three that wait
                     link.wire.up.append(waiting.pop(int(draw.integers(min(3, len(waiting))))))
                 else:
                     past = genuine[: max(GENUINE - len(waiting), 1)]

@@ -69,7 +69,7 @@ def texts(link: BothEnds, counter: int) -> list[str]:
 
 
 def test_nothing_is_scheduled_while_the_folder_of_keys_may_be_mounted_later(link: BothEnds) -> None:
-    """A folder that is mounted late has a schedule of its own, which an entry would overwrite."""
+    """The folder that is mounted later contains its own schedule, which a new entry would overwrite."""
     link.sky.remove(1)
     link.sky.rebuilt = True
     scheduled = directives.pack(Scheduled(in_seconds(link, 9.0), "ping 1"), link.clock.utc_ns())
@@ -253,7 +253,7 @@ def test_after_a_kill_at_any_write_no_entry_is_executed_twice(
 def test_an_entry_whose_removal_reached_one_copy_is_not_there_after_a_failed_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A first write reaches the disk although it fails, and the next write reaches the second copy only."""
+    """The first write reports a failure but reaches the disk; the next write reaches only the second copy."""
     table = Timetable(tmp_path)
     table.add(5, 1, 9, "ping 1")
     monkeypatch.setattr(commanding, "overwrite", lambda path, data: overwrite(path, data) and False)
@@ -410,7 +410,7 @@ def test_a_line_that_an_earlier_release_stored_has_angles_in_rad() -> None:
 
 
 def label(link: BothEnds, utc_ns: int) -> bytes:
-    """Return the packet that begins a run, whose UTC at the present time is `utc_ns`."""
+    """Return the first packet of a run, in which the present mission time corresponds to the UTC `utc_ns`."""
     fields: dict[str, Any] = {field.name: [0.0] * 3 if field.count == 3 else 0 for field in RUN.fields}
     fields |= {"config_name": "orbit", "software": "1", "utc_ns": utc_ns - link.clock.now_ns()}
     return link.packer.pack(RUN, link.clock.now_ns(), fields)

@@ -161,7 +161,7 @@ def test_a_damaged_run_folder_stops_no_flight(tmp_path: Path, monkeypatch: pytes
 
 
 def test_an_attempt_that_fails_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folders of many attempts would displace the earlier runs."""
+    """The folders of many failed attempts would make the archive delete earlier runs."""
 
     def fail(_: Path) -> None:
         raise OSError(errno.EMFILE, "Too many open files")

@@ -54,9 +54,9 @@ def test_power_lost_at_every_byte_of_the_last_four_kibibytes_costs_the_packet_it
 
 
 def test_blocks_that_power_loss_left_as_zeros_cost_only_what_they_cover(run: Path) -> None:
-    """Blocks that became zeros by a power loss destroy only the packets that they cover.
+    """Blocks that a power loss left as zeros destroy only the packets that they cover.
 
-    A file contains such blocks if the file system has stored its length but not its last blocks.
+    Blocks read as zeros if the file system has stored the length of the file but not these blocks.
     """
     data = find_segments(run, "flight")[0].read_bytes()[:8192]
     packets = packets_of(data[: packets_of_prefix(data)])
