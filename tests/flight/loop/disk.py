@@ -29,8 +29,8 @@ class Disk(LinuxFiles):
     """A file system in which only synced content and names survive a power loss.
 
     `calls` counts the calls that change the disk. The power fails before call number `stop_before`. If
-    `failure` is an errno, the power stays on, but this call and all later calls fail with the errno. `forget`
-    is the name of a call that has no effect.
+    `failure` is an errno, the power stays on, but this call and all later calls fail with the errno. Calls
+    with the name `forget` have no effect.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Disk(LinuxFiles):
         each change."""
 
     def start(self, stop_before: int | None, failure: int = 0) -> None:
-        """Reset the count of calls, and set the call that fails or that the power loss precedes."""
+        """Reset the count of calls, and set the call that fails, or before which the power fails."""
         self.calls, self._stop_before, self._failure = 0, stop_before, failure
 
     def read(self, path: Path) -> bytes | None:

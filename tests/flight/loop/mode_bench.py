@@ -23,7 +23,7 @@ def target(name: str) -> Any:
 
 
 class OneAngle:
-    """Test double for the targets of a body with one angle. Tests set the values that it reports."""
+    """Test double for the targets of a body with one angle, which reports values that tests set."""
 
     def __init__(self) -> None:
         self.rate, self.off, self.holdable = 0.0, 0.0, True
@@ -39,11 +39,11 @@ class OneAngle:
         return target(f"{wanted} as number {number}")
 
     def hold_here(self, estimate: object, now_ns: int) -> Any:
-        """Return the attitude at the given time as a target."""
+        """Return the target that keeps the attitude at the given time."""
         return target(f"here at {now_ns}")
 
     def can_hold(self, estimate: object) -> bool:
-        """Return whether the coils could hold the attitude."""
+        """Return whether the coils can hold the attitude."""
         return self.holdable
 
     def speed(self, estimate: object) -> float:
@@ -118,7 +118,7 @@ class ModeBench:
         accurate: bool = True,
         seconds: float = 1.0,
     ) -> Mode:
-        """Run one cycle with the estimate of `targets`."""
+        """Run one cycle in which the rate and the error of the estimate are those of `targets`."""
         self.now_ns += round(seconds * SECOND_NS)
         estimate = cast(Any, object()) if known else None
         return self.control.step(estimate, rate, overdue, answers, self.now_ns, accurate)

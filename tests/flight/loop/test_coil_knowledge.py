@@ -50,8 +50,8 @@ def test_the_currents_during_a_stall_of_the_loop_are_unknown() -> None:
 
 
 def test_no_guardian_acts_in_a_gap_that_the_loop_does_not_detect() -> None:
-    """The guardian never acts in a heartbeat gap that the loop fails to detect.
+    """The guardian never acts in a gap of the heartbeats that is too short for the loop to detect.
 
-    The gap may be nearly two cycles longer than the interval between the loop's checks.
+    The gap can be nearly two cycles longer than the interval between the loop's checks.
     """
     assert STOOD_NS + 2 * 25 * MS < SILENCE_NS

@@ -121,7 +121,7 @@ def test_a_wrong_gain_of_the_monitor_in_short_pulses_does_not_isolate_a_coil(gai
 
 
 def test_a_suspicion_of_coils_at_zero_ends_if_no_probe_is_applied() -> None:
-    """A suspicion of coils at zero current ends after the probe, also if another mode commands zero."""
+    """A suspicion ends after the time of the probe, even if another mode commands zero current instead."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     suspicious = []
     for cycle in range(40 * 6):
@@ -378,7 +378,7 @@ def test_a_brake_that_does_not_confirm_a_stuck_leg_is_released() -> None:
 def _looks(leg: StuckLeg, stuck: Iterable[int], count: int = 40) -> list[int | None]:
     """Return the results of ADC samples at zero commands.
 
-    Each axis with a stuck leg draws current unless braked.
+    Each axis with a stuck leg draws current unless its coil is braked.
     """
     drawing = set(stuck)
     found = []
@@ -472,7 +472,7 @@ def reading(time: float, current: float) -> PowerReading:
 def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_carries_nothing() -> None:
     """A stuck leg that opposes the command draws no supply current, like an open coil.
 
-    Only samples at zero commands distinguish the two faults.
+    Only samples at zero commands distinguish a stuck leg from an open coil.
     """
     drawn = supply_currents(np.array([[-FULL]]), np.array([[FULL]]))
     assert drawn[0, PLACE[CoilFault.A_HIGH]] == pytest.approx(0.0)
@@ -512,7 +512,7 @@ def test_a_check_at_rest_does_not_raise_suspicion() -> None:
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
-    """The rest of the coils does not last longer if the current monitor gives no readings."""
+    """If the current monitor gives no readings, the period with the coils off is not prolonged."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     rested = []
     for cycle in range(160):
@@ -542,11 +542,11 @@ def wander(rng: np.random.Generator, samples: int) -> FloatArray:
 def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
     """No coil is suspected in 2,388 driver readings (seed 11).
 
-    The gains of the supply current are within 15 %. Every driven coil has an error within the thesis's 3.5 mA
-    in every cycle, and the readings have the resolution of the monitor. Single ADC samples differ from the
-    mean of the chopped current by up to 18 %. Without a suspicion in N readings, the rate of suspicions is
-    below 3 / N at 95 % confidence. Only a suspicion of a single axis leads to the decision that a coil is
-    faulty.
+    The supply current is 0.85 to 1.15 times its expected value. Every driven coil has an error within the
+    thesis's 3.5 mA in every cycle, and the readings have the resolution of the monitor. Single ADC samples
+    differ from the mean of the chopped current by up to 18 %. Without a suspicion in N readings, the rate of
+    suspicions is below 3 / N at 95 % confidence. Only a suspicion of a single axis leads to the decision that
+    a coil is faulty.
     """
     rng = np.random.default_rng(11)
     suspected = readings = 0

@@ -1,4 +1,4 @@
-"""Tests of coil gains and faults from the motion of a simulated body, and of recorded commands."""
+"""Tests of the record of commands, and of coil gains and faults from the motion of a simulated body."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _acceleration(rate: FloatArray, field: FloatArray, carried: FloatArray) -> F
 
 
 class Body:
-    """A body whose coils have the given gains, with a field that rotates as the body does."""
+    """A body whose coils have the given gains, in a field that is fixed in inertial axes."""
 
     def __init__(self, gains: FloatArray) -> None:
         self.gains, self.rate, self.field = gains.astype(float), np.array([0.05, -0.04, 0.03]), FIELD.copy()

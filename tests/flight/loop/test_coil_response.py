@@ -334,7 +334,7 @@ def test_a_gain_that_misaligned_coils_can_explain_is_not_used(gain: float, found
 def test_a_gain_that_changed_within_the_bins_is_not_used(
     newest: float, found: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A gain is not used if the newest half of its interval shows another gain.
+    """The gain of an interval is not used if the newest half of the interval shows another gain.
 
     The mean gain over an interval with a fault is neither the gain before the fault nor the gain after it.
     """
@@ -468,7 +468,7 @@ class Motion:
         self.asked: list[tuple[int, float, int, int]] = []
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
-        """Return the fraction of the change that was observed."""
+        """Return the fraction of a suspected change that was observed."""
         self.asked.append((axis, constant, since_ns, settled_ns))
         return self.share
 

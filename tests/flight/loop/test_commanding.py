@@ -261,7 +261,7 @@ def test_each_channel_is_polled_and_its_news_are_reported() -> None:
 
 
 def test_the_time_line_is_executed_in_order_when_it_is_due() -> None:
-    """Steps of the time line have mission times, and are due in the order of their times."""
+    """The steps of the time line are executed in the order of their mission times."""
     bench = Bench(CommandStep(at=3.0, slew=0.25), CommandStep(at=2.0, mode="detumble"))
     bench.run(EPOCH + 2 * S - 1)
     assert bench.records == []

@@ -114,7 +114,7 @@ def test_one_control_law_commands_the_coils(mode: Mode, flags: tuple[str, ...], 
 
 
 def test_an_error_about_one_result_loses_no_other_result() -> None:
-    """A planner that never receives its result is busy for ever, and ends the flight."""
+    """A planner that never receives its result stays busy, which finally ends the flight."""
     bench = Bench(Mode.HOLD)
     _, plan = bench.results(imaging.WORKER, PLANNER)
     bench.tasks.imaging.finish.side_effect = ZeroDivisionError

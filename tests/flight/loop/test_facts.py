@@ -69,10 +69,11 @@ PERSISTENCE = {
     **{f"battery-{level}": (3, 3, "") for level in ("low", "very-low", "critical")},
     **{f"{rail}-monitor-lost": (3, 3, "") for rail in ("battery", "bus")},
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
-"""Numbers of updates until a fact (a monitored condition) becomes true and until it ends, and its modes.
+"""For each fact (a monitored condition): numbers of updates until it becomes true and until it ends, and
+modes.
 
-The second number is None if the fact latches. `modes` are the modes in which the fact is monitored; an empty
-string means all modes.
+The second number is None if a true fact never ends. `modes` are the modes in which the fact is monitored; an
+empty string means all modes.
 
 All other facts become true and end immediately, and are monitored in all modes.
 """
@@ -378,7 +379,7 @@ def test_an_event_held_back_is_written_as_soon_as_the_throttle_permits() -> None
     assert written == [(0, 0, "doubted")]
     log.release(100)
     assert written[1:] == [(40, 1, "doubted again")]
-    # The throttle counts from the time at which the event was written.
+    # The minimum interval between two events begins when the first event is written.
     log.report(events.COMMANDS_DOUBTED, 150, "once more")
     log.release(199)
     assert len(written) == 2

@@ -115,7 +115,7 @@ class Bench:
         self.ended += 1
 
     def run(self, seconds: float = 0.25, slot: int = 1, done: bool = True) -> None:
-        """Run the task after some seconds in which every control cycle failed unless `done`."""
+        """Run the task after some seconds, in which all control cycles have failed if `done` is false."""
         self.now_ns += round(seconds * S)
         self.control.cycles += 10
         self.control.completed += 10 * done
@@ -151,7 +151,7 @@ def test_a_control_group_without_completed_cycles_stops_the_trigger() -> None:
 
 @pytest.mark.parametrize(("failed", "holds"), [(5, False), (6, True)])
 def test_control_cycles_that_fail_in_a_row_are_counted(failed: int, holds: bool) -> None:
-    """Sixty failed cycles in a row are a failing task. A completed cycle begins the count again."""
+    """Sixty failed cycles in a row count as a failing task. A completed cycle resets the count."""
     bench = Bench()
     bench.run(0.1, done=False)
     bench.run(0.1)
@@ -273,7 +273,7 @@ def test_the_health_packet_has_the_state_of_the_flight() -> None:
 
 
 class Devices:
-    """Doubles of the tasks and devices whose counters the housekeeping packet contains."""
+    """Test doubles of the tasks and devices whose counters the housekeeping packet contains."""
 
     def __init__(self) -> None:
         self.records: list[dict[str, Any]] = []

@@ -38,7 +38,7 @@ def camera_at(seconds: float) -> FloatArray:
 
 
 class Bench:
-    """The tracks of objects with test doubles that record the calls."""
+    """The tracks of objects, connected to test doubles that record the calls."""
 
     def __init__(self) -> None:
         self.records: list[tuple[Any, dict[str, Any]]] = []

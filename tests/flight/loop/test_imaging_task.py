@@ -594,7 +594,7 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     bench.take(2, 15 * S, 16 * S)
     assert bench.jobs[-1].lens == (better, 5.0)
     bench.finish(FrameFound(motion(), None, lens=better), 17 * S)
-    bench.only(LENS)  # a frame is recorded only with its result
+    bench.only(LENS)  # this frame leaves the lens unchanged, so no second packet is recorded
     assert events.LENS_CHANGED not in bench.reports
     bench.take(3, 35 * S, 36 * S)
     assert bench.jobs[-1].lens == (better, 25.0), "the lens may have changed since the last frame that taught"
@@ -602,7 +602,7 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     bench.finish(FrameFound(motion(), None, lens=again), 37 * S)
     assert bench.reports.count(events.LENS_CHANGED) == 1
     bench.take(4, 40 * S, 41 * S)
-    # After a contradiction the estimate also has one frame, as the estimate of an earlier boot has.
+    # The number of frames is one before and after this frame, but the number of contradictions increases.
     third = replace(again, contradictions=2)
     bench.finish(FrameFound(motion(), None, lens=third), 42 * S)
     assert bench.reports.count(events.LENS_CHANGED) == 2
@@ -717,7 +717,7 @@ def test_points_among_unknown_stars_go_to_the_tracks_with_the_attitude_of_mid_ex
 
 
 def test_the_course_of_a_job_has_the_rates_of_the_exposure_in_camera_axes() -> None:
-    """The mean of the course is that of a rate that increases linearly during the exposure."""
+    """The rate increases linearly during the exposure, and the mean of the course is the mean rate."""
     bench = Bench()
     bench.estimate = bench.past(0)
     times = np.array([900, 1000, 1200, 1300]) * MS

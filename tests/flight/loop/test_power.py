@@ -118,7 +118,7 @@ def pointing(satellite: Satellite) -> Satellite:
 
 @pytest.fixture(scope="module")
 def orbit() -> Satellite:
-    """Return a satellite after an eclipse with the largest coil currents, and a flight in sunlight."""
+    """Return a satellite after an eclipse and a time in sunlight, with the largest coil currents."""
     satellite = pointing(Satellite())
     satellite.fly(END)
     return satellite

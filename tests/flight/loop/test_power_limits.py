@@ -52,7 +52,7 @@ def test_the_first_charge_is_that_of_the_open_circuit_voltage() -> None:
 def test_the_current_is_integrated_and_corrected_by_the_voltage() -> None:
     estimate = ChargeEstimate(LINEAR)
     estimate.update(6.9, 0.5, 1.0, 1800.0)
-    # In 4 s, 0.5 A take 2 A s of 7200 A s; the voltage shows a charge of 0.6.
+    # In 4 s, 0.5 A take 2 A s of 7200 A s; the open-circuit voltage corresponds to a charge of 0.6.
     estimate.update(7.1, 0.5, 4.0, 1800.0)
     integrated = 0.5 - 2.0 / 7200.0
     assert estimate.charge == pytest.approx(integrated + 4.0 / 1800.0 * (0.6 - integrated))
@@ -169,7 +169,7 @@ class Bench:
     def run(
         self, charge: float, count: int = 1, *, battery: bool = True, bus: bool = True, step: int = 1
     ) -> None:
-        """Run the task with readings of an open-circuit voltage for a charge; the readings scatter."""
+        """Run the task with slightly scattered readings of the open-circuit voltage at a state of charge."""
         for number in range(count):
             self.second += step
             voltage = 6.0 + 2.0 * charge + 1e-6 * (number % 2)

@@ -135,8 +135,8 @@ def test_the_count_is_that_of_the_crashes_in_the_window(
 
 
 BOOT, SETTLED, AGAIN = 0, 600, 640
-"""Cycles at which the first boot starts, the first boot ends, and the second boot ends, which lasts one
-second."""
+"""Cycle numbers at the start of the first boot, at its end, and at the end of the second boot, which lasts
+one second."""
 CHANGED = 0.3
 
 

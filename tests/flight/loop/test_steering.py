@@ -194,7 +194,7 @@ def test_corrections_and_trials_are_reported_and_a_coil_on_trial_is_used_again()
 
 
 class Flown:
-    """Steering of a body whose estimation and control are test doubles, with a drive that answers."""
+    """Steering with a test double of a body, and with a simulated drive."""
 
     def __init__(self) -> None:
         self.fault = ""
