@@ -205,7 +205,7 @@ def test_a_device_is_opened_at_most_three_times_and_then_kept(monkeypatch: pytes
 
 
 def test_a_device_that_does_not_start_is_not_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A unit of separate sensors reads them in its own thread from its opening to the end of the session."""
+    """A unit that consists of separate sensors reads them in its own thread until the end of the session."""
     refused = NotResponding("lis3mdl", "no acknowledge")
     unit = Mock(configure=Mock(side_effect=[refused, refused, None]))
     driver = Mock(open=Mock(side_effect=[unit]))
@@ -370,7 +370,7 @@ def test_the_kind_of_a_serial_device_is_recognised_at_its_baud_rate() -> None:
 
 
 def test_a_receiver_that_a_flight_has_configured_may_send_rarely() -> None:
-    """A receiver keeps the period of its last flight, and is silent for longer than 1.2 s."""
+    """A receiver keeps the period that its last flight configured, so its pauses can exceed 1.2 s."""
     clock = SimClock()
     line = Line(clock, 9600, iter([(4.5, UBX)]))
     rig: Any = Mock(clock=clock)

@@ -59,7 +59,7 @@ def dark(change: Callable[[Image], Image] = lambda pixels: pixels, **values: Any
 
 
 class CoverHand:
-    """Hand that notes which lens it covers (True) and uncovers (False)."""
+    """Emulated hand that records each covering (True) or uncovering (False) of a lens."""
 
     def __init__(self) -> None:
         self.done: list[tuple[bool, int]] = []
@@ -321,7 +321,7 @@ WIDE = WideCamera(columns=64, rows=64, bits=8)
 
 
 class LitCameras:
-    """Horizon cameras whose frames have a lit and a covered level; plugs may be exchanged."""
+    """Horizon cameras with given pixel levels of lit and covered lenses, and possibly exchanged plugs."""
 
     def __init__(
         self, levels: list[tuple[float, float]], lens: list[int] | None = None, leak: float = 0.0
@@ -348,7 +348,7 @@ class LitCameras:
 
 
 class _Wide(ScriptedCamera):
-    """Horizon camera that shows the levels of its lens."""
+    """Horizon camera whose frames have the level of its lens, lit or covered."""
 
     def __init__(self, lit: LitCameras, number: int) -> None:
         super().__init__(lambda: lit.session)

@@ -121,7 +121,7 @@ def test_only_a_rotated_unit_changes_the_mounting_which_then_gives_body_axes(
 
 
 def named(findings: list[Finding]) -> list[str]:
-    """Return part and kind of each finding."""
+    """Return the part and the kind of each finding, as one text."""
     return [f"{one.part} {one.kind}" for one in findings]
 
 
@@ -166,7 +166,7 @@ def test_no_field_is_missing_if_the_usual_change_is_below_eight_sigma(noise: flo
 def test_the_allan_deviation_of_a_ramp_is_its_change_in_the_averaging_time_over_root_two() -> None:
     slopes = np.array([1.0, -3.0, 0.5])
     times, found = allan_deviation(np.arange(70)[:, None] * 0.1 * slopes, 0.1)
-    assert times == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.6])  # averages of up to a quarter of the samples
+    assert times == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.6])  # averaging times up to a quarter of the record
     assert found == pytest.approx(times[:, None] * np.abs(slopes) / math.sqrt(2.0))
 
 
@@ -349,7 +349,7 @@ def about(axis: int, degrees: float) -> FloatArray:
 
 
 def with_rows(turns: Turns, sizes: list[float]) -> Turns:
-    """Return rotations of other sizes (deg), measured by the gyro."""
+    """Return a copy of rotations in which the gyro measured the given angles (deg)."""
     return replace(turns, gyro=np.diag(np.radians(sizes)))
 
 
@@ -466,7 +466,7 @@ def coils(
     size_known: bool = True,
     **changes: Any,
 ) -> CoilsFound:
-    """Return the result for fields and currents relative to the expected ones, and other changed values.
+    """Return the diagnosis of a coil test whose fields and currents are multiples of the expected values.
 
     `field` and `drawn` are numbers for all coils or lists of numbers for each coil; `field` may also be a
     matrix (3, 3) that replaces the directions.
@@ -672,7 +672,7 @@ def test_relative_strengths_refer_to_the_median_field_if_the_strength_is_unknown
     sizes = np.linalg.norm(FIELDS, axis=1) * [2.0, 2.0, 1.0]
     assert found.strength == pytest.approx(sizes / np.median(sizes))
     assert named(found.findings) == ["coils.windings[2] wrong strength"]
-    # A coil without a field does not count.
+    # A coil without a field is not included in the median.
     silent = coils(field=[2.0, 0.0, 1.2], drawn=[1.0, 0.0, 1.0], size_known=False)
     sizes = np.linalg.norm(FIELDS, axis=1) * [2.0, 0.0, 1.2]
     assert silent.strength == pytest.approx(sizes / np.mean(sizes[[0, 2]]))

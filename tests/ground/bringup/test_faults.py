@@ -649,7 +649,7 @@ POWER = {"power": {"battery": {"capacity": 2.0}}}
 
 
 def fitted(change: Change, folder: Path, *, fault_of: str = "") -> Session:
-    """Return a session in which the drivers and the emulated devices share a change of `orbit`."""
+    """Return a session in which `change` applies to `orbit` for the drivers and for the emulated devices."""
     opened = session(Case(change | (fault(fault_of) if fault_of else {}), "", [], base="orbit"), folder)
     opened.config = requested_config(RunRequest(folder / "wired.yaml", Path()))[1]
     return opened

@@ -79,11 +79,11 @@ def test_the_power_step_measures_each_line_without_and_with_the_strongest_curren
     assert measured[BUS] == pytest.approx({"voltage": 7.5, "current": 0.2, "rise": 0.9 * strongest})
     assert {tuple(command) for command in coils.commands} == {(0.0, 0.0, 0.0), (strongest, 0.0, 0.0)}
     assert coils.commands[0] == coils.commands[-1] == [0.0, 0.0, 0.0]
-    # Each current is held for more than two seconds, so that the means contain nothing else.
+    # Each current is held for more than two seconds, so that no other current enters the mean of a reading.
     assert session.rig.clock.now_ns() == pytest.approx(2 * 2.6 * SECOND_NS)
 
 
-STRONGEST = 0.15  # current (A) of coil x in these tests, at most
+STRONGEST = 0.15  # largest current (A) of coil x in these tests
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_the_guardian_of_the_coils_is_kept_awake() -> None:
     beats: list[int] = []
     session.guardian = SimpleNamespace(beat=lambda: beats.append(len(coils.commands)), tend=lambda now_ns: [])
     step_power(session)
-    assert beats == list(range(1, len(coils.commands)))  # after each command but the last, which sets zero
+    assert beats == list(range(1, len(coils.commands)))  # each command but the final zero
 
 
 def test_a_configuration_without_power_system_skips_the_step() -> None:
@@ -231,7 +231,7 @@ def moved(by_m: float, sigma: float) -> list[GpsReading]:
 
 
 def accelerated() -> list[GpsReading]:
-    """Return fixes of a receiver with a constant acceleration of 100 m/s^2, which does not jump."""
+    """Return fixes without jumps, of a receiver with a constant acceleration of 100 m/s^2."""
     found = []
     for one in fixes():
         t = (one.utc_ns - UTC_NS) * 1e-9
@@ -345,7 +345,7 @@ class ScriptedStrings:
         self.lamps: list[list[float]] = []
 
     def light(self, normal: FloatArray) -> None:
-        """Move the lamp, as the emulated hand."""
+        """Point the lamp along `normal`, as the emulated hand does."""
         self.lamp = normal
         self.lamps.append(normal.tolist())
 
@@ -381,7 +381,7 @@ PERMUTED = SUNLIT[[1, 0, 2]]
         (np.diag([0.4, 0.031, 0.16]), 0.0, [], ""),
         (np.diag([0.4, 0.029, 0.16]), 0.0, ["[1] dead"], "a lamp on its panel gives 29 mA"),
         (PERMUTED, 0.0, ["[0] exchanged", "[1] exchanged"], "gives a current in string"),
-        # Stray light on a string with a larger peak current does not count as its own light.
+        # Stray light on a string with a larger peak current is not mistaken for an exchange of strings.
         (SUNLIT + 0.5 * np.outer(Y, X), 0.0, [], ""),
     ],
 )  # fmt: skip

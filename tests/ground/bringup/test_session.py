@@ -167,7 +167,7 @@ def test_the_axes_step_measures_each_rotation_by_the_hand() -> None:
     session = bench_session({"inertial_unit": unit})
     asked: list[str] = []
     session.hand, session.ask = hand, asked.append
-    # The sample before the first of a record does not contribute, so the rotation waits for two samples.
+    # The integral of the rate begins at the first sample of a record, so the rotation waits for two samples.
     whole = hand.turn
 
     def late(axis: FloatArray, angle: float, seconds: float) -> None:
@@ -277,7 +277,7 @@ class Bench:
 
 
 class Driven(ScriptedCoils):
-    """Coils that note braked bridges and report a failure."""
+    """Coils that record the braked bridges, and report a failure that the test sets."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__()

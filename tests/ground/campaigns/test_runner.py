@@ -72,7 +72,7 @@ class Watch:
         monkeypatch.setattr("sys.stderr", self.screen)
 
     def after(self, seconds: float, progress: Progress) -> str:
-        """Return what the progress writes if a case ends after a time (s)."""
+        """Return the text that the progress display writes when a case ends after a time (s)."""
         self.now += seconds
         progress.advance()
         return self.screen.new()
@@ -374,7 +374,7 @@ def threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Thread]]:
 
 @pytest.fixture
 def signals(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Return process and signal of each signal that is sent. No process gets a signal."""
+    """Return the list of pairs (process, signal) given to `os.kill`, which then sends no signal."""
     sent: list[tuple[int, int]] = []
     monkeypatch.setattr("os.kill", lambda pid, number: sent.append((pid, number)))
     return sent
@@ -407,7 +407,7 @@ cycles: weakref.WeakSet[Cycle] = weakref.WeakSet()
 
 
 def leave_a_cycle(case: Case) -> Result:
-    """Return the number of earlier cycles, and leave another one, as a flight in lock-step does."""
+    """Return the number of existing reference cycles, and leave a new one as a flight in lock-step does."""
     before = len(cycles)
     cycles.add(Cycle())
     gc.freeze()

@@ -159,7 +159,7 @@ def test_variations_that_cannot_be_flown_are_refused(texts: list[str], reason: s
 
 
 def test_the_refused_draws_of_a_case_are_counted() -> None:
-    """Half of the uniform draws within +-200 % are refused, because an inertia is positive."""
+    """A quarter of the uniform draws within +-200 % are refused, because an inertia is positive."""
     cases = varied_campaign(DEMO, [variation_of("plant.inertia=200%")], 10.0).cases(40, 1)
     refused = [case.parameters["refused"] for case in cases]
     assert 5 <= sum(refused) <= 40
@@ -293,7 +293,7 @@ ROW = {"worst": 1.0, "limit": 2.0, "unit": "deg", "verdict": "pass", "margin": 1
 
 
 class Flight:
-    """Flight whose report and ending are given; the requests are noted."""
+    """Test double of a flight with a given report and a given end, which records the requests."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, verdict: str = "pass", *, interrupted: bool = False

@@ -130,7 +130,7 @@ def test_a_board_without_devices_names_each_missing_device(tmp_path: Path) -> No
         assert f"{part}: no answer" in done.stdout
 
 
-# The command with scripted steps.
+# Tests of the command with scripted steps.
 
 FAULT = Finding("coils", "no field", "nothing", "look", 2.0)
 VALUES: dict[str, Any] = {
@@ -195,7 +195,7 @@ def test_other_lines_of_a_step_name_devices_few_samples_and_the_reason_of_a_skip
 
 
 class Scripted:
-    """Steps that return given outcomes, and a session without devices."""
+    """Scripted steps with given outcomes, in a session without devices."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, folder: Path, **outcomes: Outcome | StepSkipped
@@ -400,7 +400,7 @@ def test_the_steps_are_those_of_the_configured_devices() -> None:
 
 
 class Guardian:
-    """Guardian of the coils that notes whether it is ready."""
+    """Test double of the guardian of the coils, which records whether it was awaited."""
 
     ready = False
 
@@ -465,7 +465,7 @@ def test_focusing_ends_when_enter_is_pressed(
 
 
 def test_the_expected_fields_are_those_of_the_simulated_coils(tmp_path: Path) -> None:
-    """The configuration states the field (T/A) by axis and coil, and the session by coil and axis."""
+    """The fields (T/A) have a row per axis in the configuration, but a row per coil in the session."""
     rows = [[1e-4, 2e-4, 3e-4], [4e-4, 5e-4, 6e-4], [7e-4, 8e-4, 9e-4]]
     path = tmp_path / "wired.yaml"
     path.write_text(f"extends: step_demo\nsimulation: {{coil_field: {rows}}}\n")

@@ -136,7 +136,7 @@ def test_pictures_without_stars_are_named_with_the_reason_and_exit_status_1(tmp_
 
 
 def test_a_picture_that_is_given_twice_counts_once(pictures: list[Path], tmp_path: Path) -> None:
-    """The copy also has the same pixels if its file is rotated by its metadata."""
+    """The copy is recognised by its pixels, even if its metadata rotate the image."""
     exif = pillow.Exif()
     exif[0x0112] = 6
     pillow.open(pictures[1]).save(tmp_path / "copy.png", exif=exif)

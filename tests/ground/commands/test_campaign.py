@@ -17,7 +17,7 @@ from knightcube.errors import UsageError
 
 
 class Scripted:
-    """Campaign of which one flight of three is beyond a limit."""
+    """Test double of a campaign of three flights, one of which is beyond a limit."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.flown: list[tuple[tuple[Any, ...], dict[str, Any]]] = []

@@ -23,7 +23,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:
-    """Run a shell line, and return the exit status of the first command that fails in its pipe."""
+    """Run a shell line, in which a pipe fails if any of its commands fails."""
     words = ["bash", "-o", "pipefail", "-c", line.replace("FLIGHT", f"{sys.executable} -m flight")]
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
 

@@ -81,8 +81,8 @@ LEVEL = limb_scene(
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
     """Return a folder with three images, and their nadir directions by name.
 
-    A horizontal camera took the images `first` and `later` at two times. A camera that points farther to the
-    right took the image `right`.
+    The images `first` and `later` are from a horizontal camera at two times, and the image `right` is from a
+    camera that points farther to the right.
     """
     folder = tmp_path_factory.mktemp("paper")
     model = EarthCameraModel.fuga15d(seed=1)
@@ -180,7 +180,7 @@ def test_a_mask_that_hides_the_whole_picture_is_refused(folder: Path, tmp_path: 
 
 
 def test_an_uncertain_field_of_view_is_in_the_uncertainty(tmp_path: Path) -> None:
-    """A field of view that is 5 % wrong does no harm if its error is given, in frames of several seeds.
+    """In frames of several seeds, a field of view that is 5 % wrong does no harm if its error is given.
 
     The nadir error then stays within three standard deviations, and is less than half the error without
     `--fov-error`.

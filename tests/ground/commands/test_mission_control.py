@@ -28,7 +28,7 @@ ZERO = datetime(2026, 3, 20, 12, 0, 1, 500_000, tzinfo=UTC)
 
 
 def run_packet(utc: datetime | None) -> bytes:
-    """Return the packet that states the UTC of mission time zero, with 999 us beyond the millisecond."""
+    """Return the packet with the UTC of mission time zero, plus 999 us."""
     utc_ns = 0 if utc is None else round(utc.timestamp() * 1e3) * 10**6 + 999_000
     return Packer().pack(RUN, 0, {**plain_contents(RUN), "utc_ns": utc_ns})
 
@@ -112,7 +112,7 @@ def test_the_address_is_that_of_the_configuration() -> None:
 
 
 class Process:
-    """Process that ends with a status after a number of questions, or never (None)."""
+    """Test double of a process, whose method `poll` returns one of the given answers after another."""
 
     def __init__(self, *answers: int | None, stubborn: bool = False) -> None:
         self.answers, self.stubborn = list(answers), stubborn
@@ -180,7 +180,7 @@ Started = list[tuple[list[str], Path]]
 
 
 def processes(monkeypatch: pytest.MonkeyPatch, say: str, *answers: int | None) -> Started:
-    """Replace processes: each is noted, and its log contains the text `say`."""
+    """Replace processes by test doubles whose logs contain `say`; return the list of started processes."""
     started: Started = []
 
     def start(command: list[str], log: Path, stack: ExitStack) -> Process:
@@ -334,7 +334,7 @@ SLEEP = "import time; time.sleep(60)"
 
 
 class Stage:
-    """Mission control whose Yamcs is a small program, or ends when the signal arrives."""
+    """Mission control whose Yamcs is the program `code`, and which gets a signal after some turns."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, code: str, *, turns: int = 10**9) -> None:
         self.turns, self.compiled = turns, list[Path]()
@@ -353,7 +353,7 @@ class Stage:
     def __exit__(self, *error: object) -> None: ...
 
     def count(self) -> None:
-        """Count a turn; the signal arrives in the last turn."""
+        """Count a turn of the main loop; the signal arrives in the last turn."""
         self.turns -= 1
         self.signals.received = self.turns <= 0
 

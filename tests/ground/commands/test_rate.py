@@ -133,8 +133,8 @@ def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) 
 def test_options_describe_the_camera_and_a_refusal_states_the_reason(scene: Scene, picture: Path) -> None:
     """A stated point spread function that is too wide increases the uncertainty, or leads to a refusal.
 
-    The true width is 1 px. With a stated width of 2 px, the uncertainty is larger. With 4 px, the rate is
-    refused.
+    The true width is 1 px. With a stated width of 2 px, the uncertainty is larger. With a stated width of 4
+    px, the command refuses to give a rate.
     """
     told = [
         "--fov",

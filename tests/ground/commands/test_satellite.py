@@ -528,8 +528,7 @@ def test_the_name_that_a_satellite_gives_a_file_does_not_control_the_terminal(
 ) -> None:
     """Control characters in file names of the satellite are not printed.
 
-    A refused transfer keeps its file name until the transfer is closed, but only the transfer of the command
-    is printed.
+    A refused transfer keeps its file name until it is closed, but the command prints only its own transfer.
     """
     (tmp_path / "up").write_bytes(b"x")
     session = Session(tmp_path, ([], []), ([], [ending("elements/up")]))
