@@ -42,7 +42,7 @@ def places(picture: Picture, colour: tuple[int, int, int]) -> set[tuple[int, int
 
 
 def distances(picture: Picture, colour: tuple[int, int, int], x: float, y: float) -> FloatArray:
-    """Return the distances (px) of the pixels of a colour from a point, if closer than 20 px."""
+    """Return the distances (px) of all pixels of a colour from a point, as far as they are below 20 px."""
     found = np.array(sorted(places(picture, colour)), dtype=float).reshape(-1, 2)
     apart = np.hypot(found[:, 0] - x, found[:, 1] - y)
     return np.asarray(apart[apart < 20.0])
@@ -164,7 +164,7 @@ def test_matched_and_expected_stars_have_their_rings(mirrored: bool) -> None:
 
 
 def labels_of(drawn: Picture) -> FloatArray:
-    """Return the positions (n, 2) of the pixels of names."""
+    """Return the positions (n, 2) of the pixels that belong to names."""
     rows, columns = np.nonzero(np.all(np.abs(drawn.astype(int) - YELLOW) < 25, axis=2))
     return np.stack([columns, rows], axis=1)
 

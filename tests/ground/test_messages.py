@@ -87,7 +87,7 @@ def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path:
 
 
 def test_the_orbit_message_has_one_state_of_the_camera_for_each_frame(tmp_path: Path) -> None:
-    """Two objects of one frame share one camera state. A sighting has no state if the orbit is unknown."""
+    """Two objects of one frame share one camera state. A sighting without a known orbit gives no state."""
     states = [([7e6 + k, -1e6, 2e6], [1e3, 7e3 - k, -5e2]) for k in range(3)]
     track = [
         sighting(1.0 + k, number, 10.0, 5.0, place=place, velocity=velocity, place_sigma=20.0 + k)

@@ -404,7 +404,7 @@ def test_parquet_files_hold_every_number_with_its_unit(rich_run: Run, tmp_path: 
 
 
 def test_a_log_needs_little_more_than_twice_its_size_in_memory_while_it_is_read() -> None:
-    """The measured memory excludes the log itself. The log of two days has a gigabyte."""
+    """The measured memory excludes the log itself. A log of two days has a size of one gigabyte."""
     packer, packets = Packer(), []
     for second in range(2000):
         packets += [packer.pack(kind, second, plain_contents(kind)) for kind in (CONTROL, HOUSEKEEPING)]

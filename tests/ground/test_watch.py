@@ -262,7 +262,7 @@ def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same(
 
 
 def test_the_time_for_a_long_log_grows_with_its_length() -> None:
-    """Four times as many printed lines, one per 400 packets, take less than eight times as long."""
+    """Four times as many packets, of which each 400 print one line, take less than eight times as long."""
 
     def processor_time(lines: int) -> float:
         packets = {name: np.zeros(0, layout.dtype) for name, layout in LAYOUTS.items()}
@@ -362,7 +362,7 @@ def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
 def test_an_event_that_is_older_than_a_shown_event_is_shown_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An event that was held back is recorded later with its own time, and a restart begins at time zero."""
+    """A held-back event is recorded late with its earlier time, and a restart begins at time zero."""
     monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
     listener, packer = Listener(tmp_path / "socket"), Packer()
     newer, older = (event(packer, events.IMU_SILENT, time, f"at {time}") for time in (5.7, 2.3))

@@ -162,7 +162,7 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
 def test_each_form_of_point_takes_degrees_and_is_the_command_in_words(
     name: str, values: dict[str, float], words: str
 ) -> None:
-    """The flight software reads a command that a client has packed by the document, with angles in deg."""
+    """The flight software reads commands that a client packs by the XTCE document, with angles in deg."""
     root = found(fromstring(document()), "x:CommandMetaData")
     command = found(root, f"x:MetaCommandSet/x:MetaCommand[@name='{name}']")
     arguments = {one.get("name"): one for one in command.iter(f"{{{SPACE['x']}}}Argument")}

@@ -116,7 +116,7 @@ def test_file_data_fit_into_the_configured_telecommand_frames(
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> None:
-    """A browser can send a page as text/plain to any loopback port; Yamcs would read it as a command."""
+    """A web page can send text/plain to any loopback port, and Yamcs would read the text as a command."""
     http = free_port()
     write(tmp_path, f"127.0.0.1:{free_port()}", http)
     with serving(tmp_path, http) as server:

@@ -1,4 +1,4 @@
-"""Tests of Yamcs's start and of the requests for its timeline, without Java: Yamcs is an object."""
+"""Tests of the start of Yamcs and of the requests for its timeline, with test doubles instead of Java."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def test_the_configuration_names_gateway_token_folders_and_epoch(tmp_path: Path)
 
 
 def test_a_header_of_file_packets_is_a_telecommand_with_zero_time(tmp_path: Path) -> None:
-    """CCSDS 133.0: version 0, type 1, secondary header flag, sequence flags 3, count and length 0."""
+    """The header has version 0, type 1, sequence flags 3, count 0 and length 0 (CCSDS 133.0)."""
     yamcs.write(tmp_path)
     streams = (tmp_path / "etc" / "files.sql").read_text()
     header = bytes.fromhex(streams.split("unhex('")[1].split("'")[0])

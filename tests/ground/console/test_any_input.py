@@ -93,7 +93,7 @@ NUMBERS = [
         "+1",
     ),
 ]
-"""Texts of numbers for the query of a URL."""
+"""Texts for numbers in the query of a URL."""
 
 
 @pytest.fixture(scope="module")

@@ -237,7 +237,7 @@ class Ends(FiledEnds):
     """Both ends of a link. At the ground end, the console is the only program."""
 
     def collect(self) -> None:
-        """Leave received telemetry to the console."""
+        """Keep the received packets for the console."""
         self.packets += list(self.terminal.take())
 
 
@@ -257,7 +257,7 @@ def console(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[E
 
 
 def during(feed: LinkFeed, request: Callable[[], Any]) -> Any:
-    """Run a request while the feed is read; return the result of the request, or its KnightCubeError."""
+    """Run a request in a thread while the feed is read; return its result or its KnightCubeError."""
     found: list[Any] = []
 
     def work() -> None:

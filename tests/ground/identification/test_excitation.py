@@ -25,7 +25,7 @@ def controller(**changes: float) -> ExcitationController:
 
 
 def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_reach() -> None:
-    """Under the pulses of a manoeuvre, a free body comes to rest within the reach of the excitation.
+    """The pulses of a manoeuvre leave a free body at rest, and move it at most by the reach.
 
     The motion is integrated exactly, as for a double integrator.
     """

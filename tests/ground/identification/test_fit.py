@@ -111,7 +111,7 @@ def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
 
 
 def test_a_gap_in_the_samples_does_not_bias_the_fit() -> None:
-    """In the gap, the prediction by the first constants is far off, but not that by the final constants."""
+    """After the gap, the prediction by the initial constants is far off; that by the final ones is not."""
     record = fly_bare(USUAL, 60.0)
     kept = (record.time < 15.0) | (record.time > 27.0)
     gap = replace(record, time=record.time[kept], angle=record.angle[kept], rate=record.rate[kept])

@@ -95,7 +95,7 @@ def test_without_commands_the_coil_falls_to_zero_as_the_driver_lets_it(short: Ru
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
 def test_an_offset_of_the_magnetometer_does_not_rotate_and_is_subtracted(short: Run, share: float) -> None:
-    """The field rotates with the body. Without a rotating field, the magnetometer measures no field."""
+    """If the measured field does not rotate as the body does, the record contains no field."""
     quiet = np.zeros_like(short["control"]["current_written"])
     stilled = altered(short, "control", current_written=quiet, current_command=quiet)
     imu = short["imu"]
@@ -161,7 +161,7 @@ def test_values_that_no_flight_writes_are_reported_as_damage(
     values = short[packet][field].copy()
     values[len(values) // 2] = value
     damaged = altered(short, packet, **{field: values})
-    if field == "sample_time_ns":  # host times are not used while the clock of the unit runs
+    if field == "sample_time_ns":  # times of the host are used only if the clock of the unit has stopped
         damaged = altered(damaged, "imu", device_time_ns=values)
     with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
         recorded(damaged)

@@ -51,7 +51,7 @@ class World:
 
     @property
     def constants(self) -> MotionConstants:
-        """True constants divided by the inertia."""
+        """True gain, torsion and damping, each divided by the inertia, and the true bias."""
         return MotionConstants(
             gain=self.dipole * self.field / self.inertia,
             torsion=self.stiffness / self.inertia,
@@ -160,7 +160,7 @@ def motion_error(world: World, constants: MotionConstants) -> FloatArray:
 
 
 def scale_error(world: World, plant: AbsolutePlant) -> FloatArray:
-    """Return estimated minus true ln J, ln n A, ln B, ln g, torsion, damping (6,), as in `covariance`."""
+    """Return the estimated minus the true values (6,) of ln J, ln n A, ln B, ln gain, torsion and damping."""
     true = world.constants
     gain = plant.torque_constant.value / plant.inertia.value
     return np.array(

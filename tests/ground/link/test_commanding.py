@@ -335,7 +335,7 @@ def test_units_are_sent_within_the_rate(tmp_path: Path) -> None:
 def test_a_packet_that_cannot_be_sent_is_sent_by_the_next_call(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A failure of the network must not lose the segment that the transfer has already handed over."""
+    """If the network fails, the segment that the transfer has already handed over must not be lost."""
     (tmp_path / "file").write_bytes(bytes(range(256)) * 20)
     sent: list[list[bytes]] = []
     for failures in (0, 3):

@@ -360,7 +360,7 @@ def opened(tmp_path: Path) -> Iterator[Opened]:
 def test_the_gateway_obeys_only_clients_that_have_read_the_token_file(opened: Opened) -> None:
     with socket.create_connection(("127.0.0.1", opened.port), PATIENCE_S) as stranger:
         head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9000\r\n\r\n"
-        skipped = 7 + int.from_bytes(head[4:6], "big")  # length that a packet reader would take from the text
+        skipped = 7 + int.from_bytes(head[4:6], "big")  # packet length that a reader would find in this text
         with contextlib.suppress(ConnectionError):
             stranger.sendall(head.ljust(skipped, b"\0") + SAFE)
         assert opened.command() is None

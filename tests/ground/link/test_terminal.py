@@ -180,7 +180,7 @@ def test_a_tcp_line_is_opened_again_after_its_peer_has_closed_it(
 
 
 def test_a_slow_attempt_to_open_a_line_is_followed_by_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If each frame began another attempt, a peer that does not answer would block the program."""
+    """If each frame started a new attempt to connect, a peer that does not answer would block the program."""
     now = 0.0
     monkeypatch.setattr(terminal_module, "time", SimpleNamespace(monotonic=lambda: now))
     own, peer = socket.socketpair()

@@ -23,7 +23,7 @@ from matplotlib.text import Annotation, Text
 from matplotlib.ticker import FixedLocator, LogLocator
 
 FRACTIONS = (0.0, 0.21, 0.5, 0.83, 1.0)
-"""Positions along a curve whose points are kept, as fractions of the curve's length."""
+"""Positions of the recorded points of a curve, as fractions of its number of points."""
 
 
 def described(figure: Figure) -> dict[str, Any]:
@@ -195,7 +195,7 @@ def _numbers(values: Any) -> list[float | None]:
 
 
 def _words(text: str) -> Any:
-    """Return the numbers in a text, or, without numbers, whether the text is empty."""
+    """Return the numbers in a text, or, if it has none, whether it is a visible text."""
     return re.findall(r"\d+\.?\d*", text) or bool(text and not text.startswith("_child"))
 
 

@@ -30,7 +30,7 @@ STREAK_ERROR = 2e-4  # error of each streak rate about the suspension thread, ra
 
 @dataclass(frozen=True)
 class Recipe:
-    """Parameters of a run. The run lasts `duration` of `planned` s, and has a new target every `hold` s.
+    """Parameters of a run that ends after `duration` of its `planned` s, and has a new target every `hold` s.
 
     `bus_power` (W) is measured each second by a monitor in the coils' supply; None without a monitor.
     """
@@ -57,7 +57,7 @@ def second_order(t: FloatArray, damping: float, frequency: float) -> FloatArray:
 
 
 def trajectory(recipe: Recipe) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return time (n,) s, q2 (n,), rate (n,) rad/s."""
+    """Return the times (n,), s, the values q2 (n,), and the rates (n,), rad/s."""
     time = np.arange(round(recipe.duration * recipe.rate_hz) + 1) / recipe.rate_hz
     index = np.minimum((time / recipe.hold).astype(int), len(recipe.targets) - 1)
     targets = np.array(recipe.targets)
@@ -202,7 +202,7 @@ def _plan(packer: Packer, stamp: int, number: int, start: float, target: float) 
 
 
 def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> bytes:
-    """Return the mean rate over the last second, with the error `STREAK_ERROR` and its square as variance."""
+    """Return the packet of the mean rate over the last second, with an error of `STREAK_ERROR`."""
     mean = float(np.mean(0.5 * (rates[1:] + rates[:-1])))
     error = STREAK_ERROR if sequence % 2 == 0 else -STREAK_ERROR
     variance = STREAK_ERROR**2 / 3.0  # only one of three axes has an error, so e' P^-1 e / 3 is 1
@@ -224,7 +224,7 @@ def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> byt
 
 
 def _stars(packer: Packer, stamp: int, sequence: int, q2: float) -> bytes:
-    """Return an attitude with the error `STAR_ERROR` about the thread, and a variance of its square."""
+    """Return the packet of an attitude with the error `STAR_ERROR` about the thread."""
     half = np.arcsin(q2) + 0.5 * (STAR_ERROR if sequence % 2 == 0 else -STAR_ERROR)
     variance = STAR_ERROR**2 / 3.0
     return packer.pack(

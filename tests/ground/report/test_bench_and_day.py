@@ -308,7 +308,7 @@ def test_a_module_other_than_matplotlib_that_is_missing_is_not_blamed_on_matplot
 def test_the_pictures_of_a_run_are_those_of_its_kind(
     tmp_path: Path, saved: list[tuple[Any, Path]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run with spin packets is in orbit; a run on the testbed may have pictures of an orbit too."""
+    """A run with spin packets is a run in orbit; a run on the testbed can also have pictures of an orbit."""
     names = (
         "_attitude", "_current", "_power", "_paths", "_cycle_times", "_rate", "_overview", "cage_figure",
         "spin_figure", "knowledge_figure", "pointing_figure", "track_figure", "objects_figure",

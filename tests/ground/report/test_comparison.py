@@ -89,7 +89,7 @@ SATELLITE: dict[str, Any] = {
 
 
 def with_other_numbers(value: Any) -> Iterator[Any]:
-    """Yield copies of a value, in each of which another number is larger."""
+    """Yield one copy of a value for each of its numbers, in which this number is larger by one."""
     if isinstance(value, dict | list):
         for key, below in value.items() if isinstance(value, dict) else enumerate(value):
             for other in with_other_numbers(below):

@@ -76,7 +76,7 @@ def test_a_damaged_log_invents_no_packet_and_is_reported(
 
 @pytest.mark.parametrize("byte", [b"\0", b"\x7f", b"\xff"])
 def test_packets_in_which_each_byte_has_the_same_value_are_reported_and_compared(byte: bytes) -> None:
-    """The byte 0xff is NaN in every real number, and no known state in every integer."""
+    """Bytes 0xff are NaN as floating-point numbers, and unknown states as integers."""
     packets = []
     for layout in LAYOUTS.values():
         length = layout.length - HEADER_BYTES - 1

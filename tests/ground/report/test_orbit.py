@@ -208,7 +208,7 @@ def packets(packet: Packet, times: list[float], **fields: Any) -> PacketArray:
 
 
 def config() -> OrbitConfig:
-    """Return a configuration whose camera looks along body +z, up to a rate of 0.02 rad/s."""
+    """Return a configuration whose camera points along body +z and is used up to a rate of 0.02 rad/s."""
     found = as_orbit(reader.load(CONFIG.with_name("orbit.yaml")))
     assert found.camera is not None
     assert (found.camera.period, found.camera.fine_period) == (PERIOD, FINE_PERIOD)
@@ -218,7 +218,7 @@ def config() -> OrbitConfig:
 
 
 def flight(gave: list[float]) -> Run:
-    """Return a run with frames at the times `gave`, which alternately have a rate and an attitude.
+    """Return a run whose frames at the times `gave` (s) give a rate and an attitude alternately.
 
     The camera points to the zenith, with the Sun behind the Earth. During `HIDDEN` the camera points to the
     limb.
@@ -254,7 +254,7 @@ def flight(gave: list[float]) -> Run:
 
 
 FIRST_FINE = FINE_FROM + PERIOD
-"""First instant (s) with a fine attitude, 10 s after the previous instant."""
+"""First due time (s) of a frame with a fine attitude; the previous frame is due 10 s earlier."""
 SLOW = [*range(FAST_UNTIL, FINE_FROM, PERIOD), *range(FIRST_FINE, LAST_S - FINE_PERIOD, FINE_PERIOD)]
 FREE = [at for at in SLOW if not HIDDEN[0] <= at < HIDDEN[1]]
 

@@ -97,7 +97,7 @@ def test_readings_without_a_rate_do_not_hide_the_rates_of_a_detumbling() -> None
 
 
 def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
-    """Attitude errors count while the attitude is fine, and shortly after star fixes.
+    """Attitude errors are evaluated while the attitude is fine, and also shortly after star fixes.
 
     The errors about x are 1 mrad (coarse), 2 and 3 mrad (with star fixes) and 6 mrad (without star fixes).
     Sigma is 1 mrad.
@@ -304,7 +304,7 @@ def test_every_requirement_is_judged_by_its_figure() -> None:
     assert orbit.requirements(config, spinning, None, None, None, 110.0)[0]["worst"] == math.inf
     nothing = replace(config, requirements=Requirements())
     assert orbit.requirements(nothing, slowed, known, pointed, None, 300.0) == []
-    # A limit that had not passed at the end of the log is neither kept nor exceeded.
+    # If the log ends before a time limit, the verdict is unknown.
     assert orbit.requirements(config, spinning, None, None, None, 109.0)[0]["verdict"] == "unknown"
     never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None, None, 139.0)
     assert never[1]["verdict"] == "unknown"

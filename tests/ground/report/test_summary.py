@@ -202,7 +202,7 @@ def test_frames_without_rate_and_attitude_are_listed_with_the_reason(full: Run, 
 
 
 def test_a_step_never_settled_is_a_miss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that has not settled after 40 s is a miss.
+    """A step that has not settled after 40 s misses the requirement.
 
     The tested response is too slow to reach 90 % of the step in 40 s.
     """
@@ -306,7 +306,7 @@ def test_a_control_packet_that_is_missing_from_the_log_does_not_count_as_a_skipp
 def test_missing_cycles_and_skipped_slots_in_one_gap_are_distinguished(
     lost: int, slots: int, expected: tuple[int, int]
 ) -> None:
-    """The log has no packet of `slots` slots: `lost` packets are missing, and the loop skipped the others."""
+    """Packets of `slots` slots are absent: `lost` packets were lost, and the loop skipped the other slots."""
     packer, zero = Packer(), {f.name: [0] * f.count if f.count > 1 else 0 for f in CONTROL.fields}
     packets = [packer.pack(CONTROL, k, {**zero, "cycle": k}) for k in range(lost + 1)]
     packets.append(packer.pack(CONTROL, lost + 1, {**zero, "cycle": slots + 1}))
@@ -399,7 +399,7 @@ def test_the_identity_of_a_run_is_that_of_its_packets() -> None:
 
 
 def test_health_states_shares_of_good_streams_conditions_and_worst_values() -> None:
-    """The states of a stream are unknown, good, and others; a stream that is never fitted is not listed."""
+    """The share of good states is reported for each stream, except for streams that are never fitted."""
     states = StreamState.GOOD, StreamState.STALE, StreamState.NOT_FITTED
     good, lost, not_fitted = map(int, states)
     rows = [
