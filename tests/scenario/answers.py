@@ -51,6 +51,6 @@ def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
         for at, data in script:
             rigged.at(at, partial(channel.say, data))
 
-    # A command scheduled far in the future makes the rate group of commands run.
+    # The rate group of commands needs a scheduled command to run; this command is never due.
     far = {"at": 1e6, "mode": "safe"}
     return fly(commanded(4.0, far), folder, prepare), channel

@@ -69,7 +69,7 @@ LOSSES: dict[str, tuple[Break, Break]] = {
     "out of range": (in_the_unit(lambda seen: shifted(seen, 1e3)), in_the_unit(None)),
     "refused": (in_the_unit(elsewhere), in_the_unit(None)),
 }
-"""Functions that start and end a loss of control, by the name of its cause."""
+"""Pairs of functions that start and end a loss of control, by the name of its cause."""
 
 
 def slewing(duration: float) -> TestbedConfig:
@@ -83,7 +83,7 @@ def slewing(duration: float) -> TestbedConfig:
         (thesis_config, -0.1, tuple(LOSSES)),
         (lambda duration: commanded(duration, initial="hold"), -0.1, tuple(LOSSES)),
         (slewing, -0.1, tuple(LOSSES)),
-        # For detumbling, readings that the filter rejects are sufficient.
+        # Detumbling continues with readings that the filter rejects, so the last cause is omitted.
         (lambda duration: commanded(duration, initial="detumble"), 0.45, tuple(LOSSES)[:-1]),
     ],
     ids=["demonstration", "thesis", "hold", "slew", "detumble"],
@@ -146,10 +146,7 @@ def test_a_hold_that_is_declared_impossible_ends_at_once(tmp_path: Path) -> None
 
 
 def test_without_planner_and_readings_no_path_is_followed_to_its_end(tmp_path: Path) -> None:
-    """If the readings stop, no coil is driven along a planned path, even without a planner.
-
-    A planned path is tracked only while readings arrive.
-    """
+    """A planned path is tracked only while readings arrive, even if no new plan replaces it."""
     run = fly(thesis_config(6.0), tmp_path, silence, planner_latency=0.9)
     assert run["plan"]["accepted"].tolist() == [1]
     assert currents(run, SILENT_AT - 0.5, SILENT_AT).max() > ZERO

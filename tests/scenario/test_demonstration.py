@@ -69,8 +69,8 @@ def summary(demonstration: Run) -> dict[str, Any]:
 def power(demonstration: Run) -> dict[str, float]:
     """Return the mean powers (W) over 700 s.
 
-    In a run of 700 s, each step lasts 70 s longer than in the tests. The power at rest is used for these 70
-    s.
+    In a run of 700 s, each step lasts 70 s longer than in the tests. For the missing 70 s, the mean power at
+    rest is used.
     """
     coils = coil_power(demonstration)
     assert coils is not None

@@ -137,7 +137,7 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
         wire = rigged.lock.line.to_host
         rigged.at(BEGIN, lambda: setattr(wire, "faults", LineFaults(silent=True)))
         for k in range(100):
-            # Noise on the line has no sender, so it still arrives if the VN-100's bytes are lost.
+            # Noise arises on the line itself, so it arrives even if the VN-100's bytes are lost.
             def spark(k: int = k) -> None:
                 wire.faults = SOUND
                 wire.noise(40, rigged.lock.clock.now_ns(), 115200)

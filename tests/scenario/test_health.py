@@ -121,7 +121,7 @@ def test_a_unit_that_sends_half_its_packets_is_slow(tmp_path: Path) -> None:
 
 
 def reading(memory: Callable[[float], float], rigged: Rigged) -> None:
-    """Check the resources every 0.5 s, as if all processes together used `memory` bytes."""
+    """Let the flight check its resources every 0.5 s, as if its processes used `memory` bytes."""
 
     def look(now_ns: int) -> ResourceSample:
         seconds = (now_ns - rigged.epoch_ns) / SECOND

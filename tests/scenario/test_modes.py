@@ -173,7 +173,7 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
     config = configuration.replace(config, guidance=configuration.replace(config.guidance, strategy=strategy))
     run = fly(config, tmp_path, prepare, section=released(-0.2, 0.0))
     assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
-    # In the demonstration, the timeout starts at the end of its path, or after the same time without a path.
+    # In the demonstration, the timeout starts when the path ends; without a path, it starts at the same time.
     # In the mode HOLD, the timeout starts when the filter discards its estimate.
     since = 10.0 if initial == "testbed-demo" else 4.0 + AttitudeFilter.REJECTIONS_TO_RESTART * CYCLE
     assert entered(run, Mode.SAFE) == pytest.approx(since + BRIEF["hold_patience"], abs=0.1)

@@ -23,7 +23,7 @@ from tests.support.flights import Rigged, demo_config, event_names, fly
 NEAR = (1 << 32) - 30
 """Initial value of counters that exceed 32 bits within one second of control cycles."""
 FEW_LEFT = (1 << 32) - 3
-"""Initial value of slower counters that exceed 32 bits during the run."""
+"""Initial value of counters that count slowly and exceed 32 bits during the run."""
 SLEWS = 64_535
 """Initial number of commanded slews, close to the end of its 16-bit range."""
 
@@ -122,7 +122,7 @@ def test_every_integer_of_an_orbit_may_exceed_its_range(
 def test_counts_of_ten_years_neither_end_the_flight_nor_its_slews(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Counts of ten years of flight end neither the flight nor its slews.
+    """Counters with the values of ten years of flight do not end the flight or its slews.
 
     In three seconds each counter exceeds 32 bits, and slew numbers reach 65,535 or more.
     """

@@ -24,8 +24,8 @@ from tests.support.flights import event_names, fly
 BEGIN, SLEW, AFTER, TURN = 8.0, 150.0, 8.0, np.radians([20.0, 20.0, -10.0])
 """Start and duration (s) of a slew, time (s) of flight after the slew, and the slew's rotation vector (rad).
 
-The coils can cause the rotation about x, along the field, only because the field rotates; The rotation
-reaches 0.7 deg/s of the 0.8 deg/s that a path may have.
+The coils can cause the rotation about x, along the field, only because the field rotates. The rate reaches
+0.7 deg/s; the limit for a path is 0.8 deg/s.
 """
 BROKEN = 10.0
 """Time (s) at which the coils x and z break. The remaining coil causes no torque about its own axis y, about
@@ -145,9 +145,9 @@ def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Pat
 
 
 def test_the_coils_only_remove_energy_while_the_body_is_damped(crippled: Run) -> None:
-    """While a body is damped, its coils only remove energy.
+    """While the body is damped, its coils only remove energy.
 
-    Along its path, before it is damped, they also add energy.
+    Before that, along the path, they also add energy.
     """
     lost = at(crippled, "astray")[0]
     around, truth = crippled["orbit_truth"], crippled["truth"]

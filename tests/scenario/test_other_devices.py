@@ -72,7 +72,7 @@ def flown(text: str, folder: Path, *expected: str, fault: str = "") -> Run:
 
 
 def test_a_testbed_flies_on_circuitpython_drivers_and_bridges_with_an_i2c_interface(tmp_path: Path) -> None:
-    """The step reaches its target within 10 s. Gravity and magnetic field give the angle."""
+    """The step reaches its target within 10 s. The angle is computed from gravity and the magnetic field."""
     pytest.importorskip("adafruit_icm20x")
     pytest.importorskip("adafruit_lis3mdl")
     run = flown(TESTBED, tmp_path)

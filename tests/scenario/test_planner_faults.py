@@ -1,6 +1,6 @@
 """Tests that an invalid plan is not used. The last valid plan continues, and then its end point is held.
 
-In `test_strategies`, the same configurations fly with a valid planner and without these alarms.
+`test_strategies` flies the same configurations with a valid planner, and expects none of these alarms.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
 def test_a_flight_without_an_estimate_identifies_the_stars_lost_in_space(tmp_path: Path) -> None:
     """A flight without an estimate identifies the stars lost in space and starts the filter.
 
-    Without the IMU, no estimate predicts or uses an attitude.
+    While the IMU is silent, the filter has no estimate, so it neither predicts nor uses an attitude.
     """
     run = fly(demo_config(8.0), tmp_path, lambda rigged: unit_silent(rigged, 0.0, 4.0))
     assert_solved(run)

@@ -1,4 +1,4 @@
-"""Tests of guidance to a target: with a goal time, with a cost of time, to a moving target, and as a step."""
+"""Tests of guidance: slews with a goal time, with a cost of time or to a moving target, and steps."""
 
 from __future__ import annotations
 

@@ -36,12 +36,12 @@ REFUSED = {
 
 ANY = re.compile("|".join(REFUSED))
 BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"\b") for pattern in REFUSED))
-"""`REFUSED` without the conditions on preceding text. A search for this pattern finds more, and is six times
+"""`REFUSED` without its conditions on the preceding text. A search finds too many phrases, but is six times
 faster."""
 GAPS = str.maketrans('#"_', "   ")
 
 PARTS = ("FSTRING_START", "FSTRING_MIDDLE", "FSTRING_END")
-"""Tokens of a formatted string, which is one token in Python 3.11."""
+"""Names of the tokens into which Python divides a formatted string; in Python 3.11, it is one token."""
 TEXT_TOKENS = (
     tokenize.STRING,
     tokenize.COMMENT,
@@ -92,7 +92,7 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
 def may_have_any(text: str) -> bool:
     """Return whether a text may contain a refused phrase. Most texts contain none.
 
-    Code is searched too, so a result of True needs an exact search.
+    Code is searched like text, so a result of True must be confirmed by an exact search.
     """
     flat = " ".join(text.lower().translate(GAPS).split())
     return bool(BEGINS.search(flat) and ANY.search(flat))
