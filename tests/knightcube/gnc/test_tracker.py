@@ -55,7 +55,7 @@ def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> t
 
 @pytest.mark.parametrize("known", [False, True])
 def test_the_errors_agree_with_the_covariance(known: bool) -> None:
-    """The NEES at the ends of 60 passes has the sum of a chi-square with 120 degrees of freedom."""
+    """The sum of the NEES at the ends of 60 passes is a chi-square with 120 degrees of freedom."""
     rng = np.random.default_rng(16)
     times = np.arange(0.0, 24.0, _PERIOD)
     place, rate = [], []
@@ -64,7 +64,7 @@ def test_the_errors_agree_with_the_covariance(known: bool) -> None:
         places, rates = _nees(flown, rng, _SIGMA, known)
         place.append(places[-1])
         rate.append(rates[-1])
-    # The 99 % interval of chi-square(120) / 60 is within 1.25 and 2.9.
+    # The 99 % interval of chi-square(120) / 60 lies between 1.25 and 2.9.
     assert 1.25 < np.mean(place) < 2.9
     assert 1.25 < np.mean(rate) < 2.9
 

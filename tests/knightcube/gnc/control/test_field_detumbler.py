@@ -417,7 +417,7 @@ def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
 
 
 def test_momentum_below_the_permitted_remainder_is_not_planned_for() -> None:
-    """A momentum below the permitted remainder is not planned for, so the plan is shorter.
+    """A plan does not remove momentum below the permitted remainder, so it is shorter.
 
     A tenth of the momentum is along the slowly rotating field, and the other nine tenths are removed faster.
     """
@@ -434,7 +434,7 @@ def test_the_predicted_field_begins_with_the_measured_field() -> None:
         ahead = rng.standard_normal((9, 3))
         field = ahead[0] + 0.5 * rng.standard_normal(3)
         turned = aligned_to(ahead, field)
-        # The series of fields was only rotated.
+        # The function only rotates the series of fields, so their inner products do not change.
         np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)
         assert np.linalg.det(turned[1:4]) == pytest.approx(np.linalg.det(ahead[1:4]))
         if ahead[0] @ field > 0.0:
@@ -445,7 +445,8 @@ def test_the_predicted_field_begins_with_the_measured_field() -> None:
 def test_a_field_along_the_orbit_is_known_from_its_direction_and_its_change() -> None:
     """The field along the orbit is predicted from its present direction and its change.
 
-    Near the equator, the direction of the field oscillates. The prediction is given in other axes.
+    Near the equator, the direction of the field oscillates. The predicted series is in axes that differ from
+    those of the measured field.
     """
     times = braking(LIMIT).instants
     angle = 0.3 * np.sin(1.1e-3 * times)

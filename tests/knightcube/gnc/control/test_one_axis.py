@@ -92,7 +92,7 @@ def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float)
     rate = math.sqrt(2.0 * braking * math.sin(error) - reach**2) / math.cos(error)
     wanted = PathSample(sign * error, 0.0, 0.0)
     demanded = tracker.command(wanted, 0.0, sign * rate).demanded
-    # The remaining demand is due to the curvature of the sine.
+    # The demanded torque is only that of the curvature of the sine.
     curvature = -sign * math.sin(error) * rate**2 / math.cos(error)
     assert demanded == pytest.approx(torque_current(0.0, curvature), rel=1e-6)
 

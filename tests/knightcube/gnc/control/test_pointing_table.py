@@ -177,9 +177,10 @@ def test_a_path_from_an_attitude_off_the_law_leads_to_the_law() -> None:
 
 @pytest.mark.parametrize("roll", [60.0, -100.0])
 def test_a_path_from_an_attitude_far_about_the_axis_is_feasible(roll: float) -> None:
-    """From an attitude far off about the axis, a feasible motion with errors below 25 deg is found.
+    """From a large roll error, a feasible motion with pointing errors below 25 deg is found.
 
-    Full steps with the derivative of the continuous motion would cause errors of 40 deg, or fail.
+    With undamped steps and derivatives of the continuous motion, the errors would be 40 deg, or no motion
+    would be found.
     """
     ahead = expected(BULGED)
     q = multiply(from_rotation_vector(np.radians([1.0, -1.0, roll])), ahead.wanted.quaternion[0])
@@ -254,6 +255,6 @@ def test_a_diverging_motion_gives_no_result_and_no_warning() -> None:
     ],
 )
 def test_weights_without_meaning_are_refused(wrong: dict[str, object], words: str) -> None:
-    """A roll without its axis would have the weight of every other rotation."""
+    """Without its axis, the roll would have the same weight as any other rotation."""
     with pytest.raises(ArgumentError, match=words):
         replace(DEAR, **wrong)  # type: ignore[arg-type]

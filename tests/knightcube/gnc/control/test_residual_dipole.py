@@ -14,7 +14,7 @@ STEP = 0.1
 
 
 def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
-    """Return the dipole that is estimated in 1,500 s, in a field that rotates as in half an orbit."""
+    """Return the dipole estimated in 1,500 s, in which the field rotates once, as in half an orbit."""
     observer, rng = ResidualDipole(np.diag(INERTIA), bound), np.random.default_rng(5)
     rate = np.array([1e-3, -2e-3, 5e-4])
     for k in range(round(1500.0 / STEP)):

@@ -122,7 +122,7 @@ def test_after_a_gap_of_the_readings_two_fields_start_the_coils_again() -> None:
         law.sample(now_ns, np.array([0.0, 1e-5, 3e-5]), np.zeros(3))
         if law.dipole(now_ns).any():
             acted.append(now_ns // SCHEDULE.period_ns)
-    # Readings are missing from 3.725 s (second window) to 14 s (begin of the eighth window).
+    # Readings are missing from 3.725 s (second window) to 14 s (start of the eighth window).
     assert sorted(set(acted)) == [1, 8, 9]
 
 
@@ -159,7 +159,7 @@ SECOND = 1_000_000_000
 
 
 def turned_by(angle: float) -> FloatArray:
-    """Return the direction z, rotated by an angle about x."""
+    """Return the direction z (3,) in axes that are rotated by an `angle` (rad) about x."""
     return np.array([0.0, np.sin(angle), np.cos(angle)])
 
 
@@ -209,7 +209,7 @@ def test_a_sun_is_forgotten_after_a_gap_of_the_gyro(late: float, known: bool) ->
 
 
 def test_a_residual_dipole_is_learned_from_the_difference_of_the_rates() -> None:
-    """One step of the observer, by hand: the first rate is taken, the second one is compared."""
+    """The first rate only starts the observer. The second rate causes one step, which is computed by hand."""
     inertia, field = np.diag([1e-3, 2e-3, 3e-3]), np.array([0.0, 0.0, 3e-5])
     observer = ResidualDipole(inertia, 1.0)
     observer.follow(0.5, np.array([0.01, 0.0, 0.0]), field, np.zeros(3))

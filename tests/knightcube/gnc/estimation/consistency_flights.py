@@ -268,7 +268,7 @@ def _result(suspended: bool, tally: Tally, bias: FloatArray, last: Estimate) -> 
 
 
 def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
-    """Return the normalised squared error of the error states that can differ from zero in the world."""
+    """Return the NEES of the error states that can be non-zero in this simulated world."""
     turn = to_rotation_vector(multiply(world.attitude, conjugate(estimate.quaternion)))
     error = np.concatenate(
         [

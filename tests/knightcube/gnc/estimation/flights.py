@@ -41,7 +41,7 @@ RATE_COVARIANCE: FloatArray = np.eye(3) * RATE_SIGMA**2
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Truth (n, 4) and (n, 3), samples and commands; cycle k and its command begin at k CYCLE_NS."""
+    """True attitudes (n, 4), rates (n, 3), samples and commands; cycle k begins at k * CYCLE_NS."""
 
     attitudes: FloatArray
     rates: FloatArray

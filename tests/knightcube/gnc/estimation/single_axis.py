@@ -65,7 +65,7 @@ class FilterSettings:
         current_noise: standard deviation (A) of the error of the coil current, independent in each cycle.
         control_period: control period, s.
         disturbance_walk: random walk of the unmodelled acceleration, rad/s^2 per sqrt(s).
-        disturbance_start: standard deviation of the unmodelled acceleration at the start, rad/s^2.
+        disturbance_start: initial standard deviation of the unmodelled acceleration, rad/s^2.
         gate_sigma: largest normalised innovation of an accepted measurement.
         history_ns: largest delay of a usable measurement, ns.
     """

@@ -114,7 +114,7 @@ def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
 
 
 def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> None:
-    """After 30 s, torsion, damping and gain are within three sigma, and separate from a steady torque.
+    """After 30 s, torsion, damping and gain are within three sigma, and not confused with a steady torque.
 
     The sigmas of torsion and gain have decreased to less than a tenth.
     """
@@ -431,7 +431,7 @@ def test_an_estimate_before_the_start_or_after_a_day_is_refused() -> None:
 @pytest.mark.parametrize("kind", [AttitudeMeasurement, RateMeasurement])
 @pytest.mark.parametrize("covariance", [1e-8, 1e-8 * np.ones(3)])
 def test_a_covariance_that_is_not_a_matrix_is_refused(kind: type, covariance: FloatArray | float) -> None:
-    """With numpy, a number or a row would be added to each row, as if the errors were correlated."""
+    """Without the check, numpy would broadcast a scalar or a row, as if the errors were correlated."""
     value = np.array([0.0, 0.0, 0.0, 1.0])[: 4 if kind is AttitudeMeasurement else 3]
     with pytest.raises(ArgumentError, match="covariance: an array of shape"):
         kind(0, value, covariance)

@@ -11,7 +11,7 @@ from tests.support.compiled_forms import assert_forms_agree
 
 
 def _problem(coils: int, others: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return coefficients and right-hand sides (2, 40, p + n + 1), and prior weights and expected gains."""
+    """Return equations (2, 40, p + n + 1), prior weights (p,) and (h, n), and expected gains (h, n)."""
     rng = np.random.default_rng(10 * coils + others)
     rows = rng.standard_normal((2, 40, others + coils + 1)) * np.geomspace(0.1, 10.0, others + coils + 1)
     weights = rng.uniform(0.01, 1000.0, (2 * coils + 2, coils))

@@ -163,7 +163,7 @@ def test_a_wrong_direction_does_not_pass_the_gate_and_a_right_one_does() -> None
 
 
 def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> None:
-    """From 100 readings with 20 nT of noise, a hard iron of 300 nT is estimated to 2 nT, as stated."""
+    """From 100 readings with 20 nT of noise, a bias of 300 nT is estimated to the stated 2 nT."""
     rng = np.random.default_rng(6)
     flight = fly(4, 400, False)
     filter_ = AttitudeFilter(FREE, replace(SETTINGS, field_bias_start=5e-7))
@@ -197,7 +197,7 @@ def test_without_a_bias_of_the_magnetometer_none_is_estimated() -> None:
 
 
 def test_a_direction_opposite_to_the_expected_direction_is_refused() -> None:
-    """Across an opposite direction, the deviation is zero, so only its angle shows the error."""
+    """An opposite direction has no component normal to the expected one; only its angle differs."""
     flight = fly(11, 3, False)
     for off in (0.0, 1e-3, 1.0):
         estimate = begin(flight, False)

@@ -131,5 +131,5 @@ def test_few_innovations_contradict_nothing() -> None:
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_an_innovation_of_singular_covariance_has_no_finite_square(size: int) -> None:
-    """The gate of a filter rejects a square that is not finite."""
+    """The gate of a filter rejects a normalised squared innovation that is not finite."""
     assert np.isnan(weigh(np.zeros((6, 6)), np.ones(size), np.eye(6)[:size], np.zeros((size, size))).square)

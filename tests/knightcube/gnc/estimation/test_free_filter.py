@@ -131,10 +131,10 @@ def test_an_unknown_dipole_turns_a_body_of_another_inertia_within_the_claim(axis
 
 
 def test_sun_and_nadir_by_differently_misaligned_cameras_give_an_honest_attitude() -> None:
-    """The camera of the Sun is misaligned by 0.1 deg, those of nadir are not, and both are 20 deg apart.
+    """The Sun camera is misaligned by 0.1 deg, the nadir cameras are not. Sun and nadir are 20 deg apart.
 
-    The misalignment causes an error of 0.1 deg / sin 20 deg = 0.29 deg about nadir. The misalignment of
-    another camera that measures the Sun is unknown again.
+    The misalignment causes an error of 0.1 deg / sin 20 deg = 0.29 deg about nadir. If another camera
+    measures the Sun, the misalignment is unknown again.
     """
     settings = FreeFilterSettings()
     found = FreeFilter(INERTIA, settings)
@@ -319,7 +319,7 @@ def test_errors_of_a_body_that_are_negative_are_refused() -> None:
 
 
 def test_measurements_of_another_shape_or_length_are_refused_and_change_nothing() -> None:
-    """With numpy, a number or a row would be added to each row, as if the errors were correlated."""
+    """Without the check, numpy would broadcast a scalar or a row, as if the errors were correlated."""
     found, _, _ = fly(3, 1)
     before, still, down = found.covariance.copy(), np.zeros(3), np.array([0.0, 0.0, 1.0])
     for wrong in (np.array(1e-8), 1e-8 * np.ones(3)):

@@ -16,7 +16,7 @@ from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, S
 from tests.support.consistency_worlds import CYCLE_NS
 
 SWING = 0.14
-"""Current (A) near the coils' limit, for a slew: only motion makes the age of the samples observable."""
+"""Current (A) of a slew, near the coils' limit. Only motion makes the age of the samples observable."""
 ESTIMATING = replace(SETTINGS, latency_start=0.05)
 
 
@@ -95,7 +95,8 @@ def test_the_estimated_age_is_between_zero_and_the_longest_latency() -> None:
 def test_a_current_that_changes_within_the_uncertainty_of_the_age_adds_noise() -> None:
     """If a current changes within the uncertainty of the age, the change adds noise to the acceleration.
 
-    The noise is half the step of the acceleration per sigma of the age, and zero without a step.
+    Its standard deviation is half the step of the acceleration times the sigma of the age, and zero without a
+    step.
     """
     none = (0.0, 0.0, 0.0)
     now = FilterState(exponential(0.0, 0.4, 0.0), none, none, none, Parameters())

@@ -116,9 +116,9 @@ def dense_step(
 
 
 def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
-    """The process noise agrees within 10 % with 4000 random sequences of 20 cycles, whose noise is held.
+    """The process noise agrees within 10 % with 4000 random sequences of 20 cycles.
 
-    The diagonals of the covariances are compared.
+    The random noise is constant within each cycle. The diagonals of the covariances are compared.
     """
     rng = np.random.default_rng(3)
     draws, cycles, dt = 4000, 20, 0.025
@@ -214,7 +214,7 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
 
 @pytest.mark.parametrize("components", [1, 2, 3])
 def test_a_correction_computed_with_loops_equals_the_correction_computed_with_numpy(components: int) -> None:
-    """All states, all states but the age, only the rate, or no state is corrected."""
+    """All states, all states but the age, only the rate, or no states are corrected."""
     rng = np.random.default_rng(62)
     root = rng.normal(0.0, 0.1, (SIZE + 6, SIZE + 6))
     value, noise = rng.normal(0.0, 0.1, components), 0.1 * np.eye(components) + 0.01
@@ -237,7 +237,7 @@ def test_a_correction_computed_with_loops_equals_the_correction_computed_with_nu
 
 @pytest.mark.parametrize("kept", [0, 1])
 def test_a_correction_about_the_thread_equals_that_by_the_innovation(kept: int) -> None:
-    """Samples of known and of estimated age correct all states, all states but the age, or only the rate."""
+    """The age is known or estimated, and all states, all states but the age, or only the rate change."""
     rng = np.random.default_rng(63)
     exposure = MeanRateMeasurement(0, 10, np.zeros(3), RATE_COVARIANCE)
     state = STATE._replace(kept=((exposure, STATE.quaternion),) * kept)

@@ -36,7 +36,7 @@ def flown() -> Flight:
 def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
     """Return the filter after a flight.
 
-    If `FOUND` is reported, the loop knows that the chip does not respond.
+    If `reported` is true, the filter is informed at the cycle `FOUND` that the chip does not respond.
     """
     filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
     follow(filter_, flown, 1, min(FOUND, until))
@@ -114,10 +114,10 @@ def test_a_jump_of_the_gyro_bias_is_estimated() -> None:
 
 
 def judged(body: RigidBody, departures: list[float]) -> tuple[int, int | None]:
-    """Return the number of gyro samples up to an alarm, and the cycle of the first sample of its mean.
+    """Return the number of gyro samples until the alarm, and the first cycle of the mean that raised it.
 
-    The values `departures` are the innovations about the y axis, in standard deviations. The innovations
-    about the other axes are zero.
+    `departures` are the innovations about the y axis, in standard deviations. The innovations about the other
+    axes are zero.
     """
     settings = dataclasses.replace(SETTINGS, unknown_current=LIMIT)
     model, sigma, axes = AttitudeFilter(body, settings)._model, 1e-4, 1 if body.suspended else 3

@@ -133,7 +133,7 @@ def plant(current_limit: float | None = None) -> SingleAxisPlant:
 
 
 _ROUNDING = 1e-10
-"""Largest value that rounding gives to a coefficient of a path that is zero in exact arithmetic."""
+"""Largest rounding error of a path coefficient that is zero in exact arithmetic."""
 
 
 def without_counts(found: StepPlan) -> StepPlan:

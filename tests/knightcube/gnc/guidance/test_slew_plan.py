@@ -242,7 +242,7 @@ def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() 
 
 
 def test_a_small_cost_of_time_gives_a_slow_slew_of_little_heat() -> None:
-    """A slew whose duration has a small cost takes long, although a slew in a fraction of the time exists.
+    """With a small cost of time, the optimal slew is slow, although much faster slews exist.
 
     A plan with a fixed duration bounds the cost of the plan with a free duration.
     """

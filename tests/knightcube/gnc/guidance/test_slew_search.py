@@ -72,7 +72,7 @@ class Model:
         self.free_is_kept = True
 
     def path(self, horizon: float, count: int = 10, factor: float = 1.0) -> Any:
-        """Return a path, whose heat is `factor` times that of the best path."""
+        """Return a path whose heat is `factor` times that of the best path."""
         return SimpleNamespace(horizon=horizon, factor=factor, equations=SimpleNamespace(count=count))
 
     def energy(self, found: Any) -> float:
@@ -113,7 +113,7 @@ def test_a_minimum_time_slew_is_shortened_to_nearly_the_shortest_duration() -> N
 
 
 def test_a_time_cost_ends_the_shortening_at_the_best_duration() -> None:
-    """Heat k/T^3 plus c T is least at T^4 = 3 k/c."""
+    """The total cost k/T^3 + c T of heat and time is minimal at T^4 = 3 k/c."""
     model = Model(20.0, heat=1e6)
     cost = 3e6 / 80.0**4
     found = continuation(model, time_cost=cost).shortened([model.path(300.0)], 1.0, cost)
@@ -346,7 +346,7 @@ class Guesses:
 def searched(
     solver: Guesses, names: list[str], monkeypatch: pytest.MonkeyPatch, **changes: Any
 ) -> tuple[SlewSearch, list[tuple[str, float]]]:
-    """Return a search and the guesses and durations of the paths that it yields, without limits."""
+    """Return a search with a given solver, and guess and duration of each path found; no limit is checked."""
     search = SlewSearch(small_slew(horizon=240.0, longest=240.0, **changes), 10, 5000)
     search.solver = cast(Any, solver)
     search._walker = cast(

@@ -108,7 +108,7 @@ def test_the_clearance_of_a_cone_is_the_angle_beyond_its_half_angle() -> None:
     "end", [AttitudeEnd(TARGET, END_RATE), BoresightEnd(Z, matrix(TARGET).T @ Z, END_RATE)]
 )
 def test_the_end_is_missed_by_the_error_of_attitude_and_rate(end: Any) -> None:
-    """At the end, the error is zero; a small rotation changes it by half of the angle or by its sine."""
+    """A small rotation from the end causes an error of half of its angle, or for a boresight of its sine."""
     scale = 100.0
     conditions = EndConditions(end, scale)
     whole = isinstance(end, AttitudeEnd)
@@ -251,7 +251,7 @@ def test_an_end_at_rest_deep_inside_a_cone_is_refused(deep: float, refused: bool
     found = blocking_cone(task, 240.0)
     assert found is not None
     assert found.name == "Moon"
-    # The roll does not move the axis of the camera if it is the axis that points to the target.
+    # The camera's axis is the pointing axis, so the roll does not move it.
     assert blocking_cone(free, 240.0) is found
     (cone,) = free.cones
     for axis, blocked in ((np.array([0.0, 1.0, 0.0]), False), (np.array([1.0, 0.01, 0.0]), True)):

@@ -195,7 +195,7 @@ def test_a_boresight_end_takes_the_roll_of_least_rotation(opposite: bool) -> Non
 
 
 def test_the_dipoles_of_a_path_cause_its_motion_with_least_heat() -> None:
-    """The torque of the dipoles is the needed torque across the field; more dipole along it costs heat."""
+    """The dipoles give the needed torque normal to the field; more dipole along the field only costs heat."""
     cone = Cone(
         "Sun", np.array([0.0, 1.0, 0.0]), lambda times: np.tile([0.6, 0.0, 0.8], (len(times), 1)), 0.3
     )

@@ -187,7 +187,7 @@ def test_the_reference_point_changes_the_parameters_and_not_the_path() -> None:
 def test_gradients_are_exact(horizon: float) -> None:
     """The gradients of energy and limits agree with central differences.
 
-    The gradients are with respect to every parameter and to the duration (horizon).
+    The gradients are taken with respect to every parameter and to the duration.
     """
     family = PathFamily.around(BoundaryStates(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
     program = PathProgram(THREAD, family, 0.68, horizon, PathCost.HEAT)
@@ -316,7 +316,7 @@ def test_both_ends_of_the_range_of_the_stretch_are_permitted(max_stretch: float)
 def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
     """The median plan takes less than 3 ms of processor time, for steps, thesis and twenty known problems.
 
-    The benchmark `plan` measures more problems.
+    `python -m tests.studies.bench plan` measures more problems.
     """
     problems = [*STEPS, THESIS, *(known.problem for known in known_optima())]
     assert np.median([ordinary_seconds(problem.planned, 2) for problem in problems]) < 0.003
@@ -514,7 +514,7 @@ def test_a_horizon_slightly_shorter_than_the_first_path_found_is_kept() -> None:
 def test_a_path_of_little_supply_energy_is_stretched_as_a_path_of_little_heat(
     start: float, end: float, disturbance: float, stiffness: float
 ) -> None:
-    """Half of the duration of the bang-bang path cannot suffice, so both paths take longer."""
+    """The requested duration is half of that of the bang-bang path, so both paths are stretched."""
     strongest = 3e-4 * 0.2
     plant = SingleAxisPlant(1e-3, 3e-4, 20.0, 0.2, stiffness * strongest, 0.0, disturbance * strongest / 1e-3)
     horizon = math.sqrt(abs(end - start) * 1e-3 / strongest)
