@@ -61,7 +61,7 @@ def test_motions_are_alike_if_they_are_equal_or_opposite_within_half_a_percent()
 @pytest.mark.parametrize(
     ("ends", "lit", "verdict"),
     [
-        # Ends (start and end of each streak): NaN is outside the frame. Streaks without gaps are 1.
+        # `ends` of each streak: 1 correct, 0 wrong, NaN outside the frame. `lit`: 1 if a streak has no gaps.
         ([[1, 1]] * 8, [1] * 8, StreakVerdict.CONFIRMED),
         ([[1, 1]] * 3 + [[0, 0]] * 5, [1] * 8, StreakVerdict.REJECTED),
         ([[1, 1]] * 3 + [[np.nan, 0]] * 5, [1] * 8, StreakVerdict.REJECTED),
@@ -102,7 +102,7 @@ def test_chains_and_trails_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(estimate, "trailing_fraction", lambda *_, share=share: share)
         assert check_streaks(_problem(), growing, _NOBODY) is verdict
         assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.CONFIRMED
-    # The ends of short streaks are not confirmed, so that trails reject any motion of short streaks.
+    # If no streak end is confirmed, trails reject any motion, also one with a nearly constant rate.
     monkeypatch.setattr(estimate, "true_ends", lambda _, scene: np.full((len(scene.stars), 2), np.nan))
     assert check_streaks(_problem(), slowly, _NOBODY) is StreakVerdict.REJECTED
     monkeypatch.setattr(estimate, "trailing_fraction", lambda *_: 0.45)
@@ -145,7 +145,7 @@ def _rolling(
     prior: FloatArray | None = None,
     sigma: float = 1e-3,
 ) -> tuple[MotionResult | None, list[float]]:
-    """Return the result if the two senses of a rotation about x give two candidates, and the senses tried."""
+    """Return the result if the senses +x and -x give `one` and `other`, and the senses tried."""
     asked: list[float] = []
 
     def fit_along(sense: FloatArray) -> estimate._Candidate | None:
@@ -204,7 +204,7 @@ def test_a_prior_rate_decides_on_the_sign_of_the_rotation() -> None:
 def test_the_error_of_the_motion_from_navigation_is_in_the_covariance(
     monkeypatch: pytest.MonkeyPatch, delay: float
 ) -> None:
-    """The result contains the course from navigation, unless the pixels contradict this course."""
+    """The result uses the motion from navigation and its error, unless the pixels contradict this motion."""
     turn = np.array([0.1, 0.0, 0.0])
     course = Course(np.stack([turn, 0.0 * turn, turn]), 1e-4)
     camera = replace(_problem(), shutter=Shutter(delay, 70.0), course=_MOTION)
@@ -315,7 +315,7 @@ def _rated(
 
 
 def _moved(result: MotionResult, stars: list[int], place: float) -> MotionResult:
-    """Return the result with the first of both ends of some streaks at the column `place` of the frame."""
+    """Return the result with the leftmost end of some streaks moved to the column `place`."""
     moved = result.stars.copy()
     for _ in range(5):
         # The point-spread width is 1.1 px, so that an end is visible from the column 1.7 on.
@@ -398,7 +398,7 @@ def test_few_or_short_streaks_give_no_rate(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_double_images_reject_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most streaks are double if each has another star within 8 px, with at least 30 % of the flux."""
+    """A streak is double if another star within 8 px has at least 30 % of its flux."""
 
     def beside(distance: float, share: float, count: int) -> Callable[[MotionResult], MotionResult]:
         def changed(result: MotionResult) -> MotionResult:
@@ -478,7 +478,7 @@ def test_convincing_guesses_come_before_the_others_in_the_order_of_their_evidenc
 ) -> None:
     doubtful, sure, other = (2e3, False, 0.1), (9e3, True, 0.2), (5e3, False, 0.3)
     assert _searched(monkeypatch, [doubtful, sure, None, other], []) == [0.2, 0.3, 0.1]
-    # A convincing fit that explains less than an earlier fit is not accepted without comparison.
+    # A convincing fit does not come first if an unconvincing fit explains more; then the frame is scanned.
     assert _searched(monkeypatch, [(9.5e3, False, 0.1), sure], [(8e3, False, 0.5)]) == [0.1, 0.2, 0.5]
     # Equal motions are fitted once, and poor fits are dropped.
     assert _searched(monkeypatch, [sure, (8e3, True, 0.2005), other], []) == [0.2, 0.3]
@@ -493,7 +493,7 @@ def test_convincing_guesses_come_before_the_others_in_the_order_of_their_evidenc
 def test_a_vibration_is_fitted_only_if_no_guess_is_convincing_without_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A fit with a vibration to a wrong guess would use up the work of the frame."""
+    """For a wrong guess, a fit with a vibration would exhaust the work that a frame is allowed."""
     wrong, sure = (4e3, False, 0.1), (9e3, True, 0.2)
     asked: list[float] = []
 
@@ -505,12 +505,13 @@ def test_a_vibration_is_fitted_only_if_no_guess_is_convincing_without_one(
     again = Asked({0.1: (5e3, True, 0.11), 0.3: (6e3, True, 0.31)})
     found = _searched(monkeypatch, [wrong, sure], [], disturbed=again)
     assert found[0] == 0.2
-    # The likeliest of the fits whose residuals may show a vibration comes first, even if it is convincing.
+    # Of the fits whose residuals may show a vibration, the likeliest is tried first, even if it is
+    # convincing.
     asked.clear()
     doubtful = (5e3, True, 0.3)
     assert _searched(monkeypatch, [wrong, doubtful], [], disturbed=again)[0] == 0.31
     assert asked == [0.3, 0.1]
-    # A wrong guess without a vibration remains the last.
+    # If the fit with a vibration is not convincing either, the order of the fits does not change.
     asked.clear()
     none = Asked({0.1: (4e3, False, 0.1)})
     assert _searched(monkeypatch, [wrong, (3e3, False, 0.2)], [], disturbed=none) == [0.1, 0.2]
@@ -610,7 +611,8 @@ def _attempt(
 def test_the_evidence_for_a_guess_is_its_explained_chi_square(monkeypatch: pytest.MonkeyPatch) -> None:
     """The evidence sums the squared significances of well-fitted stars, each at most 200 squared.
 
-    Streak ends above 40 %, which a wrong angle may reach by chance, multiply the evidence.
+    The evidence is multiplied by the fraction of correct ends minus 0.4, which a wrong angle may reach by
+    chance.
     """
     squares = 45.0**2 + 200.0**2 + 100.0**2
     found = _attempt(monkeypatch)

@@ -71,8 +71,8 @@ def test_the_rate_is_within_what_its_covariance_and_the_bound_allow(theta: float
 def test_streaks_without_both_ends_in_the_frame_give_no_rate() -> None:
     """Streaks that cross the whole frame do not show their length.
 
-    A fit with the length within the frame gives two thirds of the true rate, an error of 55 standard
-    deviations.
+    A fit of the length that is visible in the frame gives two thirds of the true rate, an error of 55
+    standard deviations.
     """
     scene = real_sky(9012, 1.5, 750.0, 0.2, replace(CAMERA, columns=500, rows=500))
     found = _estimated(scene)
@@ -225,7 +225,7 @@ def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() 
 
 
 def test_a_torque_that_begins_within_the_exposure_is_in_the_covariance() -> None:
-    """The rate changes from a random time on, across its direction, which is not linear in time."""
+    """From a random time on, the body accelerates normal to the rate, so the rate is not linear in time."""
     squares = []
     for seed in range(12, 24):
         generator = np.random.default_rng([31, seed])
@@ -281,7 +281,7 @@ def test_a_rotation_that_returns_nearly_to_its_start_is_not_reported_as_one_from
 def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
     """Streaks of half the field of view are fitted, although few of them are entirely in the frame.
 
-    The bright regions have wrong lengths, and a scan along the circles about the rotation axis finds the
+    The lengths of the bright regions are wrong, so a scan along the circles about the rotation axis finds the
     angle.
     """
     scene = real_sky(26, np.radians(75.0), 512.0, 0.2)
@@ -315,7 +315,7 @@ def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
 def test_a_rolling_shutter_distinguishes_a_rotation_from_its_reverse() -> None:
     """A rolling shutter distinguishes a rotation from its reverse, because their rates differ by 5 %.
 
-    Without a prior rate, the covariance includes the rates of both rotations.
+    Without a prior rate, the sense of the rotation is unknown, and the covariance covers both rates.
     """
     camera = replace(CAMERA, line_time=5e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
@@ -455,7 +455,7 @@ def test_a_rotation_supported_only_by_streaks_at_the_border_is_rejected() -> Non
 
 
 def test_a_rotation_is_rejected_if_the_only_entire_streak_is_longer() -> None:
-    """A rotation is rejected if the only streak that is entirely in the frame is longer.
+    """A rotation is rejected if the only streak with both ends in the frame is longer than predicted.
 
     All other bright streaks show only one end, and 0.88 times the true angle fits these ends.
     """
@@ -611,7 +611,7 @@ def test_a_stated_error_of_the_focal_length_is_part_of_the_covariance(error: flo
     assert found.covariance is not None
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
     assert float(np.sqrt(np.trace(found.covariance))) < 0.05 * float(np.linalg.norm(scene.rate))
-    # If the focal length is assumed to be exact, the claim is wrong.
+    # If the focal length is assumed to be exact, the stated covariance is too small.
     certain = estimate_rate(scene.pixels, pinhole, scene.exposure, prior_rate=scene.rate)
     assert certain.rate is not None
     assert certain.covariance is not None

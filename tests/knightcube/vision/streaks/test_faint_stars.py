@@ -123,7 +123,7 @@ _STARS = [(5.2, 60.0, 900.0), (6.0, 71.5, 500.0), (4.4, 8.0, 300.0), (5.0, 120.0
 
 
 def test_responses_are_truncated_triangles_with_the_profile_across() -> None:
-    """The responses of stars, divided by the noise, are subtracted where the noise is given."""
+    """The responses of stars are divided by the noise and subtracted where the noise is known."""
     grid = _grid(20.0)
     expected = _responses(grid, _SPAN, _STARS)
     scale = np.random.default_rng(1).choice([0.0, 0.02], expected.shape, p=[0.4, 0.6]).astype(np.float32)
@@ -206,13 +206,13 @@ def test_peaks_that_stronger_peaks_cause_are_omitted() -> None:
     row = np.array([5, 5, 5, 5, 7, 5])
     column = np.array([50, 60, 100, 41, 50, 145])
     value = np.array([100.0, 93.0, 80.0, 60.0, 40.0, 8.0])
-    # The remaining heights: 100, 93 - 50 (46 %), 80, 60 - 55 - 2, 40 - 3 % of 100, and 8 below the threshold.
+    # Heights after subtraction: 100, 93 - 50 = 43 (46 %), 80, 60 - 55 - 2 = 3, 40 - 3 = 37, and 8, below 9.
     across = ndtr((2 * ACROSS + 1.5) / 1.05) - ndtr((2 * ACROSS - 1.5) / 1.05)
     assert 40.0 - 100.0 * across > 10.0
     arguments = row, column, value, spans, length, 9.0
     assert faint_stars._unshaded(*arguments).tolist() == [True, True, True, False, True, False]
     assert_forms_agree(faint_stars._unshaded, *arguments, compiled=False)
-    # At the edge of the detector, a star has a smaller response, and the same response at its neighbours.
+    # At the edge of the detector, a star's own response is smaller, but not its response at its neighbours.
     spans[:, 0] = 48.0
     value[1] = 100.0
     assert_forms_agree(faint_stars._unshaded, row, column, value, spans, length, 9.0, compiled=False)

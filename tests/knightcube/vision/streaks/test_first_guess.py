@@ -81,8 +81,7 @@ def test_a_scan_along_the_circles_gives_the_angle_nearest_to_a_prior_first() -> 
 def test_the_asymmetry_of_regions_shows_a_change_of_the_rate(growth: float) -> None:
     """The asymmetry of the regions shows whether the rate increases or decreases during the exposure.
 
-    The guessed axis may be opposite to the true axis, so the change has a sign relative to the guessed
-    rotation.
+    If the guessed axis is opposite to the true axis, the change has the opposite sign.
     """
     rotation = turn_of(np.radians(70.0), 120.0, 0.4)
     scene = taken(np.random.default_rng(74), rotation, growth * rotation, 0.5)
@@ -205,7 +204,7 @@ def test_a_region_in_another_direction_does_not_change_the_axis() -> None:
 
 @pytest.mark.parametrize("growth", [1.2, -1.2, 0.2])
 def test_the_centroid_of_a_streak_shows_the_change_of_the_rate(growth: float) -> None:
-    """A significant change of the rate has the sign of the change in magnitude, in the guessed direction."""
+    """A significant change of the rate is found, with the opposite sign if the guessed axis is opposite."""
     motion = CameraMotion(0.07 * _AXIS, growth * 0.07 * _AXIS)
     regions = _drawn(motion)
     guess = find_axis(regions, _SMALL)
@@ -341,7 +340,7 @@ def test_refined_lengths_are_within_half_a_step_of_the_search() -> None:
 
 
 def test_a_scan_finds_angle_position_and_flux_of_streaks() -> None:
-    """A scan along the circles of the regions finds the angle, and the stars for this angle."""
+    """A scan along the circles of the regions finds the angle, and the positions and fluxes of the stars."""
     angle, rng = 0.09, np.random.default_rng(3)
     motion = CameraMotion.steady(angle * _AXIS / np.linalg.norm(_AXIS))
     image, time = rng.normal(100.0, 3.0, (200, 240)), np.linspace(-0.5, 0.5, 300)

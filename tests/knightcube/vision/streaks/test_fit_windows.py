@@ -1,4 +1,4 @@
-"""Tests of the pixels of the fit: patches, numbers of shared pixels, values of the frame, and slow parts."""
+"""Tests of the fitted pixels: patches, numbers of shared pixels, frame values, and slow parts of paths."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_patches_are_squares_of_pixels_and_know_the_frame() -> None:
 
 
 def test_each_pixel_has_one_number() -> None:
-    """Pixels of several windows have one number, and pixels outside have the number after the last."""
+    """A pixel in several windows has one number; pixels outside the frame have the number after the last."""
     index = np.array([7, 3, 7, 9, 3, 3, 0, 5])
     inside = np.array([True, True, True, True, True, True, False, True])
     for form in (fit_windows._numbered.numpy_form, fit_windows._numbered.loop_form):
@@ -102,7 +102,7 @@ def test_windows_have_the_values_of_the_frame_and_the_pixels_that_stars_share() 
 
 
 def test_sums_over_windows_are_those_of_each_pixel() -> None:
-    """The counts of two blocks of two pixels and of one patch of three pixels are added to four pixels."""
+    """Two blocks of two pixels and one patch of three pixels add their counts to four pixels."""
     slot = np.array([0, 2, 1, 1, 0, 2, 3])
     images = np.array([[[1.0, 2.0], [-9.0, -9.0]], [[3.0, 4.0], [-9.0, -9.0]]], dtype=np.float32)
     blocks = images, np.array([10.0, 100.0]), np.array([0.5, 0.0])
@@ -127,7 +127,7 @@ def test_areas_are_those_of_a_straight_strip() -> None:
 
 
 def test_the_slow_part_of_a_path_is_at_the_end_with_the_smaller_rate() -> None:
-    """The fast part begins where the relative change of the speed over one width falls below 5 %."""
+    """The fast part begins where the relative change of the speed over one PSF width falls below 5 %."""
     rate = np.array([0.0, 0.08, 0.0])
     times = np.array([[-0.5, 0.5], [-0.5, 0.5]])
     stars = np.array([[75.0, 60.0], [60.0, 30.0]])

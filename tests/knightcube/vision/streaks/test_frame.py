@@ -175,7 +175,7 @@ def test_a_point_spread_of_another_width_gives_a_rate_within_its_covariance(
 ) -> None:
     """The fitted width is near the true width, which a learned profile determines less well than a Gaussian.
 
-    The shares of the Gaussians of a learned profile also describe a part of the width.
+    The shares of the Gaussians in a learned profile describe a part of the width, too.
     """
     scene = real_sky(12, np.radians(70.0), 80.0, 1.0, replace(CAMERA, psf_sigma=true))
     found = _found(scene, psf_sigma=described)
@@ -225,7 +225,7 @@ def test_a_frame_that_saturates_below_the_described_level_is_recognised() -> Non
 
 @pytest.mark.parametrize(("sigma", "sizes"), [(1.0, [1]), (1.5, [1, 2]), (3.0, [2])])
 def test_a_blurred_frame_is_prepared_again_with_larger_pixels(sigma: float, sizes: list[int]) -> None:
-    """A frame of the configured width is prepared once, and one of a very large width only with binning."""
+    """A frame with the configured PSF width is prepared once, and one with a very wide PSF only binned."""
     scene = real_sky(2, 1.2, 60.0, 1.0, replace(CAMERA, psf_sigma=sigma))
     settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
     frames = prepare_frames(scene.pixels, CAMERA.pinhole, SATURATION, settings)

@@ -176,7 +176,7 @@ _HIGHER = np.array([[0.02, -0.01, 0.03], [0.01, 0.05, -0.04]])
 
 
 def test_the_rotation_of_an_exposure_follows_from_the_terms_of_the_motion() -> None:
-    """Odd terms contribute to the rotation between start and end, and even terms to the halfway rotation."""
+    """Odd terms rotate the camera from start to end; even terms move the attitude halfway between them."""
     motion = CameraMotion(np.array([0.3, 0.1, -0.2]), np.array([0.4, -0.2, 0.8]), _HIGHER)
     assert motion.rotation == pytest.approx([0.305, 0.0975, -0.1925])
     assert motion.halfway == pytest.approx([0.05 + 0.000625, -0.025 + 0.003125, 0.1 - 0.0025])
@@ -259,7 +259,7 @@ def test_a_streak_is_complete_if_both_ends_are_far_enough_inside_the_detector() 
 
 
 def test_a_star_is_exposed_while_its_row_is_exposed() -> None:
-    """Start and end of a star's exposure are those of the row in which the star then is.
+    """A star's exposure starts and ends with that of the row in which the star is at that time.
 
     A star below or above the detector has the times of the nearest row.
     """
@@ -364,7 +364,7 @@ def test_a_course_has_the_mean_rates_and_their_linear_change() -> None:
     ("share", "sigma", "used"), [(1.05, 0.98, True), (0.95, 0.98, False), (1.05, 1.02, False)]
 )
 def test_a_course_is_used_if_it_is_certain_and_not_uniform(share: float, sigma: float, used: bool) -> None:
-    """A course is used if stars depart from uniform motion, and if its error on the image is small.
+    """A predicted rotation is used if it moves stars non-uniformly and if its error in the image is small.
 
     For a constant acceleration g, the departure g t^2/2 varies by g/8 within the exposure.
     """

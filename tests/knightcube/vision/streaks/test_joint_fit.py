@@ -43,7 +43,7 @@ _STARS = 16
 
 
 def _seen(theta: float, length: float, turned: float) -> tuple[FitProblem, StreakScene, CameraMotion]:
-    """Return a frame, its brightest stars for `turned` times the true motion, and the true motion."""
+    """Return a frame, a scene whose motion is `turned` times the true motion, and the true motion."""
     sky = real_sky(21, np.radians(theta), length, 0.2)
     frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
@@ -276,7 +276,7 @@ def test_windows_are_cut_again_if_the_streak_ends_have_moved() -> None:
 
 
 def _evaluation(stars: int, steps: FloatArray) -> Evaluation:
-    """Return normal equations of stars whose scores ask for `steps` (n, 7) of the shared parameters."""
+    """Return noisy normal equations whose solutions are the `steps` (n, 7) of the shared parameters."""
     rng = np.random.default_rng(9)
     root = rng.normal(size=(stars, SHARED + ALONE, 60))
     information = root @ root.swapaxes(1, 2)
@@ -361,7 +361,7 @@ def test_subtracted_stars_leave_noise_and_their_model_errors() -> None:
 
 
 def test_stars_are_subtracted_from_pixels_inside_the_frame() -> None:
-    """Pixels of two stars lose the counts of both, and the squares of their model errors are added."""
+    """The counts of both stars are subtracted from shared pixels; their squared model errors are added."""
     signal, floor = np.full(4, 100.0, np.float32), np.full(4, 9.0, np.float32)
     index, inside = np.array([[[1, 2]], [[2, 0]]]), np.array([[[True, True]], [[True, False]]])
     images, light = np.array([[[0.1, 0.2]], [[0.3, 0.4]]], np.float32), np.array([10.0, 100.0])
@@ -433,7 +433,7 @@ def test_the_expected_intensity_is_that_of_the_central_pixels(width: float) -> N
 
 
 def test_the_last_step_is_that_of_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A width that oscillates by several standard deviations does not count as an unfinished motion."""
+    """If only the width oscillates, even by several standard deviations, the motion counts as converged."""
     camera, scene = _taken(60.0, 300.0)
     done = iterate(camera, scene, camera.free, ROUGH)
     assert done is not None
@@ -512,7 +512,7 @@ def test_the_search_for_faint_stars_is_repeated_once(
     expected: int | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The search is repeated if the streak ends are wrong or moved far, and rejected if they stay wrong."""
+    """The search is repeated if streak ends are wrong or moved far; the fit fails if they remain wrong."""
     scene, made = _small_scene(), []
 
     def fitted(_: FitProblem, first: StreakFit) -> tuple[Any, str]:

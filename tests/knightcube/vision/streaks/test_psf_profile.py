@@ -30,7 +30,7 @@ _RATE = _TURN / _EXPOSURE
 def _found(
     spread: Spread | None, seed: int, shake: Callable[[FloatArray], FloatArray] | None = None
 ) -> MotionResult:
-    """Return the motion found in a frame of 14 stars, with a point spread or a displacement (m, 2), px."""
+    """Return the motion found in a frame of 14 stars with the given PSF and image displacement (m, 2), px."""
     rng = np.random.default_rng((seed, 3))
 
     def at(times: FloatArray) -> FloatArray:
@@ -68,10 +68,10 @@ def test_without_a_learned_profile_rings_give_no_rate(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("cycles", [40.0, 90.0])
 def test_a_fast_vibration_is_not_treated_as_a_ring(cycles: float) -> None:
-    """A vibration along a line widens streaks like a ring, but not at their ends: the frame gives no rate.
+    """A vibration along a line widens streaks as a ring-shaped PSF does, but it does not widen their ends.
 
-    The residuals at the ends make the rate uncertain. A ring of this width gives a rate, as the test of a
-    defocused camera shows.
+    The residuals at the ends make the rate uncertain, so the frame gives no rate. A ring-shaped PSF of this
+    width alone gives a rate, as the test of a defocused camera shows.
     """
 
     def shake(times: FloatArray) -> FloatArray:
@@ -103,7 +103,7 @@ def test_the_light_of_a_profile_is_the_sum_of_its_gaussians() -> None:
 
 
 def test_the_derivatives_by_the_width_are_those_of_the_light() -> None:
-    """The images of long streaks and of spots change with the width of the scene as their derivatives say."""
+    """The derivatives of the images of long streaks and spots with respect to the PSF width are correct."""
     # A rotation about the boresight gives streaks far from the image centre and a spot near the centre.
     scene, step = _scene(np.array([0.0, 0.0, 0.3])), 2e-3
     frame = reduce_frame(np.full((560, 560), 100, dtype=np.uint16), 4095.0, 1.0)

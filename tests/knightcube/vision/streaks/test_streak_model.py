@@ -119,8 +119,8 @@ def test_the_derivatives_of_short_streaks_by_the_acceleration_are_those_of_brute
 ) -> None:
     """The quadratic images give the derivatives of streaks that are shorter than two blocks of pixels.
 
-    The fit of a star removes the part of a derivative that changes of the star's position, of its flux and of
-    the rate explain. The remaining part agrees with a sum over instants to 6 %.
+    Before the comparison, the part of a derivative that changes of position, flux and rate can explain is
+    removed. The remaining part agrees with a sum over instants to 6 %.
     """
     axis = np.array([0.6, 0.8, 0.3])
     turn, star = length / _PINHOLE.focal_length * axis, np.array([[160.2 + place, 150.7]])
@@ -144,7 +144,7 @@ def test_the_derivatives_of_short_streaks_by_the_acceleration_are_those_of_brute
 
 
 def test_strips_extend_beyond_both_ends_for_any_times() -> None:
-    """Strips extend beyond both ends for any times.
+    """Strips extend beyond both ends of a streak, whatever its start and end times.
 
     With a rolling shutter, the times of a streak are arbitrary. The strips have the same number of additional
     pixels at both ends.
@@ -184,7 +184,7 @@ def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: fl
 
 
 def test_a_short_bent_streak_is_summed_exactly() -> None:
-    """A short curved streak is summed exactly.
+    """The image of a short curved streak agrees with a sum over instants.
 
     The star is 5 px from the rotation axis and rotates by one radian, so its path is far from straight.
     """

@@ -76,10 +76,9 @@ def test_an_exact_camera_has_no_errors() -> None:
 def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
     """A wrong image centre appears as a rotated rate vector.
 
-    A shift by dx is, to first order, a rotation by dx / f about y. Only half of the rotation by dx / f
-    appears in the rate. The shift also changes the motion field in the image to second order, which cancels
-    the effect on one of the two components of the motion. The fraction of one half holds for stars on a
-    square.
+    A shift by dx is, to first order, a rotation by dx / f about y. Only half of this rotation appears in the
+    rate. The shift also changes the motion field in the image to second order, which cancels the effect on
+    one of the two components of the motion. The fraction of one half applies to stars spread over a square.
     """
     focal = CAMERA.pinhole.focal_length
     found = _together(*_seeming(replace(EXACT, centre=5.0)))
@@ -232,7 +231,7 @@ def test_stars_hidden_in_streaks_do_not_move_the_ends(monkeypatch: pytest.Monkey
 
 
 def _left(residual: float, noise: float, shift: str) -> tuple[StreakResiduals, StreakScene]:
-    """Return residuals of ends or sides that are displaced by `residual` px, with a noise factor."""
+    """Return residuals of streak ends or sides displaced by `residual` px, with `noise` times their noise."""
     rng = np.random.default_rng(3)
     images = np.zeros((40, 7, 10, 9), dtype=np.float32)
     ends, sides = slice(0, 20), slice(20, 40)
@@ -262,7 +261,7 @@ def test_residuals_are_measured_as_a_displacement(shift: str, measured: object) 
 
 
 def test_a_learned_profile_that_is_wrong_everywhere_does_not_displace_the_ends() -> None:
-    """With a learned profile, only the part of residuals that exceeds those elsewhere is a displacement."""
+    """With a learned profile, only residuals larger than those elsewhere show a displacement."""
     learned = PsfProfile((0.5, 1.0), (-0.5, 1.5))
     for displaced, expected in ((0.0, 0.0), (0.5, 0.5)):
         left, scene = _left(displaced, 1.5, "ends")
@@ -288,7 +287,8 @@ def test_calibration_errors_are_estimated_together_with_the_motion(
     """The correction is that of dense equations for the motion and all calibration errors.
 
     Each calibration error has a prior standard deviation of one. The errors that the fit has already
-    corrected are part of the prior. The covariance grows by that of the errors and by the squared correction.
+    corrected are part of the prior. The covariance increases by the contribution of the errors and by the
+    square of the correction.
     """
     rng = np.random.default_rng(8)
     n, k, m, described = 6, 4, 3, 2
@@ -300,7 +300,7 @@ def test_calibration_errors_are_estimated_together_with_the_motion(
     assert found is not None
 
     def dense(of: int) -> FloatArray:
-        """Return the information matrix of the motion and the first `of` calibration errors."""
+        """Return the information matrix of the motion and of the first `of` calibration errors."""
         whole = np.zeros((k + of, k + of))
         for known, change in zip(information / spread, apparent[:, :, :of], strict=True):
             design = np.hstack([np.eye(k), change])
@@ -330,14 +330,13 @@ def test_calibration_errors_are_estimated_together_with_the_motion(
 def test_a_calibration_error_is_corrected_if_it_is_hardly_due_to_chance() -> None:
     """A calibration error is corrected if chi-square exceeds its quantile for a probability of 1e-5.
 
-    One star with a large error of its own determines the common motion; the difference of two stars has the
-    variance 2, of which the calibration error contributes 4.
+    The difference of the two stars has a variance of 2 from noise and of 4 from the calibration error.
     """
     information = np.array([[[1.0]], [[1.0]]])
     apparent = np.array([[[1.0]], [[-1.0]]])
     limit = float(chi2.isf(uncertainty._BY_CHANCE, 1))
     for share, corrected in ((0.99, False), (1.01, True)):
-        # The estimates (d, -d) have the sum of products 2 d with the error, of the information 2 + 1.
+        # The scores (d, -d) give the gradient 2 d for the error, whose information is 2 + 1 (prior).
         difference = np.sqrt(share * limit * 3.0) / 2.0
         score = np.array([[difference], [-difference]])
         done = correct(information, score, apparent, 1.0, 1)
@@ -385,8 +384,8 @@ def test_correlated_calibration_errors_have_the_stated_covariance() -> None:
 def test_the_intensity_of_a_reversing_motion_is_that_of_many_instants(share: float, length: float) -> None:
     """The chi-square of a reversing motion is that of a fit of flux and sky level to all pixels.
 
-    The star is `share` of the time after the reversal away from the point of rest at the beginning, and its
-    distance from the point of rest grows with the square of the time.
+    The exposure lasts from -`share` to 1 in a time that is 0 at the reversal. The distance from the point of
+    rest grows with the square of this time.
     """
     rng = np.random.default_rng(2)
     places = np.arange(-uncertainty._BEFORE, 60.0, uncertainty._STEP)
@@ -453,7 +452,8 @@ def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: p
     ends = Displacement(0.04, 0.1)
     shown = np.array([uncertainty._END_FLOOR, uncertainty._END_SHOWN * 0.04, uncertainty._END_CHANCE * 0.1])
     assert found(difference, 1.0, ends) == pytest.approx(float(np.linalg.norm(shown)))
-    # With a learned profile or a fitted vibration, the variances do not limit the uncertainty.
+    # With a learned profile or a fitted vibration, the uncertainty is that of the residuals, whatever the
+    # variances.
     shown[0] = uncertainty._FITTED_FLOOR
     vibration = Vibration(np.array([3.0]), np.array([[1e-4, 0.0, 0.0]]), np.zeros((1, 3)))
     learned = replace(scene, profile=PsfProfile((0.5, 1.0), (-0.5, 1.5)))
@@ -462,7 +462,7 @@ def test_ends_are_uncertain_by_the_difference_of_the_point_spread(monkeypatch: p
 
 
 def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -> None:
-    """Two standard deviations of chi-square are subtracted from the significant part, and one is added."""
+    """`shown` is the excess minus two standard deviations of chi-square, and `chance` the excess plus one."""
     left, scene = _left(0.0, 0.0, "ends")
     left.images[:] = 0.0
     left.images[:1, 3] = 0.2
@@ -477,12 +477,12 @@ def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -
     beyond = count * (9.0 - 1.0)
     assert found.shown == pytest.approx(np.sqrt((beyond - 2.0 * chance) / information))
     assert found.chance == pytest.approx(np.sqrt((beyond + chance) / information))
-    # If the residuals elsewhere are smaller than the noise, they are the usual residuals.
+    # Residuals elsewhere that are smaller than the noise replace the noise as the reference.
     left.residual[1:] = 1.0
     small = end_displacement(left, scene)
     assert small is not None
     assert small.shown == pytest.approx(np.sqrt((count * (9.0 - 0.25) - 2.0 * chance) / information))
-    # Residuals elsewhere that exceed the noise do not excuse those at the ends.
+    # Residuals elsewhere that exceed the noise do not raise the reference.
     left.residual[1:] = 4.0
     large = end_displacement(left, scene)
     assert large is not None
@@ -511,12 +511,12 @@ def _streaked(share: float, length: float, flux: float) -> tuple[FitProblem, Str
 
 
 def test_the_intensity_along_a_streak_shows_a_reversal() -> None:
-    """A rotation that reverses improves the fit; one from rest, or one with equal parts, does not."""
+    """A reversing rotation improves the fit, but a rotation from rest or with two equal parts does not."""
     assert uncertainty.reversal_improvement(*_streaked(0.0, 60.0, 40_000.0)) < 20.0
     camera, scene = _streaked(0.45, 60.0, 40_000.0)
     found = uncertainty.reversal_improvement(camera, scene)
     assert 60.0 < found <= uncertainty._MOST_IMPROVEMENT
-    # Only bright, trusted stars near rest are tested, and no motion from the navigation filter.
+    # Only bright, trusted stars near rest are tested, and only motions that do not come from navigation.
     half = replace(scene.motion, acceleration=0.7 * scene.motion.acceleration)
     assert uncertainty.reversal_improvement(camera, replace(scene, motion=half)) == 0.0
     known = replace(scene.motion, higher_terms=np.full((1, 3), 1e-9))

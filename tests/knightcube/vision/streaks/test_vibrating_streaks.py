@@ -70,7 +70,7 @@ def test_streaks_equal_those_of_an_independent_renderer() -> None:
 
 
 def test_derivatives_equal_differences_of_the_counts() -> None:
-    """The images combine into the derivatives with respect to rate, position and width."""
+    """The images, multiplied by the coefficients, give the derivatives by rate, position and width."""
     scene, windows, step = _scene(), _windows(), 1e-4
     strips, stars = windows.strips, _STARS[windows.long]
     images = vibrating_streaks.images(_PINHOLE, _MOTION, _SHUTTER, stars, _WIDTH, strips)[:, :-1]

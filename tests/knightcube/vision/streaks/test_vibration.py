@@ -136,7 +136,7 @@ def test_a_motion_with_a_vibration_has_an_exact_time_reversal() -> None:
 def test_the_rate_of_a_resolved_vibration_is_within_its_claim(
     cycles: float, amplitude: float, seed: int, share: float
 ) -> None:
-    """If the streaks resolve a vibration, the rate error is a small `share` of the rate, and as claimed.
+    """If the streaks resolve a vibration, the rate error is below `share` of the rate and within 4 sigma.
 
     The wavelengths along the streaks are 6 to 50 px. Without a vibration in its model, the estimator refuses
     the frame.
@@ -162,9 +162,9 @@ def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() ->
 
 
 def _functions_are_those_of_time(functions: FloatArray, time: FloatArray, at: list[FloatArray]) -> None:
-    """Check values, slopes and ends of functions (n, b, 4) given on (b - 2,) times and at both ends.
+    """Check the values, slopes and end values of functions (n, b, 4) of `time` (b,).
 
-    The values `at` are those at a time before, at, and after each bin, and at both ends.
+    `at` contains the values just before, at, and just after each time, and at both ends.
     """
     before, here, after, ends = at
     assert functions[:, :, 0] == pytest.approx(here)
@@ -217,7 +217,7 @@ def test_normal_equations_of_functions_are_sums_over_the_bins() -> None:
     information, score = sums.normal_equations(functions)
     expected, gradient = np.zeros((9, 9)), np.zeros(9)
     for b in range(6):
-        # A coefficient of a function and an axis changes the four values of this axis.
+        # The coefficient of a function about one axis changes the four values of this axis.
         design = np.einsum("fi,kl->fkil", functions[:, b], np.eye(3)).reshape(9, 12)
         expected += design @ sums.information[b].reshape(12, 12) @ design.T
         gradient += design @ sums.score[b].reshape(12)
@@ -276,7 +276,7 @@ def _solved_steps(
     def equations(_: object, changed: StreakScene, __: object) -> tuple[FloatArray, FloatArray]:
         one = changed.motion.vibration
         design = vibration._rotations(one)(time).reshape(6 + 7 * len(one.frequency), -1)
-        # The width of the point spread, after rate and acceleration, changes nothing.
+        # Index 6, the width of the point spread after rate and acceleration, has zero derivatives.
         design = 1e6 * np.insert(design, 6, 0.0, axis=0)
         left = 1e6 * (true.rotation(time) - one.rotation(time)).reshape(-1)
         return design @ design.T, design @ left
@@ -397,9 +397,9 @@ def test_residuals_at_equal_times_are_a_common_motion(across: float, along: floa
 
 
 def test_the_normal_equations_of_a_rotation_are_sums_over_the_lines_of_each_bin() -> None:
-    """Each pixel of a streak changes with displacement, speed and ends of the streak, by the image flow.
+    """A rotation changes each pixel through the displacement, the speed and the ends of the streak.
 
-    Across the path, a rotation displaces the streak by its image flow. Along the path, the speed changes the
+    A rotation displaces the streak across its path by the image flow. Along the path, the speed changes the
     brightness, and the rotations at start and end move the ends. The weight of a star is limited by the
     scatter of its residuals.
     """
@@ -468,10 +468,10 @@ def _fitted_vibration(
     excess: Sequence[float] = (),
     streaks: bool = True,
 ) -> tuple[Any, int]:
-    """Return the fit for trial frequencies and steps to given amplitudes (px), and the number of fits.
+    """Return the fit for given trial frequencies and successive amplitudes (px), and the number of fits.
 
     The excess chi-square is 10,000 before the first fit, and `excess` after each fit. By default, each fit
-    halves it. If `streaks` is false, no streak is long.
+    halves the excess. If `streaks` is false, the frame has no long streaks.
     """
     camera, scene = _plain_camera()
     trials, steps, made = iter(frequencies), iter(sizes), []
@@ -528,7 +528,7 @@ def test_a_vibration_is_fitted_until_its_steps_are_small(monkeypatch: pytest.Mon
 
 
 def test_a_sinusoid_that_explains_little_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sinusoid must explain a fifth of the excess chi-square, and its steps end if they explain nothing."""
+    """A sinusoid must explain a fifth of the excess chi-square. A step that explains nothing is the last."""
     found, made = _fitted_vibration(monkeypatch, [2.0], [0.5, 0.51], excess=[9000.0, 8200.0])
     assert (found, made) == (None, 2)
     found, made = _fitted_vibration(monkeypatch, [2.0], [0.5, 0.9, 0.5], excess=[11_000.0, 10_500.0, 0.0])
@@ -564,7 +564,7 @@ def test_a_vibration_adds_its_covariance_and_a_share_of_its_amplitudes(
 
 @pytest.mark.parametrize("cycles", [20.0, 34.0])
 def test_the_spectrum_shows_the_true_amplitude_of_an_unresolved_vibration(cycles: float) -> None:
-    """The point spread reduces the residuals of a vibration; the stated amplitude is the true one."""
+    """The point spread reduces the residuals of a vibration, but the true amplitude is stated."""
     length, amplitude, focal = 90.0, np.array([2e-4, -1e-4, 3e-5]), 1200.0
     time = 0.56 * (2.0 * (np.arange(512) + 0.5) / 512 - 1.0)
     information = np.zeros((512, 4, 3, 4, 3))
