@@ -335,7 +335,7 @@ def test_the_facts_of_a_frame_are_plain_values() -> None:
     "coarse", [Pinhole(50, 33, 70.0), Lens(50, 33, 70.0, (25.5, 15.0), k1=0.02, p1=0.001, aspect=0.01)]
 )
 def test_the_solution_of_a_binned_image_holds_for_the_whole_image(coarse: CameraModel) -> None:
-    """A direction has, in the whole image, the middle of the bin that contains it in the binned image."""
+    """The centre of a bin and the corresponding pixel of the whole image have the same direction."""
     points = np.array([[3.0, 4.0], [40.25, 20.5]])
     found = FrameSolution(
         SolveStatus.SOLVED,

@@ -91,7 +91,7 @@ def learned(mask: BoolArray, frames: int = 40, level: float = 60.0) -> Structure
 
 @pytest.mark.parametrize("level", [10.0, 60.0, 180.0])
 def test_structure_is_learned_while_the_limb_moves(level: float) -> None:
-    """Structure is recognised while the limb moves, whether it is dark, grey or bright.
+    """Dark, grey or bright structure is recognised while the limb moves.
 
     The mask of the structure is one block wider than the structure.
     """

@@ -57,7 +57,7 @@ def _frames(
 ) -> tuple[list[MatchedFrame], FloatArray]:
     """Return frames at random attitudes (count, 4).
 
-    In the fraction `wrong` of the matches, stars are exchanged.
+    For the fraction `wrong` of the matches, the catalogue directions are exchanged.
     """
     frames, attitudes = [], []
     for _ in range(count):
@@ -227,7 +227,7 @@ def test_the_terms_that_the_stars_show_are_fitted_and_others_stay_zero(shape: di
 
 
 def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None:
-    """The lens of mirrored images describes the images as given.
+    """The lens found in mirrored images describes the images as they are, not their mirror images.
 
     In a mirrored image and in its sky, left and right are exchanged.
     """
@@ -255,7 +255,7 @@ def test_frames_of_another_focus_are_excluded_also_if_they_are_half_of_the_frame
 
 @pytest.mark.parametrize("sixth_power", [0.0, 0.01])
 def test_distortion_that_the_lens_does_not_contain_increases_the_covariance(sixth_power: float) -> None:
-    """A sixth-power distortion of 1 % at the corners displaces focal length and distortion by many sigma.
+    """A sixth-power distortion of 1 % at the corners biases focal length and distortion by many sigma.
 
     The standard deviations of a lens without this distortion do not increase.
     """
@@ -283,7 +283,7 @@ def test_distortion_that_the_lens_does_not_contain_increases_the_covariance(sixt
 
 
 def test_frames_whose_stars_are_all_rejected_are_excluded() -> None:
-    """Frames are excluded whose focal length differs by 0.5 %, although all their stars are rejected."""
+    """Frames whose stars are all rejected, because their focal length differs by 0.5 %, are excluded."""
     rng = np.random.default_rng(95)
     begun = _begun(20.0)
     frames = [
@@ -352,7 +352,7 @@ def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, flo
 
 @pytest.mark.parametrize(("field_deg", "count", "stars"), [(20.0, 1, 40), (12.0, 1, 15), (20.0, 3, 20)])
 def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: int, stars: int) -> None:
-    """The accuracy of a lens includes the omitted terms, because the fit changes without them."""
+    """The accuracy of a lens includes the errors due to omitted terms."""
     rng, begun = np.random.default_rng(61), _begun(field_deg)
     ratios: dict[str, list[float]] = {"focal_length": [], "centre": [], "distortion": []}
     for _ in range(12):

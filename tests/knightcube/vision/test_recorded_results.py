@@ -35,7 +35,7 @@ def frame(seed: int, streak_px: float) -> SkyFrame:
 
 
 def found(one: SkyFrame, estimator: LikelihoodSettings | StreakEstimator, near: bool) -> FrameFound:
-    """Return the result of a frame's job, with a prior attitude if `near`."""
+    """Return the result of a frame's job, with a prior attitude if `near` is true."""
     off = multiply(from_rotation_vector(np.array([2e-4, -1e-4, 1e-4])), one.attitude)
     prior = AttitudePrior(off, 3e-4) if near else None
     tracker = TrackerSettings(SolveSettings(), (1.0, 1.0))

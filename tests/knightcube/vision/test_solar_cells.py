@@ -31,7 +31,7 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 
 def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray, FloatArray, int, int]:
-    """Return errors (n,), rad, normalised squared errors (n,), and two numbers of wrong decisions.
+    """Return errors (n,), rad, normalised squared errors (n,), and the numbers of both wrong decisions.
 
     The first number counts sunlit readings that were judged dark. The second number counts dark readings that
     were judged sunlit.
@@ -101,7 +101,7 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
     view = (EARTH_RADIUS / position[0]) ** 2
     assert currents[0] == pytest.approx(1.0, abs=1e-4)
     assert currents[3] == pytest.approx(0.3 * view, rel=0.05)
-    # A plate that is vertical receives at most half of this light, and equally on all four sides.
+    # The four vertical plates receive equal light, at most half of that on the plate that faces the Earth.
     sides = currents[[1, 2, 4, 5]]
     assert np.ptp(sides) < 2e-3
     assert 0.2 * currents[3] < sides.mean() < 0.5 * currents[3]
@@ -146,7 +146,7 @@ def test_currents_that_no_sun_direction_explains_are_uncertain() -> None:
 
 
 def test_the_search_for_the_sun_never_alternates_between_two_directions() -> None:
-    """In 300 readings with light from the Earth, the basis is normal to the direction of the last step."""
+    """In 300 readings with Earth light, the basis of the last step is normal to the final direction."""
     rng, off = np.random.default_rng(2), []
     for number in range(300):
         towards, nadir = random_direction(rng), random_direction(rng)
@@ -258,7 +258,8 @@ def _accepted(
 def test_field_and_strings_give_the_attitude(seed: int) -> None:
     """The attitude maps the known field onto the measured field, and its rotation about the field is found.
 
-    The covariance is that of the field across the field, and that of the possible rotations about the field.
+    The covariance across the field is that of the measured field; about the field, it is that of the possible
+    rotations.
     """
     truth = quaternion.normalise(np.random.default_rng(seed).normal(size=4))
     estimator = FieldAndStrings(_PLATES)
@@ -312,7 +313,7 @@ def test_the_sun_along_the_field_leaves_the_rotation_about_it_undetermined() -> 
 
 
 def test_earlier_readings_are_propagated_and_forgotten_after_two_minutes() -> None:
-    """The possible rotations turn with the body. Evidence against others decays within 120 s."""
+    """The possible rotations rotate with the body. Evidence against rotations is forgotten in 120 s."""
     truth = quaternion.normalise(np.array([0.3, -0.5, 0.2, 0.7]))
     step = quaternion.from_rotation_vector(np.array([0.5, -0.3, 0.4]))
     after = quaternion.multiply(step, truth)
@@ -337,7 +338,7 @@ def test_earlier_readings_are_propagated_and_forgotten_after_two_minutes() -> No
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_known_field_is_rotated_onto_the_measured_field(sign: float) -> None:
-    """Also a field that is nearly opposite to the measured field is rotated onto it."""
+    """A known field that is nearly opposite to the measured field is also rotated onto it."""
     estimator = FieldAndStrings(_PLATES)
     axis = _unit(0.3, 0.4, -0.5)
     known = sign * _unit(0.3, 0.41, -0.5)

@@ -321,14 +321,14 @@ def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> 
 
 
 def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Images with stars of several pixels are solved in sums of pixels.
+    """Images whose stars cover several pixels are binned before they are solved.
 
     Large photographs have such stars, and the noise of neighbouring pixels is correlated.
     """
     resting = sky_frame(np.random.default_rng(5), 0.0, 0.1)
     spread = gaussian_filter(np.kron(resting.pixels.astype(float), np.ones((3, 3))), 3.0)
     image = np.rint(spread[1:-1, 1:-1] + 20_000.0).astype(np.uint16)
-    # The stated values are those of the image, and not of the sums of its pixels.
+    # The stated settings refer to the image, not to the binned image.
     stated = DetectionSettings(saturation=65_535.0, psf_sigma=4.0)
     tracker = StarTracker(fov_deg=12.0, settings=SolveSettings(detection=stated))
     solution = tracker.solve(image)

@@ -154,7 +154,7 @@ def test_the_sun_and_a_reflection_of_its_size_are_ambiguous() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
 def test_glare_that_is_brighter_on_one_side_increases_the_covariance(share: float) -> None:
-    """Glare that is brighter on one side by `share` displaces the disc, which the covariance includes.
+    """Glare that is brighter on one side by `share` displaces the disc; the covariance includes this error.
 
     The covariance of symmetric glare does not increase, and its error is below a hundredth of a degree.
     """

@@ -230,7 +230,8 @@ def test_projection_does_not_depend_on_distance(x: float, y: float, distance: fl
 def test_a_direction_behind_the_camera_has_no_pixel(x: float, y: float) -> None:
     """A direction behind the camera has no pixel, although its opposite projects to a pixel.
 
-    The errata correct section 2.1 of the thesis, by which opposite directions project to the same pixel.
+    The errata correct section 2.1 of the thesis, according to which opposite directions project to the same
+    pixel.
     """
     behind = CAMERA.project(-CAMERA.unit_vectors(np.array([[x, y]])))
     assert np.all(np.isnan(behind))
@@ -299,7 +300,7 @@ def test_the_camera_for_paths_of_stars_images_like_the_lens(lens: Lens) -> None:
 
 
 def test_a_direction_beyond_the_fold_of_the_distortion_is_not_in_the_image() -> None:
-    """The lens returns NaN, and the camera for paths of stars a place outside the image."""
+    """The lens returns NaN, and the camera for star paths returns a point outside the image."""
     lens = Lens(1024, 768, 2900.0, (511.5, 383.5), k1=-2.4)
     angle = np.linspace(lens.half_diagonal, 1.5, 300)
     vectors = np.stack([np.sin(angle), np.zeros(300), np.cos(angle)], axis=1)

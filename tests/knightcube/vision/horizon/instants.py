@@ -51,7 +51,7 @@ class Instant:
 
 
 def instant(cameras: list[MountedCamera], nadir: FloatArray, sun: FloatArray, seed: int) -> Instant:
-    """Return a satellite above 53 deg north, with nadir (3,) in body and Sun (3,) in inertial axes."""
+    """Return a satellite above 53 deg north, with nadir (3,) in body axes and Sun (3,) in inertial axes."""
     down = np.array([-0.6, 0.0, -0.8])
     position = -(6_378_137.0 + ALTITUDE) * down
     middle = nadir / np.linalg.norm(nadir) + down

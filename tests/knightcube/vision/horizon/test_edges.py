@@ -117,7 +117,7 @@ def test_levels_are_those_of_a_dark_and_a_bright_half_and_the_noise_of_the_dark(
 
 @pytest.mark.parametrize(("lit", "found"), [(7, False), (8, True)])
 def test_fewer_than_sixteen_lit_pixels_are_a_star(lit: int, found: bool) -> None:
-    """Fewer than sixteen lit samples are taken as a star, not as the Earth.
+    """Fewer than sixteen lit samples are treated as a star, not as the Earth.
 
     Each pixel is sampled twice: in its row and in its column. Seven pixels thus count as 14 samples, and
     eight pixels as 16.

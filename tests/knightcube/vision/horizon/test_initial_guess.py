@@ -123,7 +123,7 @@ def test_two_edges_determine_a_known_cone_and_three_an_unknown_one() -> None:
 def test_few_trials_are_spread_over_all_pairs() -> None:
     """A few trials are spread over all pairs of edges.
 
-    The first third of the edges has no common cone with the other edges, and its pairs are tried first.
+    The first 15 of the 45 edges are stray, so trials in the order of the pairs would find no cone.
     """
     draw = np.random.default_rng(1)
     good = ring(NADIR, math.acos(COSINE), 30)
@@ -195,7 +195,7 @@ def test_a_direction_along_nadir_gives_no_rotation(lever: float, known: bool) ->
 def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
     off_deg: float, accepted: bool
 ) -> None:
-    """A direction without error may deviate from a guessed nadir by four times 0.2 deg, the guess's error.
+    """An exact direction may deviate from a guessed nadir by four times 0.2 deg, the error of the guess.
 
     In flight, initial guesses of nadir are wrong by up to 0.3 deg.
     """
@@ -206,7 +206,7 @@ def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
         error = side * math.radians(off_deg) * axis
         found = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, 1e-6, error),)))
         assert (found.mismatch <= MOST_MISMATCH) is accepted
-        # With a sensor error of one degree, the tested deviation is less than one standard deviation.
+        # With a sensor error of 1 deg, the same deviation is less than one standard deviation.
         coarse = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, math.radians(1.0), error),)))
         assert coarse.mismatch == pytest.approx(off_deg / math.hypot(1.0, 0.2), rel=1e-6)
 
@@ -214,7 +214,8 @@ def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
 def test_the_fraction_of_nadirs_allowed_by_a_direction_is_that_of_a_belt() -> None:
     """A direction permits the nadirs in a belt, within four sigma of a great circle.
 
-    The belt has the fraction sin(4 sigma) of the sphere. Two directions permit the intersection of two belts.
+    The belt has the fraction sin(4 sigma) of the sphere. Two directions permit only the intersection of their
+    belts.
     """
     _, nadir, down = true_attitude()
     one = sensed(across(down, 0.5 * math.pi), 0.03)
@@ -299,7 +300,7 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
 def test_the_errors_of_the_spherical_model_are_those_of_limbs_of_the_ellipsoid(altitude: float) -> None:
     """The stated errors of the spherical limb model cover its deviations from the limb of the ellipsoid.
 
-    The positions are all over a sphere, and the truth is the circular cone through the limb of the ellipsoid.
+    The positions cover a sphere, and the reference is the circular cone through the limb of the ellipsoid.
     """
     count = 300
     height = (2.0 * np.arange(count) + 1.0) / count - 1.0

@@ -159,7 +159,8 @@ def test_the_covariance_includes_a_limb_height_that_varies_along_the_limb() -> N
     """The NEES also has its expected value if the limb is higher on one side, as towards a low Sun.
 
     The height of the limb varies with the cosine of the azimuth, with an amplitude of 2.8 km (2 km rms). The
-    fit of a quarter of the limb absorbs the variation. Without `uneven`, the errors exceed their claims.
+    fit of a quarter of the limb absorbs the variation. Without `uneven`, the errors exceed the stated
+    covariance.
     """
     generator = np.random.default_rng(5)
     claims = {0.0: 0.0, 2000.0: 0.0}
@@ -212,7 +213,7 @@ def test_edges_all_in_one_place_give_no_limb() -> None:
 
 
 def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
-    """If four successive points have the same error, they reduce neither the covariance nor the error."""
+    """Four successive points with the same error determine the limb no better than a single point."""
     generator = np.random.default_rng(8)
     view = _view(generator)
     rays = limb_rays(view, 240)[:80]

@@ -164,7 +164,7 @@ def test_without_the_flattenings_direction_the_allowance_covers_the_error(
 def test_the_fitted_altitude_stays_within_the_given_range(day: tuple[EarthScene, Image]) -> None:
     """A permitted range of altitudes that begins two sigmas above the best fit limits the fitted altitude.
 
-    The limit changes the nadir in the same direction as a known higher altitude.
+    The limit changes the nadir in the same direction as prior knowledge of this altitude.
     """
     frame = day[1]
     free = find_nadir(frame, MODEL.lens, HorizonKnowledge(), SETTINGS).nadir
@@ -495,7 +495,7 @@ def test_dark_images_give_no_coarse_nadir() -> None:
 
 
 def _changed(changes: Callable[[Hypothesis], Hypothesis]) -> Callable[..., Hypothesis | None]:
-    """Return a version of the function `examine` that changes every hypothesis."""
+    """Return a replacement of `examine` that applies `changes` to every hypothesis."""
 
     def examined(*arguments: Any) -> Hypothesis | None:
         found = examine(*arguments)
@@ -590,10 +590,10 @@ _TILT, _CLIMB = 0.03, 20e3
 def _searched_by_focal_length(
     best: float, width: float, refused: Callable[[float], bool]
 ) -> Callable[..., SimpleNamespace]:
-    """Return a search whose horizon depends on the focal length, given in standard deviations from nominal.
+    """Return a search whose horizon depends on the focal length, which is `step` sigmas from nominal.
 
-    The sum of the squared residuals of the horizon is ((step - best)/width)^2. The nadir tilts about y, and
-    the altitude grows, in proportion to the focal length. The trial is `refused` at some focal lengths.
+    The sum of the squared residuals of the horizon is ((step - best)/width)^2. The tilt of the nadir about y
+    and the altitude change linearly with `step`. The trial is `refused` at some focal lengths.
     """
 
     def searched(image: Any, *_: object) -> SimpleNamespace:
@@ -697,7 +697,10 @@ def test_nadirs_agree_within_the_quantile_of_their_difference() -> None:
 
 
 def test_the_nadir_of_most_cameras_is_selected() -> None:
-    """The most cameras decide, then the most edges. Equal groups are ambiguous above 30 % of the edges."""
+    """The group with the most cameras is selected, and of equal groups the one with the most edges.
+
+    Another group of as many cameras makes the result ambiguous if it has more than 30 % of these edges.
+    """
     one, two, three = _vote(0, 0.0, 30), _vote(1, 1e-3, 20), _vote(2, 0.8, 90)
     group, rival = nadir_module._agreed([three, one, two])
     assert sorted(vote.camera for vote in group) == [0, 1]

@@ -31,7 +31,7 @@ def test_a_logarithmic_detector_adds_equal_counts_for_each_decade_of_light() -> 
 
 
 def test_a_camera_is_above_the_air() -> None:
-    """A camera must be above the atmosphere: the limb is visible from an altitude of 50 km on.
+    """A camera must be above the atmosphere, at an altitude of at least 50 km.
 
     The equatorial radius is 6,378.1 km.
     """

@@ -82,7 +82,7 @@ def test_all_forms_fit_the_same_brightnesses(size: int) -> None:
 
 
 def test_equal_and_empty_images_have_finite_brightnesses() -> None:
-    """The chi-square is that of one image, whatever the distribution of its brightness over equal images."""
+    """Equal images may share the brightness in any way, but the chi-square is that of a single image."""
     draw = np.random.default_rng(5)
     image = draw.uniform(0.0, 1.0, 40)
     data = 7.0 * image + draw.normal(size=40)

@@ -323,7 +323,7 @@ def test_overlapping_streaks_of_two_stars_are_not_reported_as_an_object(
     image = expose(_FRAME_CAMERA, directions, magnitudes, _ROTATION, 1.0)
     report = _detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(6)), _ROTATION)
     assert report.objects == ()
-    # The pixels show that the region is a blend: at least one region is classified as stars or as unclear.
+    # The pixels show that the region is a blend, so at least one verdict is STARS or UNCLEAR.
     assert {Verdict.STARS, Verdict.UNCLEAR} & set(report.verdicts + report.crowded)
 
 
@@ -732,7 +732,7 @@ def _light(**values: Any) -> Any:
 def test_an_object_decreases_chi_square_and_explains_its_pixels(
     gained: float, remains: float, misfit: float, of_stars: float, uniform: bool, expected: bool
 ) -> None:
-    """An object gains enough, explains its streak twice as well as stars, and most of the remaining light."""
+    """An object decreases chi-square, fits twice as well as stars, and explains most remaining light."""
     light = _light(chi_square=900.0 + remains + gained)
     found = Explanation(900.0 + remains, remains, misfit, of_stars, 1e4)
     assert _judge()._is_object(light, found, 600.0, uniform) == expected
@@ -791,7 +791,7 @@ def test_a_streak_with_the_ends_of_a_star_moves_like_a_star() -> None:
 
 
 def test_the_motion_among_the_stars_is_that_without_the_rotation() -> None:
-    """The ends of a star's streak have no motion among the stars; another point moves by its own distance."""
+    """The ends of a star's streak do not move among the stars, another point moves by its distance."""
     judge = _judge()
     ends = true_endpoints(_FRAME_CAMERA, _PLACE[None], _ROTATION)[0]
     rate, _ = judge._among_stars(ends)
@@ -830,7 +830,7 @@ def test_a_streak_is_classified_by_its_pixels_if_an_indicator_fires(
     judged = _judge().streak(np.zeros((2, 2)), ("centre",) if fired else ())
     assert judged.verdict is verdict
     assert judged.candidate is found
-    # Lights that stars explain partly are kept, so that the rest of the region is searched.
+    # The light of a region that stars explain partly is kept, so that the rest of the region is searched.
     assert (judged.light is light) == (verdict in {Verdict.STARS, Verdict.UNCLEAR})
 
 

@@ -132,7 +132,7 @@ def test_the_points_of_a_trail_are_evenly_spaced_over_its_length() -> None:
 def test_an_object_beside_a_star_is_fitted_exactly_in_an_exact_image() -> None:
     """The fit finds position and flux of an object beside a star that is brighter than in the catalogue.
 
-    The covariance is the inverse of the information of all unknowns, with the priors of extent and star.
+    The covariance is the inverse information matrix of all unknowns, with the priors on extent and star.
     """
     ours, star = (112.3, 209.6, 2.0, -1.0, 4000.0), (117.8, 212.9, 1.0, 1.0, 2500.0)
     at_corner = [(x - 100.0, y - 200.0, dx, dy, flux) for x, y, dx, dy, flux in (ours, star)]
@@ -219,7 +219,7 @@ def _patches(objects: list[tuple[float, float, float, float, float]]) -> FramePa
 
 
 def test_an_object_merged_with_a_star_is_found_beside_it() -> None:
-    """Light beside a star that the star does not explain is an object, if it is bright and apart enough."""
+    """Light that the star beside it does not explain is an object, if it is bright and distant enough."""
     place = np.array([64.0, 52.5])
     found = _patches([*_POINTS, (*place, 0.0, 0.0, 4000.0)]).beside(np.array([61.0, 50.7]), 4.0, 25.0)
     assert found is not None
@@ -227,7 +227,7 @@ def test_an_object_merged_with_a_star_is_found_beside_it() -> None:
     assert found.flux == pytest.approx(4000.0, rel=0.1)
     alone = _patches(_POINTS)
     assert alone.beside(np.array([60.4, 50.2]), 2.0, 25.0) is None
-    # A second star of a pair is closer to the first.
+    # The second star of a close pair is too near the first to be an object.
     pair = _patches([*_POINTS, (60.9, 50.6, 0.0, 0.0, 4000.0)])
     assert pair.beside(np.array([60.5, 50.3]), 2.0, 25.0) is None
     # An object with a tenth of the star's light may be an error of the star's image.
@@ -271,7 +271,7 @@ def test_objects_among_points_are_areas_without_a_catalogue_star() -> None:
     settings = ObjectMeasurementSettings()
     ((fit, zero),) = measure._among_points(seen, _STARS, settings)
     assert fit.middle == pytest.approx([95.3, 30.6], abs=0.1)
-    # The median of the stars' magnitudes of one count is that of the star of magnitude 6.
+    # The median of the stars' zero points is that of the star of magnitude 6.
     assert zero == pytest.approx(_ZERO, abs=0.15)
     magnitude = zero - 2.5 * np.log10(fit.flux)
     assert magnitude == pytest.approx(5.0 + 2.5 * np.log10(9.0 / 5.0), abs=0.2)
@@ -309,7 +309,7 @@ def test_points_of_light_are_measured_without_a_motion() -> None:
 
 
 def test_catalogue_stars_have_the_trails_of_the_rotation() -> None:
-    """A star moves as v' = -omega x v, by half of the rotation before and after mid-exposure."""
+    """A star moves as v' = -omega x v, half of the rotation before mid-exposure and half of it after."""
     camera = Pinhole(400, 300, 900.0)
     sky = SkyMap(camera, HELD)
     rotation = np.array([0.004, -0.01, 0.02])

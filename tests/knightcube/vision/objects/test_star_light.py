@@ -80,7 +80,7 @@ def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) ->
     ("beyond", "gap"), [(0.0, 0.0), (12.0, 0.0), (30.0, 0.0), (-40.0, 0.0), (-40.0, 8.0)]
 )
 def test_the_ends_of_a_streak_follow_its_light(beyond: float, gap: float) -> None:
-    """The fitted ends of a streak follow its light if the assumed end is `beyond` px too far.
+    """The fitted ends of a streak follow its light, although the assumed end is wrong by `beyond` px.
 
     The streak has 100 px, and some pixels before its end are saturated.
     """
@@ -136,7 +136,7 @@ def test_only_the_part_of_a_path_around_its_middle_is_followed(
 
 
 def test_the_end_of_light_is_the_mean_over_its_likelihood() -> None:
-    """The likelihood of an end grows with half of the gains up to it."""
+    """The likelihood of an end is proportional to exp(s/2), where s is the sum of the gains up to it."""
     sure = np.array([60.0, 60.0, 60.0, -60.0, -60.0])
     assert star_light._end_of_light(sure) == pytest.approx((2.0, 0.0), abs=1e-6)
     assert star_light._end_of_light(np.array([9.0, 0.0, 0.0])) == pytest.approx((1.0, np.sqrt(2.0 / 3.0)))
@@ -191,7 +191,7 @@ def _segmented(image: FloatArray) -> Segmented:
 
 
 def test_trial_paths_of_stars_begin_and_end_at_the_corners() -> None:
-    """Of each corner, one path begins and one ends there; the other paths pass the middle of the region."""
+    """At each corner, one path begins and one path ends; the other paths pass through the region's middle."""
     corners = np.array([[200.0, 220.0], [300.0, 232.0]])
     paths = star_light._star_paths(corners, _ROTATION, _CAMERA.pinhole, 4)
     own = star_path(corners.mean(axis=0), _ROTATION, _CAMERA.pinhole)
@@ -203,7 +203,7 @@ def test_trial_paths_of_stars_begin_and_end_at_the_corners() -> None:
     way = np.sign(own[-1, 0] - own[0, 0])
     middles = paths[4:].mean(axis=1) @ [way, 0.0]
     spacing = np.diff(middles)
-    # The middles are evenly spread over the extent of the region, and the first path is the last in time.
+    # The middles of these paths are evenly spaced over the extent of the region.
     assert np.ptp(middles) == pytest.approx(extent, rel=0.03)
     assert np.abs(spacing) == pytest.approx(np.full(len(spacing), extent / len(spacing)), rel=0.05)
     far = star_light._star_paths(np.array([[10.0, 220.0], [500.0, 232.0]]), _ROTATION, _CAMERA.pinhole, 4)
@@ -215,7 +215,7 @@ def test_trial_paths_of_stars_begin_and_end_at_the_corners() -> None:
 def test_stars_and_an_object_are_compared_by_chi_square() -> None:
     """An object decreases chi-square to about the number of pixels, and has its flux.
 
-    Ends without light do not decrease chi-square.
+    An object far from the region has no flux.
     """
     path = star_path(np.array([245.0, 240.0]), _ROTATION, _CAMERA.pinhole)
     ends = np.array([[225.0, 225.0], [262.0, 258.0]])
@@ -257,7 +257,7 @@ def test_light_in_other_regions_is_not_unexplained() -> None:
     found = light.explain(ends)
     assert found.chi_square - light.expected > 600.0
     assert abs(found.unexplained) < 250.0
-    # A line that touches the point leaves the light of both regions unexplained.
+    # For a line that touches the point, the unexplained light includes that of both regions.
     across = light.explain(np.array([[225.0, 232.0], [245.0, 230.0]]))
     assert across.unexplained == pytest.approx(across.chi_square - light.expected, abs=100.0)
 

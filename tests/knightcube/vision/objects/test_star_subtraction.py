@@ -154,7 +154,7 @@ def test_a_patch_is_cut_with_a_margin_around_its_region() -> None:
     assert edge.corner[1] == 0.0
     dark = cut_patch(segmented, int(order[0]), 1.0, 2.0, 600.0)
     assert np.array_equal(dark.weight == 0.0, dark.signal + segmented.background.typical_level >= 570.0)
-    # The region along a line is that of most of its pixels.
+    # The region along a line is the region to which most of its pixels belong.
     labels = segmented.regions.label[order]
     assert region_along(segmented, np.array([[40.0, 30.0], [80.0, 60.0]])) == labels[0]
     assert region_along(segmented, np.array([[70.0, 52.0], [130.0, 26.0]])) in labels

@@ -416,7 +416,7 @@ def test_streaks_along_one_line_are_flashes_of_one_object(
     """
     along, across = np.array([0.8, 0.6]), np.array([-0.6, 0.8])
     ends = np.array([[x * along + aside * k * across for x in span] for k, span in enumerate(spans)])
-    # The order of a group is that along the line, in either direction.
+    # The streaks of a group are in the order along the line, in either direction.
     found = [min(group, group[::-1]) for group in flashes_of_objects(ends + 100.0)]
     assert found == (expected if aside == 0.0 else [[k] for k in range(len(ends))])
     assert flashes_of_objects(np.zeros((0, 2, 2))) == []

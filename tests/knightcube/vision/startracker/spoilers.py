@@ -19,7 +19,7 @@ _TEXTURE = 0.02
 
 
 def spoilt(pixels: Image, kind: str, rng: np.random.Generator) -> Image:
-    """Return integer `pixels` (rows, columns) with the foreground or defect `kind` of SPOILERS."""
+    """Return integer `pixels` (rows, columns) with the foreground or defect SPOILERS[kind] added."""
     top = float(np.iinfo(pixels.dtype).max)
     frame = pixels.astype(float)
     span = max(float(np.percentile(frame, 99.9) - np.median(frame)), 20.0)

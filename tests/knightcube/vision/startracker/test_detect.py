@@ -177,7 +177,7 @@ def test_a_bright_corner_full_of_leaves_does_not_drown_the_stars() -> None:
 
 
 def test_tracks_of_particles_do_not_drown_the_stars() -> None:
-    """Each track has several peaks, and the tracks have more peaks than are measured."""
+    """Each track has several peaks, and all tracks together have more peaks than are measured."""
     rng = np.random.default_rng(14)
     frame = sky(rng, (512, 512))
     stars = star_places(np.random.default_rng(1), 512, 30)

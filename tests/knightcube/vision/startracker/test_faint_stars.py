@@ -154,7 +154,7 @@ def test_the_light_of_a_distorting_lens_is_at_the_positions_of_an_ideal_camera()
 def test_a_narrow_strip_has_no_more_pairs_of_guide_stars_than_a_field(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Stars in a strip are as far apart as in a field, but the pairs of more stars are as many."""
+    """A narrow strip needs more guide stars than a field, but the number of their pairs is limited."""
     monkeypatch.setattr("knightcube.vision.startracker.faint_stars._MOST_PAIRS", 1e5)
     strip = Pinhole(NARROW.pinhole.columns, 24, NARROW.pinhole.focal_length)
     pixels = np.random.default_rng(2).poisson(100.0, (24, strip.columns)).astype(np.uint16)

@@ -349,7 +349,7 @@ def test_a_late_shutter_is_fitted_with_its_prior() -> None:
     none = fit_in_image(points, covariance, _reference(points), _CAMERA, start, Unknowns(late=late))
     assert none.delay == pytest.approx(0.0, abs=1e-6)
     assert none.bend.tolist() == [0.0] * 8
-    # Without effect on the positions, the prior keeps the delay at zero and its variance at one.
+    # If the delay hardly moves the stars, its prior keeps it near zero.
     unknown = fit_in_image(seen, covariance, _reference(points), _CAMERA, start, Unknowns(late=1e-6 * late))
     assert abs(unknown.delay) < 1e-2
     fixed = fit_in_image(seen, covariance, _reference(points), _CAMERA, start)

@@ -118,8 +118,8 @@ def test_false_stars_brighter_than_all_true_ones_do_not_prevent_the_identificati
 ) -> None:
     """False stars that are brighter than all true stars do not prevent the identification.
 
-    The lists are a small part of the lists of `python -m tests.studies.bench starid --hard`, with an unknown
-    field.
+    The lists are a small part of those of `python -m tests.studies.bench starid --hard`, with an unknown
+    field of view.
     """
     right = 0
     for seed in range(6):
@@ -318,7 +318,7 @@ def test_matches_are_ranked_by_the_number_of_matches_with_the_same_pairs() -> No
     draw = np.random.default_rng(2)
     observed = draw.integers(0, 6, (300, 3)).astype(np.uint16)
     star = draw.integers(0, 9, (300, 3)).astype(np.uint16)
-    # Scales of 0.97 to 1.03 are similar, and a scale of 1.1 is not.
+    # Scales from 0.97 to 1.03 count as equal, and a scale of 1.1 does not.
     like = draw.choice([0, 1], 300)
     factor = np.where(like, 1.1, draw.choice([0.97, 1.0, 1.03], 300))
     scale = np.floor(np.log2(factor) * OCTAVE).astype(np.int32)
@@ -437,7 +437,8 @@ def test_sides_of_triangles_are_sorted_with_their_opposite_corners() -> None:
 def test_scale_steps_are_joined_while_side_ratios_are_nearly_constant() -> None:
     """The side ratios at the limits of joined steps differ from the ratios in the middle by the tolerance.
 
-    The ranges of joined steps cover all steps. The ratios of small triangles near the axis change least.
+    Together, the joined ranges cover all scale steps. The ratios of small triangles near the axis change
+    least.
     """
     tangent = np.array([[0.0, 0.0], [0.02, 0.0], [0.01, 0.03], [0.28, 0.3], [-0.3, 0.2], [-0.1, -0.28]])
     direction = np.column_stack([tangent, np.ones(6)])
@@ -466,7 +467,7 @@ def test_scale_steps_are_joined_while_side_ratios_are_nearly_constant() -> None:
 
 
 def test_places_are_those_within_the_tolerance_of_a_ratio() -> None:
-    """Ranges of entries have all positions whose widths overlap with the tolerance of both ratios."""
+    """The ranges contain all positions whose intervals overlap the tolerances of both side ratios."""
     draw = np.random.default_rng(5)
     *_, below, layout = SKY.triangles.table
     for _ in range(40):

@@ -28,7 +28,7 @@ def _stars(flux: float) -> FloatArray:
 
 
 def _start(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centre of mass, with zero derivatives, because the derivatives must have no effect."""
+    """Return the centres of mass, and zeros instead of their derivatives, which must have no effect."""
     step = np.arange(-3.0, 4.0)
     total = clean.sum(axis=(1, 2))
     x, y = clean.sum(axis=1) @ step / total, clean.sum(axis=2) @ step / total

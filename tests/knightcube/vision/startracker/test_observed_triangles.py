@@ -47,7 +47,7 @@ def test_all_triangles_of_a_field_occur_once_the_brightest_first() -> None:
 
 
 def test_batches_begin_with_triangles_of_the_brightest_stars() -> None:
-    """The batches of the brightest stars have their stated sizes, divided by the root of the scale steps.
+    """The first batches have their stated sizes, divided by the root of the number of scale steps.
 
     Triangles with faint stars follow, and are computed last.
     """
@@ -87,9 +87,10 @@ def test_the_compiled_choice_of_triangles_equals_that_in_numpy(most: int, least:
 
 
 def test_spread_batches_contain_triangles_of_medium_size() -> None:
-    """The longest side is between 0.2 and 0.5 field widths; many or unranked points add their neighbours.
+    """The longest side of a triangle of medium size is between 0.2 and 0.5 field widths.
 
-    Larger triangles follow only if the field has too few triangles of medium size.
+    Larger triangles follow only if the field has too few triangles of medium size. Triangles of neighbours
+    are added if the field has many points, or points of unknown magnitude.
     """
     field, sizes = spread_field(40), BatchSizes((10,), (100, 300))
     chosen = middle_sized(field, 400, 100)

@@ -339,7 +339,7 @@ def test_the_mismatch_of_the_psf_is_the_median_over_the_stars() -> None:
     found = measure_noise(residual, variance, np.full(light.shape, 0.2), light, noise, 4.0)
     assert found.photon == pytest.approx(0.25)
     assert found.mismatch == pytest.approx(0.04, rel=1e-6)
-    # Pixels with little light, unused pixels, and pixels that the fit follows are not counted.
+    # Pixels with little light, with infinite variance, or with a high leverage are not counted.
     for spoilt in ("light", "variance", "leverage"):
         values = {"light": light.copy(), "variance": variance.copy(), "leverage": np.full(light.shape, 0.2)}
         off = residual.copy()

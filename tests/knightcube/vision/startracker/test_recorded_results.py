@@ -45,7 +45,7 @@ def solved(
     scale: tuple[float, float] = (1.0, 1.0),
     camera: Pinhole | None = None,
 ) -> FrameSolution:
-    """Return the solution of a frame, with a prior attitude if `near`."""
+    """Return the solution of a frame, with a prior attitude if `near` is true."""
     off = multiply(from_rotation_vector(np.array([2e-4, -3e-4, 1e-4])), one.attitude)
     prior = AttitudePrior(off, 3e-4) if near else None
     rate = RatePrior(one.rate, 1e-5)

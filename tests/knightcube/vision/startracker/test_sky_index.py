@@ -108,7 +108,7 @@ def test_a_rotated_sky_has_the_same_triangles() -> None:
     """A rotated sky has the same triangles, despite rounding errors.
 
     A star is a corner only of triangles that are smaller than its range, the distance to a brighter
-    neighbour. Rounding errors of the range must not change the choice of triangles.
+    neighbour. Rounding errors of this distance must not change the choice of triangles.
     """
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
@@ -139,7 +139,7 @@ def test_an_entry_depends_on_shape_and_size_of_its_triangle() -> None:
 
 
 def test_entries_of_a_form_between_two_sizes_are_contiguous() -> None:
-    """Each interval of sizes of a form contains exactly the entries that are counted by a search."""
+    """The table `below` contains the number of entries below each interval, as found by a search."""
     triangles = default_index().triangles
     form = np.repeat(np.arange(len(triangles.begin) - 1), np.diff(triangles.begin))
     whole = form * SIZES + (triangles.entry >> np.uint32(16))

@@ -182,7 +182,7 @@ _CAMERA = Pinhole(800, 600, 1500.0)
 
 
 def test_prior_lens_errors_have_their_size_at_the_corner() -> None:
-    """One standard deviation of a lens error displaces the corner by the fraction of a typical lens."""
+    """A lens error of one standard deviation displaces the corner as much as in a typical lens."""
     corner = 500.0 / 1500.0
     sigma = usual_bend(_CAMERA) ** -0.5
     assert len(sigma) == 8
@@ -204,7 +204,7 @@ def test_a_calibrated_lens_has_errors_of_its_stated_accuracy() -> None:
     assert sigma[4] * corner**2 == pytest.approx(0.006)
     assert sigma[5] * corner**4 == pytest.approx(0.002)
     assert sigma[2:4] == pytest.approx([3.0 / 1500.0 * sigma[4]] * 2)
-    # An exactly known value has a small error, so that the equations stay regular.
+    # An exactly known value is given a small error, so that the equations stay regular.
     centre = known_bend(_CAMERA, replace(EXACT, centre=3.0)) ** -0.5
     assert centre[4] * corner**2 == pytest.approx(sky_map._LEAST_DISTORTION)
     distortion = known_bend(_CAMERA, replace(EXACT, distortion=0.006)) ** -0.5
@@ -230,7 +230,7 @@ def test_pixels_and_directions_are_inverse(
     if velocity is None:
         assert directions == pytest.approx(plain)
     else:
-        # The star is behind its apparent direction.
+        # The directions are corrected for aberration, and `apparent` applies it again.
         assert apparent(directions, velocity) == pytest.approx(plain, abs=1e-7)
         assert np.linalg.norm(directions - plain, axis=1).max() > 3e-5
 

@@ -64,7 +64,7 @@ def _solve(
     frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
 ) -> FrameSolution:
     rate = RatePrior(frame.rate, 1e-6)
-    # The simulated lens has no distortion, so only its focal length may be wrong.
+    # The simulated lens has no distortion, so only its focal length is uncertain.
     camera, settings = NARROW.pinhole, SolveSettings(uncalibrated_lens=False)
     return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
 
@@ -89,7 +89,7 @@ def test_a_frame_is_solved_lost_in_space_within_its_own_covariance(streak_px: fl
 
 
 def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
-    """A calibrated lens is not changed by the identification lost in space.
+    """Lost-in-space identification does not change a calibrated lens.
 
     The triangle that identifies the stars has its own scale, which is wrong by up to 0.1 %.
     """
@@ -320,7 +320,7 @@ def test_a_mirrored_photograph_is_solved_and_reported_as_mirrored() -> None:
 
 _EXPOSURE = 2.0
 _TIMES = _EXPOSURE * (np.array(NODES) - 0.5)
-# Weights as a function of time, from -1 to 1, of three weightings: mean, ends, and least-squares parabola.
+# Three weightings as functions of time from -1 to 1: mean, ends, and middle of a least-squares parabola.
 _EVEN = np.linspace(-1.0, 1.0, 401)
 _PARABOLA = np.linalg.pinv(np.stack([np.ones(401), _EVEN, _EVEN**2], axis=1))[0]
 _WEIGHTS = {
@@ -358,7 +358,7 @@ def test_steady_and_odd_motions_do_not_change_the_attitude_at_mid_exposure(weigh
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_the_nodes_represent_the_whole_exposure(name: str) -> None:
-    """For a rotation of second and fourth power in time, the few nodes agree with sums over 401 instants."""
+    """If the rotation contains t^2 and t^4, the few nodes agree with sums over 401 instants."""
     weighting, fine = _WEIGHTS[name]
     time = 0.5 * _EXPOSURE * _EVEN
     off = middle_covariance(weighting, _turns(0.0, 0.2, 0.0, 0.9), np.zeros((3, 3)), _EXPOSURE)

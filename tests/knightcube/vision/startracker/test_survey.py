@@ -262,7 +262,7 @@ def test_noise_of_neighbouring_pixels_may_be_correlated() -> None:
 
 
 def test_clipped_or_quantised_noise_is_unreliable() -> None:
-    """The lower tail of normal noise is two standard deviations long. That of clipped noise is shorter."""
+    """The lower tail of normal noise is two standard deviations long; clipped noise has a shorter tail."""
     limit = 2.0 * survey_module._CUT_OFF * 5.0
     reach = np.array([10.0, 1.01 * limit, 0.99 * limit, 1.0, 1.0])
     noise = np.array([5.0, 5.0, 5.0, 1.02 * survey_module._HIDDEN, 0.98 * survey_module._HIDDEN])
@@ -378,7 +378,7 @@ def test_the_compiled_search_of_clutter_equals_that_in_numpy() -> None:
 
 
 def test_areas_have_the_moments_of_their_light() -> None:
-    """An area has the flux, the centroid and the length of its star or streak, and its peaks."""
+    """An area has the flux, the centroid, the length and the peaks of its star or streak."""
     frame = np.full((120, 160), 100.0)
     time = np.linspace(-0.5, 0.5, 200)[:, None]
     frame += integrated_by_brute_force((120, 160), np.array([40.3, 60.7]) + 0.0 * time, 40000.0, 1.2)

@@ -48,7 +48,8 @@ def test_the_bound_is_not_below_the_frequency_of_matches_of_random_stars() -> No
 
     Sky and image are random sets of ten stars in a unit square, each in a random order of brightness. All
     rotations and shifts at a known scale are tried: every pair of image stars is aligned with every sky pair
-    of equal length. The most significant bound of each trial is compared with its frequency.
+    of equal length. For some limits, the fraction of trials whose lowest bound is below the limit is compared
+    with the limit.
     """
     rng = np.random.default_rng(5)
     sigma, gate, stars, trials = 0.004, 3.0, 10, 150
