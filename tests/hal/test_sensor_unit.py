@@ -366,5 +366,5 @@ def test_the_duration_of_a_job_does_not_lower_its_rate() -> None:
     ticker = clock.ticker("slow", 20_000_000, job)
     clock.sleep_until_ns(clock.now_ns() + 400_000_000)
     ticker.stop()
-    # If a run is late on a busy machine, the next run follows after less than period plus job (30 ms).
+    # If the job delayed the next period, no interval would be shorter than 30 ms, the sum of period and job.
     assert np.diff(begun).min() < 26_000_000

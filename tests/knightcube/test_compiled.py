@@ -110,7 +110,7 @@ def test_the_time_of_compilation_is_measured_and_each_function_is_reported_once(
 
 
 def test_the_process_that_compiles_a_function_computes_the_same_as_later_processes(tmp_path: Path) -> None:
-    """The background of a frame is subtracted with helpers that may compute sums in any order."""
+    """Background subtraction is tested, because its compiled helpers may compute sums in any order."""
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     environment = {
         **os.environ,

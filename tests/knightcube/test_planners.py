@@ -119,7 +119,7 @@ def test_an_impossible_step_is_refused_with_the_reason(wrong: dict[str, Any], re
 
 @pytest.mark.parametrize("end_rate", [0.0, -0.02])
 def test_the_current_that_a_refusal_asks_for_is_needed_and_nearly_sufficient(end_rate: float) -> None:
-    """The current in the error message is a lower bound, from which a small step is possible at 2 % more."""
+    """The current in the error message is a lower bound; 2 % above it, this small step is possible."""
     step: dict[str, Any] = {"start_angle": -0.05, "end_angle": 0.05, "horizon": 12.0, "max_stretch": 1.0}
     with pytest.raises(PlanningError) as refused:
         plan_step(replace(FREE, current_limit=1e-4), **step, end_rate=end_rate)
@@ -274,7 +274,7 @@ def test_a_slew_at_a_time_without_known_field_or_orbit_is_refused(
 
 
 def test_a_free_roll_does_not_move_a_goal_out_of_its_cone() -> None:
-    """The camera on the pointing axis sees the Sun at every roll; 60 deg beside it, a cone of 50 deg is free.
+    """A camera on the pointing axis sees the Sun at any roll; one 60 deg from it can avoid a cone of 50 deg.
 
     The remedy is another goal, not a longer time.
     """

@@ -49,7 +49,7 @@ from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from knightcube.vision.sun import SunMeasurement, SunSettings, SunSolution, SunStatus
 
-# Without types, so that arguments of other types can be tested.
+# The type Any permits tests with arguments of wrong types.
 LIB: Any = knightcube
 
 

@@ -1,4 +1,4 @@
-"""Tests of the emulated PCA9685 against the NXP data sheet. Each test states its rule."""
+"""Tests of the emulated PCA9685 against the NXP data sheet."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def test_frames_without_a_trigger_are_returned_to_the_stream(fake: AravisCamera)
 
 def test_without_aravis_the_remedy_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    monkeypatch.setitem(sys.modules, "gi", None)  # as if Aravis were not installed
+    monkeypatch.setitem(sys.modules, "gi", None)  # makes an import of gi fail
     camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), SystemClock())
     with pytest.raises(
         Refused, match=r"apt install gir1.2-aravis-0.8.*pip install 'knightcube-flight\[genicam\]'"

@@ -1,4 +1,4 @@
-"""Tests of the torque coils with faults of bus and chip: retries, counters, and zero current in doubt."""
+"""Tests of the torque coils with bus and chip faults: retries, counters, and zero current when in doubt."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from tests.hal.guardian.live_flight import HANG_S, SLEEPS, SPINS, CoilTruth, liv
 
 STOPPED_S = 1.0
 UNGUARDED = ("SIGSTOP, the guardian too", "SIGSTOP, the guardian too, once more")
-"""Two acts, because the last command before a stop of the flight process can be a zero current."""
+"""The same action twice, because the last command before a stop can be a zero current."""
 _CALM_S = 1.2
 _PATIENCE_S = 30.0  # longest time until a new guardian is ready
 

@@ -10,7 +10,7 @@ _PATIENCE_S = 60.0
 
 
 def state(process: int) -> str:
-    """Return the state letter of a process, such as T (stopped) or Z (zombie) of proc(5); "" for none."""
+    """Return the state letter of a process by proc(5), such as T (stopped), or "" if the process is gone."""
     try:
         stat = Path(f"/proc/{process}/stat").read_text(encoding="ascii")
     except (FileNotFoundError, ProcessLookupError):

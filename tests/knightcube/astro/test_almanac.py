@@ -42,7 +42,7 @@ SECOND = "2 25544  51.6400 200.0000 0005000 100.0000 260.0000 15.50000000539990"
 def test_the_sun_agrees_with_the_almanac_and_is_displaced_by_aberration() -> None:
     """The Sun direction agrees with an almanac of 42" accuracy, and includes the aberration of 5.2".
 
-    The almanac is the simulator's. The satellite's own velocity of 7.6 km/s causes the aberration.
+    The almanac is that of the simulator. The satellite's own velocity of 7.6 km/s causes the aberration.
     """
     for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
         apparent, distance = apparent_sun(date, np.zeros(3), np.zeros(3))
@@ -221,7 +221,7 @@ def test_elements_far_from_their_epoch_give_no_orbit(year: int) -> None:
 
 
 def test_elements_are_accepted_until_their_standard_deviation_reaches_its_limit() -> None:
-    """The elements of a height of 420 km are accepted for two weeks before and after their epoch."""
+    """Elements of an orbit at 420 km are accepted for two weeks before and after their epoch."""
     epoch, elements = datetime(2025, 11, 16, 12), TwoLineElements(FIRST, SECOND)
     days = next(d for d in range(1, 99) if elements.at(elements.epoch + d).sigma > LARGEST_SIGMA)
     assert 10 < days < 20
@@ -259,7 +259,7 @@ def test_two_line_elements_are_those_of_sgp4() -> None:
 
 
 def test_an_orbit_at_times_in_any_order_is_integrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Alternating between both ends of a month would integrate thirty days for each time."""
+    """In their order, times that alternate between the ends of a month would take thirty days each."""
     times = np.array([5000.0, -3000.0, 0.0, 9000.0, -100.0, 5000.0])
     lengths: list[float] = []
 

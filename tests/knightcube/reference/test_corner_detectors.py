@@ -67,7 +67,7 @@ def test_a_patch_computed_by_hand() -> None:
 
 
 def test_the_simple_response_is_used_if_no_intermediate_direction_is_lower() -> None:
-    """If no direction between the neighbours gives a lower value, the simple response is returned.
+    """If no direction between the neighbours gives a lower value, the response is that of the neighbours.
 
     The pixels 1 (right), 3 (left), 1 (below) and 1 (above) around 5 give B1 = B2 = 4, which is not negative.
     """

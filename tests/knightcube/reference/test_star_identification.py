@@ -187,7 +187,7 @@ def test_a_field_of_view_that_is_not_known_is_refused_with_the_reason(name: str)
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_two_points_within_their_errors_of_one_another_do_no_harm(name: str) -> None:
-    """If one guide star is the best match of two points, no point is identified wrongly.
+    """Two points that match the same guide star do not cause a wrong identification.
 
     A single star does not determine an attitude.
     """

@@ -140,7 +140,7 @@ def test_the_magnitude_limit_gives_the_wanted_number_of_stars_in_a_field() -> No
 
 @pytest.mark.parametrize("degrees", [0.01, 0.1, 5.0, 90.0])
 def test_the_variance_of_a_cosine_is_that_of_drawn_pairs(degrees: float) -> None:
-    """The variance of a cosine equals the sample variance, even if the stars are as close as their errors.
+    """The variance of a pair's cosine equals the sample variance, even at separations like the errors.
 
     The 20,000 random draws determine the standard deviation to within 1.5 % (3 sigma).
     """

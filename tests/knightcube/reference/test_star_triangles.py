@@ -101,7 +101,8 @@ def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
     theta = 2.0 * np.arcsin(0.5 * np.linalg.norm(centre - middle, axis=-1))
     total = float(np.sum(theta**2 * spherical_shape(triangles)[0]))
-    # Each division reduces the error to a quarter, and seven divisions to about (1/128)^2 of the moment.
+    # Each division reduces the error to a quarter, and seven divisions reduce it to about (1/128)^2 of the
+    # moment.
     assert spherical_shape(corners[None])[1][0] == pytest.approx(total, rel=2e-4)
 
 

@@ -1,4 +1,4 @@
-"""Tests of the size of the effects of faults on samples, lines and other emulated hardware."""
+"""Tests of the magnitude of the effects of faults on samples, lines and other emulated hardware."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ UPSETS = ("pwm: upset", "monitor: upset", "imu: upset")
 
 
 def driven_rig() -> Rig:
-    """Return coils that were commanded in each cycle for one second."""
+    """Return coils that have received a command in each cycle for one second."""
     rig = Rig()
     rig.coils.start()
     for _ in range(40):

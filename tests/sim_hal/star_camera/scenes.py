@@ -40,7 +40,7 @@ def centroid(image: FloatArray) -> FloatArray:
 def integrated_by_brute_force(
     shape: tuple[int, int], path: FloatArray, electrons: float, sigma: float
 ) -> FloatArray:
-    """Return the pixel-integrated image of a point that is for equal times at each point of `path` (k, 2).
+    """Return the pixel-integrated image of a point that stays equally long at each point of `path` (k, 2).
 
     The function sums the definition of the image in double precision, with scipy's erf. `k` should be some
     thousands.

@@ -59,7 +59,7 @@ def test_a_curved_streak_about_the_boresight_is_exact() -> None:
 
 
 def test_a_streak_of_changing_rate_is_exact() -> None:
-    """A streak at a changing rate is exact.
+    """The image of a streak at a changing rate agrees with a sum over instants.
 
     If the camera accelerates from rest, the start of the path is brighter than its end.
     """
@@ -71,7 +71,7 @@ def test_a_streak_of_changing_rate_is_exact() -> None:
 
 @pytest.mark.parametrize("jitter", [0.003, 0.03, 0.3, 1.0])
 def test_jitter_between_samples_is_followed(jitter: float) -> None:
-    """Jitter between the samples of the attitude is followed.
+    """The path of a star follows jitter from sample to sample of the attitude.
 
     The motion has kinks of up to about a pixel at its 200 samples. The renderer treats the smallest kinks as
     a smooth motion.
@@ -297,7 +297,7 @@ def test_every_row_is_the_integral_over_its_own_exposure(
 ) -> None:
     """Every row of a rolling shutter is the integral over its own exposure.
 
-    The motion is up to 0.15 px per line time, in both directions of the shutter.
+    The motion is up to 0.15 px per line time, along and against the motion of the shutter.
     """
     model = replace(ROLLING_MODEL, line_time=line_time)
     vx, vy = velocity
@@ -326,7 +326,10 @@ def test_a_changing_rate_is_exact() -> None:
 
 
 def test_jitter_is_followed() -> None:
-    """Jitter is followed under a rolling shutter. The motion has kinks of 0.1 px every 5 ms at 150 px/s."""
+    """Under a rolling shutter, the path of a star follows jitter.
+
+    The motion has kinks of 0.1 px every 5 ms at 150 px/s.
+    """
     times = np.linspace(0.0, EXPOSURE + READOUT, 45)
     rng = np.random.default_rng(3)
     turn = np.outer(times, [0.0, 150.0 / ROLLING_FOCAL, 0.0]) + rng.normal(0.0, 0.1 / ROLLING_FOCAL, (45, 3))
@@ -336,7 +339,7 @@ def test_jitter_is_followed() -> None:
 
 @pytest.mark.parametrize("start", [(60.0, -2.0), (60.0, 101.0), (-25.0, 50.0), (110.0, 90.0)])
 def test_streaks_that_an_edge_cuts_are_exact(start: tuple[float, float]) -> None:
-    """Streaks that an edge truncates are exact.
+    """The images of streaks that an edge truncates agree with sums over instants.
 
     Stars enter from above, below and the left, and leave at the corner.
     """

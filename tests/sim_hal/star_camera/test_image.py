@@ -77,7 +77,7 @@ def test_moments_are_right_in_every_pixel_of_a_star_field() -> None:
 def test_moments_are_right_without_read_noise() -> None:
     """The moments are right without read noise.
 
-    Without other noise, the Poisson steps are visible, and each pixel has its own distribution.
+    Without other noise, the steps of the Poisson distribution are visible.
     """
     model = replace(DEEP, read_noise=0.0, dark_current=4.0)
     light = np.full((96, 96), 0.5)
@@ -348,10 +348,10 @@ def test_the_thesis_placement_shares_a_star_among_four_pixels() -> None:
 
 
 def test_the_thesis_placement_and_kernel_together() -> None:
-    """The placement and the kernel of the thesis are combined, for a star at (30.5, 20).
+    """The thesis's placement of a star at (30.5, 20) and its kernel are combined.
 
-    Across, the weights are g1/2, (g1 + g0)/2, (g1 + g0)/2, g1/2. Down, the weights are g1, g0, g1, with g0 =
-    0.4519 and g1 = 0.2741.
+    Along a row, the weights are g1/2, (g1 + g0)/2, (g1 + g0)/2, g1/2. Along a column, the weights are g1, g0,
+    g1, with g0 = 0.4519 and g1 = 0.2741.
     """
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear")
     image = expected_electrons(model, at_pixels(model, [30.5, 20.0]), [3.0], *still()) / model.electrons(

@@ -508,7 +508,7 @@ def test_a_buffer_widens_both() -> None:
     ],
 )
 def test_the_earth_hides_what_is_behind_it(target: tuple[float, float, float], hidden: bool) -> None:
-    """An object is hidden exactly if the line of sight to it passes through the Earth.
+    """An object is hidden if and only if the line of sight to it passes through the Earth.
 
     The reference is the smallest distance from the Earth's centre of 100,000 points on the line.
     """

@@ -38,7 +38,7 @@ def both(
 def test_orbit_field_and_rotation_agree_with_the_world_free_body() -> None:
     """Two worlds with coils and gravity gradient agree in orbit, field and rotation.
 
-    The degree 13 of IGRF-14, which WMM2025 does not have, changes the attitude by a milliradian.
+    Degree 13 of IGRF-14, which WMM2025 does not have, changes the attitude by a milliradian.
     """
     currents = [np.array([0.05, -0.03, 0.02])]
     theirs, ours = both(FreeBodySection(craft="cubesat_3u", disturbances=CALM), lambda: currents[0])

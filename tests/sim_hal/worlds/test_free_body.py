@@ -318,7 +318,7 @@ def test_configured_coils_and_inertia_agree_with_the_true_ones(name: str) -> Non
 def test_the_dipole_of_a_coil_varies_every_twenty_seconds() -> None:
     """The dipole of a coil changes every twenty seconds.
 
-    The torque of a single driven coil shows its dipole relative to the mean dipole.
+    The torque of the only driven coil, relative to the mean dipole's torque, shows the coil's dipole.
     """
     varied = FreeBodySection(craft="cubesat_3u", disturbances=Disturbances(coil_variation=0.02))
     current = np.array([0.1, 0.0, 0.0])
@@ -389,9 +389,9 @@ def test_the_campaign_of_pointing_judges_the_weights_that_are_flown(name: str, c
 
 
 def test_the_filter_expects_the_errors_of_tilted_coils_that_the_world_draws() -> None:
-    """The filter expects the errors of tilted coils that the world draws.
+    """The errors of tilted coils that the world draws agree with the prior covariance of the filter.
 
-    Over 200 satellites, the mean square of the errors of the coil matrix, in expected sigmas, is checked.
+    Over 200 satellites, the mean square of the errors of the coil matrix agrees with this covariance.
     """
     config = as_orbit(reader.load(FOLDER / "orbit_1u_tilted.yaml"))
     coils, prior = config.coils.map(), filter_settings(config).coils

@@ -190,7 +190,7 @@ def test_errors_agree_with_the_covariance(name: str, n: int, half_field: float |
 
 @pytest.mark.parametrize("name", ["olae", "triad"])
 def test_solvers_that_are_not_optimal_differ_from_the_optimum_as_their_covariances_state(name: str) -> None:
-    """Solvers that are not optimal differ from the optimum as the difference of the covariances states.
+    """The deviations of suboptimal solvers from the optimum agree with the difference of the two covariances.
 
     An efficient estimate is uncorrelated with its difference from any other estimate, so the variances
     subtract.
@@ -335,7 +335,7 @@ def test_the_rotation_agrees_with_an_svd_solution_of_wahbas_problem_far_below_th
     weights = rng.uniform(0.2, 1.0, 25)
     found = attitude_matrix(rotation_between(starts, ends, weights).quaternion)
     difference = found @ _wahba(starts, ends, weights).T
-    # The losses of both solvers differ in second order, by the noise times the rotation of 0.02 rad.
+    # The losses of the two solvers differ only by products of the noise and the rotation of 0.02 rad.
     skew = 0.5 * np.array([difference[2, 1], difference[0, 2], difference[1, 0]])
     assert np.linalg.norm(skew) < 0.05 * sigma
 

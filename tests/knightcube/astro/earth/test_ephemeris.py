@@ -63,7 +63,7 @@ def test_a_prediction_covers_its_duration_and_keeps_the_energy_of_the_orbit() ->
 
 
 def test_the_dipole_field_is_scaled_to_the_measured_field_for_some_minutes() -> None:
-    """A field of twice the modelled strength is predicted at first, and the modelled field after an hour."""
+    """If the measured field is twice the model, the prediction begins there and returns to the model."""
     times = np.array([0.0, 400.0, 40_000.0])
     plain = dipole_field_ahead(STATE, predict(STATE, 20.0).field[0], times)
     strong = dipole_field_ahead(STATE, 2.0 * plain[0], times)

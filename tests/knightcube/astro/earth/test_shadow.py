@@ -79,7 +79,7 @@ def test_between_earth_and_sun_it_is_day_everywhere() -> None:
 def test_the_cylinder_is_as_wide_as_the_earth() -> None:
     """The edge of the cylindrical shadow is one Earth radius from its axis, at any distance behind the Earth.
 
-    By its errata, equation 2.15 contains the position of the object.
+    According to the errata, equation 2.15 contains the position of the object.
     """
     for depth in (1000e3, 42_164e3):
         assert sunlit_share(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical") == 0.0
