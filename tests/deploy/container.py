@@ -199,7 +199,7 @@ def _furnish(root: Path, folder: Path, scenario: str) -> None:
         _do("chroot", str(root), "chown", "-R", "knightcube-link:", str(Path(KEYS).parent))
     again = subprocess.run([*installer, "--dry-run", *options], capture_output=True, text=True, check=True)
     (folder / "second_install.txt").write_text(again.stdout, encoding="utf-8")
-    # The interpreter may be in a home folder, which the service's user must be able to enter in this test.
+    # If the interpreter is in a home folder, the service's user must be able to enter this folder.
     for place in (Path(sys.base_prefix), *Path(sys.base_prefix).parents, ROOT, *ROOT.parents):
         inside = root / place.relative_to("/")
         inside.chmod(inside.stat().st_mode | 0o055)

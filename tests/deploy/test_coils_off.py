@@ -209,7 +209,7 @@ class Chips:
 def test_each_chip_that_acknowledges_is_switched_off_even_if_another_does_not(
     tools: Tools, note: int, unit: int, refusals: int, left: list[int], status: int
 ) -> None:
-    """A PWM chip may refuse its first bytes. An address without a chip never acknowledges."""
+    """A PWM chip can fail to acknowledge its first bytes. An address without a chip never acknowledges."""
     chips = Chips(tools.folder)
     assert chips.driving() == list(chips.ADDRESSES)
     if refusals:

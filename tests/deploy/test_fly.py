@@ -171,7 +171,7 @@ def test_a_release_without_a_readable_manifest_is_replaced_and_the_reason_report
 
 
 _NO_IMPORT = '    *"import flight"*) exit 1 ;;'
-"""Line of the replacement of Python that makes the import of the flight software fail."""
+"""Line that makes the import of the flight software fail, in the script that replaces Python."""
 
 PYTHONS: dict[str, Callable[[Path], None]] = {
     "missing": Path.unlink,

@@ -332,7 +332,7 @@ def test_elements_replace_one_value_of_the_present_configuration(board: RenewedB
 
 
 def test_a_damaged_configuration_is_not_accepted_with_new_elements(board: RenewedBoard) -> None:
-    """If it were accepted, the new configuration would have the damaged value and a valid checksum."""
+    """A damaged configuration that is stored with new elements would get a valid checksum."""
     board.config.write_text(board.config.read_text().replace("duration: ", "duration: 1"))
     path = board.place / "elements.txt"
     path.write_text("\n".join(ELEMENTS) + "\n")
@@ -414,7 +414,7 @@ def test_a_request_after_a_new_key_may_have_the_name_of_an_earlier_request(board
 
 
 def test_a_refused_bundle_leaves_no_files(board: RenewedBoard) -> None:
-    """If its files remained, a bundle that fills the disk would prevent the storage of its refusal."""
+    """The files of a bundle that fills the disk would prevent the storage of its refusal."""
     bundle = board.bundle("configuration", board.changed("second"), 1)
     bundle.write_bytes(bundle.read_bytes()[:-100])
     request = board.activate(bundle)
@@ -727,7 +727,7 @@ def _fail_once(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, *wante
 
 
 def _confirmed_with_contact(board: RenewedBoard) -> str:
-    """Confirm a new configuration with a limit of contact of 1,000 s; return the configuration before it."""
+    """Confirm a new configuration with a contact limit of 1,000 s; return the previous configuration."""
     before = board.flown()
     activated(board)
     board.request("confirm")

@@ -91,7 +91,7 @@ def test_the_interfaces_of_the_page_are_those_of_the_code() -> None:
 
 
 class _Gyro(UnitSection, frozen=True, kw_only=True):
-    """Section of a unit on a serial line, whose registration names no files."""
+    """Section of a unit on a serial line, whose driver is registered without a function for its files."""
 
     device: str = "/dev/ttyS7"
 

@@ -84,7 +84,7 @@ def test_a_newcomer_needs_at_most_ten_commands() -> None:
 def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: Path) -> None:
     """The satellite of the tutorial is detumbled after 106 s.
 
-    The flight of 150 s is ended shortly afterwards.
+    The test shortens its flight from 150 s to 112 s.
     """
     _, (new, check, run, judge) = newcomer()
     assert "--duration 150" in run
