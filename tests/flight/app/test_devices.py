@@ -1,4 +1,4 @@
-"""Tests of the opening of devices: closed after a check, and sensors with possible axes only."""
+"""Tests that opened devices are closed after a check, and that wrong values of devices are refused."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path)
 
 
 def test_warnings_of_the_flight_are_in_the_verdict(tmp_path: Path) -> None:
-    """No path exists for a body whose inertia is a thousand times as large."""
+    """No path exists for a body with a thousand times the configured inertia."""
     plant = {**yaml.safe_load(DEMO.read_text())["plant"], "inertia": 1.05}
     done = command("check", write(tmp_path, DEMO, camera="none", plant=plant))
     assert done.returncode == 0, done.stderr

@@ -222,7 +222,7 @@ def test_a_folder_of_keys_that_is_mounted_late_is_read_by_a_new_start(
     def run_shortly(self: Station, ended: Callable[[], bool], *callbacks: Callable[..., object]) -> None:
         names = [one.name for one in self._filing.status()]
         opened.append((self._vault.rebuilt, len(self._scheduling._timetable.entries), names))
-        if len(opened) == 1:  # the parent folder is mounted while the link with rebuilt keys runs
+        if len(opened) == 1:  # the keys were rebuilt; now their parent folder is mounted
             metadata = pack(Transaction(2, 7, 1), Metadata(9, "elements/early", "a", 3))
             self._filing.take(UnitPacker(UP).pack(metadata, 1), 0)
             for path, other in ((keys, away), (files, late)):

@@ -52,7 +52,7 @@ class Seen:
         self.told.append((kind.name, text))
 
     def fly(self, begin: int, end: int, currents: FloatArray | None, noise: float = 1e-9) -> bool:
-        """Run for some seconds with string readings; return whether the coils were driven in the end."""
+        """Run with readings of the solar strings; return whether the last command drives the coils."""
         acted = False
         for tenth in range(10 * begin + 1, 10 * end):
             now_ns = tenth * SECOND_NS // 10

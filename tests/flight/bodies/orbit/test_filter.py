@@ -140,7 +140,7 @@ class Flown:
         return used == [True]
 
     def error(self) -> float:
-        """Return the error of the present attitude, rad."""
+        """Return the angle (rad) between the estimated and the true attitude."""
         return float(angle_between(self.filter.at(self.time_ns).quaternion, self.attitude))
 
     def _reading_at(self, time_ns: int) -> ImuReading:
@@ -672,7 +672,7 @@ def test_another_magnetometer_begins_without_the_learned_bias(renewed: bool) -> 
 def test_the_dipoles_stay_unknown_while_the_driver_of_the_coils_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The time of the last acknowledged command is constant, and all steps in the failure begin later."""
+    """During the failure, each command has the time at which the failure began, so all steps begin later."""
     flown = Flown(pulses=True)
     flown.fly(2.0)
     failed_ns, command = flown.time_ns, flown.filter.command

@@ -58,14 +58,14 @@ def stored(slow: SlowStates) -> dict[str, Learned]:
 
 
 def variances_after(age: float) -> FloatArray:
-    """Return the variances, after an age (s), of parameters once known to a tenth of their prior sigma."""
+    """Return the variances, after an age (s), of parameters whose sigma was a tenth of the prior sigma."""
     return np.asarray(
         (0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + air_covariance(age).diagonal()
     )
 
 
 def air_covariance(age: float) -> FloatArray:
-    """Return the covariance (growth during an age, s) of the torques due to changes of the air density."""
+    """Return the growth, in `age` s, of the covariance of the torques by changes of the air density."""
     changed, at = np.zeros_like(PRIOR), slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
     changed[at, at] = age * density_walk(0.5 * START[at])
     return changed

@@ -113,7 +113,7 @@ def test_an_estimate_that_the_field_with_coils_off_contradicts_is_discarded(curr
 def navigation(
     uses: bool, *polled: ImuReading, accurate: Any = None, spare: Any = None
 ) -> tuple[Navigation, Any, Any]:
-    """Return the navigation of a body, its mocked feed and mocked facts; the IMU returns `polled`."""
+    """Return the navigation of a body whose IMU returns `polled`, and the mocks of its feed and its facts."""
     unit, estimation, services = Mock(), Mock(), Mock()
     unit.poll.return_value, services.recorder.epoch_ns = polled, 0
     link = Mock(bad_checksum=0, discarded_bytes=0, out_of_range=0, not_finite=0, last_byte_ns=0, upsets=0)
