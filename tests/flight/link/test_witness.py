@@ -150,7 +150,7 @@ def test_a_lost_folder_is_rebuilt_without_the_primary_command_key(
             opened(keys)
     else:
         assert all(opened(keys).read(spi) is None for spi in KEYS), "the folder may be mounted later"
-    # The loss is stated at each start until there is a new key.
+    # Each start reports the loss until there is a new key.
     for rebuild in (True, False):
         at = opened(keys, rebuild=rebuild)
         assert (at.rebuilt, at.restored) == (True, False)

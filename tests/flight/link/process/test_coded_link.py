@@ -301,7 +301,7 @@ def test_datagrams_and_streams_of_both_ends_are_coded_alike(stack: ExitStack, ki
     assert found == [telemetry] * 2
     if kind == "udp":
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.sendto(command, ("127.0.0.1", line.port))  # a frame without a code block
+            stranger.sendto(command, ("127.0.0.1", line.port))  # a frame without channel coding
             while not (taken := line.receive()):
                 pass
         assert [frame for frame, _ in taken] == [b""]
