@@ -129,7 +129,7 @@ NO_SPACE = errno.ENOSPC
 def _possible(inode: _Inode) -> list[bytes]:
     """Return the possible contents of a file after power loss.
 
-    Blocks without sync are old, new, torn or zero.
+    Blocks that were not synced are old, new, torn or zero.
     """
     if inode.durable == inode.cached:
         return [inode.cached]

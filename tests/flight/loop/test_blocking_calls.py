@@ -31,7 +31,7 @@ ALLOWED = {
     "hal/drivers/current_monitors.py:PolledMonitor.error": ("_thread.", _LOCK),
     "hal/drivers/current_monitors.py:PolledMonitor.latest": ("_thread.", _LOCK),
 }
-"""Functions whose calls may block on the control thread, by the start of the call's name, with the reason."""
+"""Functions that may block the control thread, with the start of the blocking call's name and the reason."""
 
 
 def test_the_control_thread_makes_only_the_permitted_waiting_calls() -> None:

@@ -61,7 +61,7 @@ def test_a_broken_axis_is_found_and_named(fault: str, names: set[str], within: f
 
 
 def full(time: float, _: ImuReading) -> FloatArray:
-    """Return currents at the limit for all coils, as in a fast tumble. The sign of z changes at 4 s."""
+    """Return currents at the limit for all coils, as in a fast tumble. The sign of coil z changes at 4 s."""
     return np.array([FULL, FULL, -FULL if time < 4.0 else FULL])
 
 
@@ -285,7 +285,7 @@ def test_a_faulty_monitor_is_distrusted_and_no_coil_is_isolated() -> None:
 
 
 def changing(time: float, _: ImuReading) -> FloatArray:
-    """Return currents of all coils that change every 2 s, as in a tumble."""
+    """Return currents that change every 2 s in all coils, as in a tumble."""
     draw = np.random.default_rng(int(time / 2.0))
     return FULL * draw.uniform(-1.0, 1.0, 3)
 

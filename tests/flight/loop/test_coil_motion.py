@@ -29,7 +29,7 @@ _INVERSE = np.linalg.inv(INERTIA)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the cross product (3,) of two vectors. The general function of numpy takes ten times longer."""
+    """Return the cross product (3,) of two vectors. numpy.cross takes ten times as long."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 

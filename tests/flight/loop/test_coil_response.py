@@ -270,7 +270,7 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     assert watch.available.all()
     assert not watch.resting.any()
     assert watch.suspicion == ""
-    watch.tumble_rate = 10.0  # the monitor regards any rate as slow
+    watch.tumble_rate = 10.0  # every rate is now below the tumble rate
     body.fly(40.0)
     assert watch.correction.factors.tolist() == signs.tolist()
     assert watch.correction.unreviewed == frozenset()

@@ -61,7 +61,7 @@ class Bench:
     def frame(
         self, seconds: float, *, known: bool = True, rate: bool = False, others: FloatArray | None = None
     ) -> None:
-        """Accept a frame with the stars and the object, with an estimated attitude or the streaks' rate."""
+        """Accept a frame with the stars and the object, optionally with an attitude and the streaks' rate."""
         turn = attitude_matrix(camera_at(seconds))
         sky = np.vstack([STARS if others is None else others, object_at(seconds)[None]])
         count = len(sky)

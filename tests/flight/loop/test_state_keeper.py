@@ -154,7 +154,7 @@ def test_the_number_of_notices_that_are_not_read_is_limited() -> None:
 
 
 class HungDisk(Disk):
-    """A disk whose sync does not return until released."""
+    """A disk whose method `sync` blocks until the test releases it."""
 
     def __init__(self) -> None:
         super().__init__()
