@@ -23,7 +23,7 @@ from tests.support.bench_session import ScriptedCamera, bench_session, named
 
 SIZE = 128
 CAMERA = Camera(columns=SIZE, rows=SIZE, bits=12, gain=2.0, read_noise=8.0, exposure=0.5)
-"""A camera whose read noise of 8 e- is 4 counts."""
+"""A camera whose read noise of 8 e- equals 4 counts."""
 
 
 def noisy(level: float = 100.0, sigma: float = 4.0, seed: int = 1) -> Image:

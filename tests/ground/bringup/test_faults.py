@@ -55,7 +55,7 @@ def fault(*names: str) -> Change:
 
 
 def coil_field(matrix: Any) -> Change:
-    """Return the coils' field at the magnetometer, relative to its usual value."""
+    """Return a change that multiplies the elements of the coils' field at the magnetometer by factors."""
     return {"simulation": {"coil_field": (FIELD * np.array(matrix)).tolist()}}
 
 

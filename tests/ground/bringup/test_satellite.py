@@ -31,7 +31,7 @@ SECTIONS = {
 
 
 class ScriptedMonitor:
-    """Current monitor of a line with a constant current and the share `gain` of the current of coil x."""
+    """Current monitor of a line with the current `idle` plus `gain` times the current of coil x."""
 
     def __init__(
         self, session: Session, coils: ScriptedCoils, voltage: float, idle: float, gain: float
@@ -173,7 +173,7 @@ class ScriptedReceiver:
         return due
 
     def link(self) -> GpsLink:
-        """Return counters that are 0 before the step."""
+        """Return counters, which are 0 at the first call and `end` afterwards."""
         self.asked += 1
         return GpsLink() if self.asked == 1 else self.end
 
@@ -421,5 +421,5 @@ def test_an_old_reading_of_the_strings_ends_the_step(age_s: float, problem: str)
         step_strings(session)
     assert ended.value.finding is not None
     assert (ended.value.finding.kind, ended.value.finding.text) == ("no reading", problem)
-    strings.age_s = 1.2  # within the second half of the 2.5 s
+    strings.age_s = 1.2  # the reading is from the second half of the 2.5 s
     assert step_strings(session).findings == []

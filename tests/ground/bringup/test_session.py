@@ -36,7 +36,7 @@ SITE = np.array([2e-5, 0.0, -4e-5])
 
 
 def test_the_expected_noise_is_that_of_the_data_sheet_at_the_sample_rate() -> None:
-    """VN-100: 0.0035 deg/s, 14 nT and 0.14 mg, each per root hertz, over half the sample rate."""
+    """VN-100: 0.0035 deg/s, 14 nT and 0.14 mg per root hertz, in a bandwidth of half the sample rate."""
     config = orbit_config()
     config = reader.replace(
         config, inertial_unit=reader.replace(config.inertial_unit, rate_hz=50.0, rate_noise=1e-9)
@@ -233,7 +233,7 @@ FIELD = 5e-4 * np.array([[1.0, 0.1, 0.0], [0.0, 1.1, -0.1], [0.1, 0.0, 0.9]])
 
 
 class Bench:
-    """Coils whose fields a magnetometer measures at once, and a monitor of their supply."""
+    """Coils whose fields a magnetometer measures without delay, and a monitor of their supply."""
 
     def __init__(
         self, *, idle: float = 0.004, gain: float = 1.0, fault: str = "", swing: float = 0.0
@@ -380,7 +380,7 @@ def test_a_monitor_without_readings_is_reported_and_the_fields_are_compared() ->
 
 
 def test_readings_from_before_the_current_settled_do_not_count() -> None:
-    """A conversion that begins before the change of the current measures 9 A."""
+    """An ADC sample that begins before the change of the current measures 9 A."""
     bench = Bench()
     latest, command = bench.latest, bench.coils.command
     changed_ns = [0]

@@ -46,7 +46,7 @@ from knightcube.errors import UsageError
 
 
 class Screen(io.StringIO):
-    """Standard error of a terminal, or of a file."""
+    """Test double of standard error, which is a terminal or a file."""
 
     def __init__(self, terminal: bool) -> None:
         super().__init__()
@@ -291,7 +291,7 @@ def test_progress_counts_all_cases_and_those_that_were_done_before(
     fly(TOY, 3, 5, tmp_path, progress=True)
     shown = watch.screen.new()
     assert "continuing: 1 of 3 were done before\n" in shown
-    assert shown.count("\r\x1b[K[") == 3  # at the start, and after each case
+    assert shown.count("\r\x1b[K[") == 3  # one bar at the start, and one after each case
     assert "] 2/3  0 s left" in shown
     assert shown.endswith("] 3/3  0 s left\r\x1b[K")
 

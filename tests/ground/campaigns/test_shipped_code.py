@@ -101,7 +101,7 @@ def test_a_worker_that_unpacks_second_removes_its_copy(
 
 
 class KilledWorker(Exception):
-    """Error of Dask for a case that ended several workers."""
+    """Error that Dask raises for a case that has ended several workers."""
 
     last_worker = "tcp://worker-3"
 
@@ -147,7 +147,7 @@ class CommClosedError(Exception):
 
 @pytest.fixture
 def dask(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Replace Dask's modules. Return the modules that are pickled by value at the time."""
+    """Replace Dask's modules. Return the modules that are currently pickled by value."""
     by_value: list[Any] = []
     comm = SimpleNamespace(CommClosedError=CommClosedError)
     distributed = SimpleNamespace(

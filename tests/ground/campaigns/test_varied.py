@@ -426,7 +426,7 @@ def test_the_picture_shows_each_measure_over_each_drawn_number(
 
 
 def test_the_strongest_influence_is_the_largest_rank_correlation(tmp_path: Path) -> None:
-    """Ranks of the drawn numbers: x rises with the error, except for one exchange, and y falls."""
+    """The ranks of x rise with the error, except for one exchanged pair, and the ranks of y fall."""
     results = [result(k, worst) for k, worst in enumerate((0.1, 0.2, 0.4, 0.8))]
     for one, x, y in zip(results, (1.0, 3.0, 2.0, 9.0), (5.0, 4.0, 3.0, -90.0), strict=True):
         one["drawn"] = {"x": x, "y": y}
@@ -436,7 +436,7 @@ def test_the_strongest_influence_is_the_largest_rank_correlation(tmp_path: Path)
     for one in results:
         del one["drawn"]["y"]
     (row,) = campaign.summarise(results, tmp_path).facts["figures"]
-    assert row["strongest influence"] == "x +0.80"  # 1 - 6 * 2 / (4 * 15), Spearman
+    assert row["strongest influence"] == "x +0.80"  # Spearman: 1 - 6 * 2 / (4 * 15)
     (row,) = campaign.summarise(results[:2], tmp_path).facts["figures"]
     assert row["strongest influence"] == "-"
 

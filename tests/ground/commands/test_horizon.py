@@ -59,7 +59,7 @@ def test_colour_without_an_altitude_gives_one_and_a_picture(folder: Path) -> Non
         assert label in done.stdout
     drawn = np.asarray(pillow.open(overlay)).astype(int)
     orange = np.count_nonzero(np.all(np.abs(drawn - [230, 159, 0]) < 2, axis=2))
-    # The image shows the line of the limb across the whole width, and a ring for each edge.
+    # The image shows the limb as a line across the whole width, and each edge as a ring.
     assert orange > 512
 
 

@@ -164,7 +164,7 @@ def test_the_output_names_the_files_unless_it_is_one_json_object(
 
 
 def made(*, white: bool = True, field: bool = True, offset: float = 0.0) -> _Identified:
-    """Return an artificial identification."""
+    """Return an artificial result of an identification."""
     count = 5
     measured = HorizontalField(4.567e-5, 1.2e-7, 80, offset) if field else None
     reported = ["imu-silent (2): no byte for 0.12 s"] if offset else []
@@ -245,7 +245,7 @@ def test_the_json_object_has_the_values_of_the_text() -> None:
 
 
 def learned() -> LearnedDescription:
-    """Return two quantities, of which one was learned and one value has no uncertainty."""
+    """Return two learned quantities, the dipole with an uncertainty and the gyro without."""
     dipole = LearnedQuantity(
         "dipole", ("x", "y"), "A m^2", np.array([0.0, 0.01]), np.array([0.02, 0.01]),
         np.array([0.005, 0.001]), np.array([0.05, 0.05]),

@@ -215,7 +215,7 @@ def test_a_link_that_does_not_open_is_reported_after_a_minute(
         mission_control._flown(DEMO, tmp_path, ExitStack())
     assert len(started) == 1
     assert 160.0 < clock.now < 160.5
-    # The flight of a link that has ended is started, and `run` reports the link's status.
+    # If the link has ended, the flight is started nevertheless, and `run` reports the link's status.
     ended = processes(monkeypatch, "starting\n", 1)
     mission_control._flown(DEMO, tmp_path, ExitStack())
     assert len(ended) == 2
