@@ -112,7 +112,7 @@ def test_passes_of_an_unknown_revolution_are_refused() -> None:
 
 
 def _pass(rise: float, end: float, longitude: float) -> Pass:
-    """Return a pass from `rise` to `end`, s after BEGIN, over a station at this longitude (deg)."""
+    """Return a pass over a station at a longitude (deg), from `rise` to `end` (s after BEGIN)."""
     station = Station(name="station", latitude_deg=0.0, longitude_deg=longitude)
     at = [BEGIN + timedelta(seconds=seconds) for seconds in (rise, 0.5 * (rise + end), end)]
     return Pass(station, at[0], at[1], at[2], (0.0, 0.0, 0.0), 50.0, 6e5, 1.0, 0.0)

@@ -59,7 +59,7 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")
 wcs = pytest.importorskip("astropy.wcs", reason="astropy is of the extra `test`")
 
-# Astropy warns of a FITS header without an image, as some star solvers write it.
+# Astropy warns about FITS headers without an image, which some star solvers write.
 pytestmark = pytest.mark.filterwarnings("ignore:The WCS transformation has more axes")
 
 _LENS = Lens(1280, 960, 4000.0, (655.0, 470.0), k1=-0.3, k2=0.4)

@@ -243,7 +243,7 @@ def test_kinds_of_packets_are_distinguished_in_order() -> None:
 
 
 def log(cycles: int) -> bytes:
-    """Return the IMU, control and truth packets of `cycles` control cycles."""
+    """Return the packets of `cycles` control cycles, each with an IMU, a control and a truth packet."""
     packer = Packer()
     kinds = [(kind, plain_contents(kind)) for kind in (IMU, CONTROL, TRUTH)]
     return b"".join(packer.pack(kind, cycle, values) for cycle in range(cycles) for kind, values in kinds)

@@ -112,7 +112,7 @@ def test_after_a_restart_of_the_flight_the_console_shows_the_new_flight_only(sat
         assert show()["newest"]["mode"]["time_ns"] == 101 * SECOND_NS
         ends.record(run(10**18 + 1, 102), mode(103))  # a correction of UTC
         show()
-        ends.record(mode(80))  # sent again after a restart of the link process alone
+        ends.record(mode(80))  # sent again because only the link process has restarted
         show()
         assert (history.count("mode", 10**18), feed.restarts, console.trouble) == (4, 0, "")
         ends.record(run(10**18 + 200 * SECOND_NS, 0), mode(1), mode(2, "new"))

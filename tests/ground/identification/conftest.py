@@ -20,7 +20,7 @@ Identified = tuple[World, Record, PlantFit]
 def _identified() -> str:
     """Return four random worlds, their simulated records and their fits, encoded as a string.
 
-    The records are of the bare testbed, without the flight software.
+    The records come from simulations of the testbed without the flight software.
     """
     rng = np.random.default_rng(20)
     worlds = [drawn(rng) for _ in range(4)]

@@ -55,7 +55,7 @@ def chi_square(found: list[Identified], off: float = 1.0) -> float:
 def test_the_truth_lies_within_the_stated_uncertainty_in_all_worlds(identified: list[Identified]) -> None:
     """The chi-square of 4 worlds x 3 constants is in its 99.8 % band.
 
-    A gain error of 0.5 % exceeds the band.
+    With a gain error of 0.5 %, the chi-square exceeds the band.
     """
     low, high = chi2.ppf([0.001, 0.999], 3 * len(identified))
     assert low < chi_square(identified) < high

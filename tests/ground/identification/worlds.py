@@ -37,7 +37,7 @@ ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3
 class World:
     """True constants of a testbed.
 
-    `dipole` is n A per commanded ampere, and `magnetometer` is the scale factor of the sensor.
+    `dipole` is the dipole moment per commanded ampere, and `magnetometer` is the scale factor of the sensor.
     """
 
     inertia: float

@@ -197,7 +197,7 @@ def test_a_refused_key_is_kept_for_the_next_attempt(vault: Vault) -> None:
 
 
 def test_a_key_that_the_satellite_had_is_not_sent_again(vault: Vault) -> None:
-    """A folder of the satellite that was restored or rebuilt after a key change refuses the changed key."""
+    """A satellite whose key folder was restored or rebuilt after a key change refuses this key."""
     used = replace(report(Stage.FAILED), text=f"SPI 1 {USED_KEY}: make a new key")
     refused = terminal(vault, [used])
     commanding.change_key(refused, vault, 1, 2, 1.0, lambda _: None)

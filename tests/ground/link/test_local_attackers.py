@@ -282,7 +282,7 @@ _REQUESTS = """async ([page, gateway, command, packet]) => {
 }"""
 """JavaScript of a page that sends requests to gateway and console.
 
-The request begins with zeros, which a reader could take as packets of 7 bytes.
+The request begins with zeros, which a reader could read as packets of 7 bytes.
 """
 _FORM = """(page) => {
   const form = document.createElement("form");

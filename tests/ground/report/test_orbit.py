@@ -168,7 +168,7 @@ TRUE = np.array([6e-4, 0.0, 8e-4])
 
 
 def dipole_flight(known: bool = True) -> Run:
-    """Return a run whose dipole error is 50 %, later 10 %, and in shadow 20 % of the dipole."""
+    """Return a run whose relative dipole error is 50 %, later 10 %, and in shadow 20 %."""
     times = np.arange(END)
     share = np.where(times < SHADOW - JUDGED, 0.5, np.where(times < SHADOW, 0.1, 0.2))
     packets = np.zeros(END, dtype=[("time_ns", "i8"), ("residual_dipole", "f8", 3)])
