@@ -5,8 +5,7 @@
 functions, because only runs with slow tests compile functions (`tests.support.compiled_forms`). `make quick`
 omits slow tests. A renamed test is not marked as slow until the list is measured again. Test files that last
 longer than `LONG_S` run first, in the order of decreasing duration, so that the workers of `make test` finish
-at nearly the same time. The duration of a file that waits for processes or sockets exceeds its processor
-time.
+at nearly the same time. A test file that waits for processes or sockets lasts longer than its processor time.
 """
 
 from __future__ import annotations

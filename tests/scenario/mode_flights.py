@@ -1,4 +1,4 @@
-"""Simulated flights through the modes: configurations with scheduled commands, and the entered modes."""
+"""Configurations of simulated flights with scheduled mode commands, and the modes that a run entered."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _HELD = np.array([0.0, 0.2, 0.0, np.sqrt(0.96)])
 
 
 def flight_with_objects(folder: Path, objects: tuple[SkyObject, ...], duration: float = _DURATION) -> Run:
-    """Return the run of a body at rest whose camera exposes a frame of 0.2 s each second."""
+    """Return a run of a body at rest with objects in view and a frame of 0.2 s in each second."""
     config = demo_config(duration)
     world = demo_world()
     assert config.camera is not None

@@ -146,7 +146,7 @@ def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
 def test_the_errors_of_the_estimate_agree_with_its_sigmas(demonstration: Run) -> None:
     """The errors of angle and rate agree with their sigmas in 8,200 cycles.
 
-    The test checks the fraction within 3 sigma, and rms / sigma.
+    The test checks the fraction of errors within 3 sigma, and the rms error relative to sigma.
     """
     run = demonstration
     control = run["control"][200:]
@@ -225,7 +225,7 @@ def test_the_errors_of_the_star_attitudes_agree_with_their_covariances(demonstra
 
 @pytest.mark.slow
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
-    """A frame is not spoilt by a step that begins within its exposure.
+    """A frame remains usable if a step begins within its exposure.
 
     During the exposure, the body is first at rest and then accelerates.
     """

@@ -286,7 +286,7 @@ def test_a_frame_that_comes_late_is_not_accepted_as_fresh(tmp_path: Path, max_ag
 
 
 def test_a_stall_of_the_loop_is_counted_once_and_the_flight_continues(tmp_path: Path) -> None:
-    """A stall of the loop for 1 s gives one event and 40 lost slots, which are not made up.
+    """A stall of the loop for 1 s gives one event and 40 lost slots, which are not run later.
 
     The coil currents decay during the stall.
     """

@@ -24,7 +24,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def settled(flown: Run) -> AttitudeErrors:
-    """Return the attitude errors from some frames after the acquisition on."""
+    """Return the attitude errors after `ACQUIRED` s."""
     found = attitude_errors(flown)
     later = found.times > ACQUIRED
     return AttitudeErrors(found.times[later], found.error[later], found.sigma[later])

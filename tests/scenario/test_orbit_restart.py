@@ -58,7 +58,7 @@ def test_the_gyro_bias_is_known_at_once_after_a_kill(tmp_path: Path) -> None:
     assert "unclean-shutdown" in event_names(again)
     assert "learned-refused" not in event_names(again)
     assert np.isfinite(again["navigation"]["gyro_bias"][-1]).all()
-    # The optical axis of the uncalibrated camera, whose configured accuracy is 2 px, is also known at once.
+    # The optical axis, which is configured with an accuracy of 2 px, is also known at once after the restart.
     axis, known = first["lens"]["centre"][-1] - 255.5, first["lens"]["sigma"][-1, 1:3]
     assert len(first["lens"]) > 3
     assert np.all(np.abs(axis) < 5.0 * known)

@@ -19,7 +19,7 @@ from tests.support.flights import CONFIG, event_names
 ROOT = CONFIG.parents[1]
 DURATION = 12.0
 PATIENT = f"extends: {CONFIG}\nexecutive: {{vision_timeout: 100.0}}\n"
-"""Configuration in which a frame may take as long as it takes on a busy machine."""
+"""Configuration with a timeout that suffices for a frame on a busy machine."""
 
 
 def start(folder: Path, duration: float, config: Path = CONFIG) -> subprocess.Popen[str]:

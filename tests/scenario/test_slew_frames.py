@@ -20,7 +20,7 @@ SEED = 3
 ABOUT = np.array([1.0, 0.0, 0.0])
 """Body axis of the slew: across the boresight, which is along -y."""
 STREAKS = 1.1
-"""Star motion (px) during the default exposure above which stars must be streaks."""
+"""Star motion (px), during the default exposure, above which a frame must contain streaks."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def _streaked(run: Run) -> tuple[BoolArray, FloatArray]:
-    """Return for each frame whether the body was fast enough (n,), and the true star motion (n,), px."""
+    """Return whether each frame must contain streaks (n,), and the true star motion (n,), px."""
     config, _ = slew_frames.flight("orbit", SEED, ABOUT)
     assert config.camera is not None
     to_camera = attitude_matrix(np.array(config.camera.mounting))

@@ -54,7 +54,7 @@ def test_after_a_blackout_the_first_frame_is_solved_lost_in_space_and_the_next_b
     The next frame is solved by tracking. The filter's model cannot predict the attitude of the camera. The
     body has swung freely, and the full torque of the coil then rotates the body back. The IMU resumes early
     enough that the rate changes by less than half in the next exposure of one second. The motion fit does not
-    permit a larger change of the rate within an exposure.
+    permit a change by more than half within an exposure.
     """
 
     def prepare(rigged: Rigged) -> None:
@@ -76,7 +76,7 @@ def test_after_a_blackout_the_first_frame_is_solved_lost_in_space_and_the_next_b
 def test_star_attitudes_of_a_displaced_camera_are_refused_and_reported(tmp_path: Path) -> None:
     """If the camera is displaced, its star attitudes are refused and reported.
 
-    The stars are identified in an unexpected direction.
+    The stars are then identified in a direction that contradicts the estimate.
     """
 
     def knock(rigged: Rigged) -> None:
@@ -110,7 +110,7 @@ def test_the_thesis_s_corner_detectors_fly_with_the_stars_too(tmp_path: Path) ->
 
 
 def test_a_distorted_lens_that_the_configuration_describes_is_corrected(tmp_path: Path) -> None:
-    """The simulated camera images through the lens, whose distortion moves the image corner by 4 %."""
+    """The simulated camera has a lens whose distortion moves the image corner by 4 %."""
     text = TEXT.replace(
         "  accuracy: {centre: 0.0, distortion: 0.0}",
         "  lens: {focal_length: 2900.0, centre: [518.0, 505.0], k1: 0.6}\n"

@@ -51,7 +51,7 @@ def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
 def test_a_cost_of_time_determines_the_goal_time_which_later_plans_keep(tmp_path: Path) -> None:
     """A cost of time determines the goal time, which later plans keep.
 
-    If the cost is doubled, the duration of the slew decreases by the fourth root of two. The first plan
+    If the cost is doubled, the duration of the slew decreases by a factor of 2^(1/4). The first plan
     determines the goal time.
     """
     steps = (Step(at=0.0, q2=0.2), Step(at=4.0, q2=0.1))
