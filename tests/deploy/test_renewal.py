@@ -833,7 +833,7 @@ def test_a_trial_ends_although_no_stored_configuration_is_intact(board: RenewedB
 
 
 def test_the_time_of_a_build_does_not_end_the_trial(board: RenewedBoard) -> None:
-    """Flight and link restart after the build, and do not run yet at the next step."""
+    """After the build, flight and link restart, so they do not run yet at the next step."""
     before = board.flown()
     board.activate(board.bundle("configuration", board.changed("second"), 1))
     times = [board.now + 10.0, board.now + 1800.0]
