@@ -1,4 +1,4 @@
-"""Tests that a satellite is built as its configuration says, and of its estimation and its telemetry."""
+"""Tests that a satellite is built as configured, and tests of its estimation and its telemetry."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ class Estimating:
 
 
 def diagonal(rate: float) -> Any:
-    """Return an estimate whose rate about z has the largest variance of the three rates, `rate` squared."""
+    """Return an estimate whose largest variance of the rate, about z, is `rate` squared."""
     variances = np.array([1.0, 1.0, 1.0, 0.25 * rate**2, 0.5 * rate**2, rate**2])
     return SimpleNamespace(covariance=np.diag(variances), rate=np.array([0.1, 0.2, 0.3]), time_ns=5,
                            quaternion=normalise(np.array([0.1, 0.2, 0.3, 0.9])))  # fmt: skip

@@ -204,7 +204,7 @@ def test_the_worker_gets_what_is_known_in_body_axes() -> None:
 
 
 def test_structure_learned_from_frames_is_known_to_the_next_job() -> None:
-    """The structure map that the worker returns is part of the next job, even if the filter does not run."""
+    """The worker's map of the image structure is part of the next job, even if the filter does not run."""
     craft = Still(3)
     bright = np.full((64, 64), 200, dtype=np.uint8)
     for sequence in range(2):

@@ -27,7 +27,7 @@ DOUBLED = tuple(
 )
 """Coils on three axes, with two unequal coils in opposite directions on the axis z."""
 SECONDS, BROKEN, FIELD = 20.0, 36.0, 3.0e-5
-"""Durations (s) of a flight with healthy coils and of a flight whose coil fails after 10 s, and field (T)."""
+"""Duration (s) with healthy coils, duration (s) of a flight whose coil fails after 10 s, and field (T)."""
 
 
 @pytest.mark.parametrize("name", ["orbit_2u", "orbit_6u", "orbit_12u", "orbit_1u_tilted"])

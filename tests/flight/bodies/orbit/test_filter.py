@@ -368,7 +368,7 @@ def test_a_rate_from_streaks_is_used() -> None:
 @pytest.mark.parametrize("pulses", [False, True])
 @pytest.mark.parametrize("jump", [1e-4, 3e-4, 1e-3, -2e-3])
 def test_a_jump_of_the_gyro_bias_is_estimated_without_a_wrong_claim(jump: float, pulses: bool) -> None:
-    """After a jump of the gyro bias, attitude, rate and bias stay within their claims.
+    """After a jump of the gyro bias, the errors of attitude, rate and bias stay within their uncertainties.
 
     The gyro alone cannot show whether the bias or the rate has changed.
     """

@@ -35,7 +35,7 @@ BLINK = 0.05
 
 @dataclass
 class Chase:
-    """A simulated rigid body in the magnetic field. Plans are available at once, and sightings are simulated.
+    """A simulated rigid body in the magnetic field, with simulated sightings and plans without delay.
 
     The object starts at `begin` deg from the boresight and moves at `rate` deg/s in the direction `across`.
     """

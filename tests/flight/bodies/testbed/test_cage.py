@@ -99,7 +99,7 @@ class _Fixed:
 def test_two_coils_make_the_torque_of_one_coil_in_any_field_with_less_current(
     config: TestbedConfig, direction: float
 ) -> None:
-    """Two coils give the torque that was commanded of coil x, in any field direction and with less current.
+    """Two coils give the commanded torque of coil x in any field, with less current than coil x.
 
     Two coils give a torque even if the field is along body x, where coil x alone gives no torque.
     """

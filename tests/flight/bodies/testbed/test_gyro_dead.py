@@ -105,7 +105,7 @@ def test_an_estimate_that_the_field_with_coils_off_contradicts_is_discarded(curr
         filter_.command((step + 2) * PERIOD_NS, np.zeros(3))
         held.append(feed.accept(reading((step + 5) * PERIOD_NS, turned)).holds)
         step += 6
-    # With driven coils, only every other measurement is made with the coils off.
+    # If the coils are driven, only every second measurement is made with the coils off.
     assert held.index(True) == (8 if current else 4)
     assert angle_about_axis_y(filter_.at(step * PERIOD_NS).quaternion) == pytest.approx(2.5, abs=0.1)
 
