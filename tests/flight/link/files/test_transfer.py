@@ -504,7 +504,7 @@ def test_a_record_that_does_not_fit_on_the_disk_leaves_no_incomplete_file(
 
 
 def test_received_data_is_removed_before_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that is killed in between leaves a record, with which the next start removes the transfer."""
+    """If the process is killed in between, the next start finds the record and removes the transfer."""
     folder, record = Store(tmp_path), Incoming(GROUND, 7)
     folder.save(record)
     folder.part(record).write_bytes(b"data")

@@ -40,7 +40,7 @@ class FiledEnds(BothEnds):
         self.session = FileSession(self.terminal, store, 1, self.up_rate, self.clock.now_ns())
 
     def ask(self, directive: Directive) -> None:
-        """Send a command of the file session."""
+        """Send a directive by the file session."""
         self.session.ask(directive, self.clock.now_ns())
 
     def turn(self, seconds: float = 0.5, answer: object = None) -> None:

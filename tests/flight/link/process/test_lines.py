@@ -1,4 +1,4 @@
-"""Tests of the link's lines with floods, strangers, slow connections, and frames that were not sent."""
+"""Tests of the link's lines: floods, strangers, slow connections, and frames that a line did not send."""
 
 from __future__ import annotations
 

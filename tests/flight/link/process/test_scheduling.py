@@ -1,6 +1,6 @@
 """Tests that scheduled commands run once at their UTC, even after a restart.
 
-Late commands are only reported.
+Late commands are reported and not run.
 """
 
 from __future__ import annotations

@@ -568,7 +568,7 @@ def test_a_stolen_primary_key_cannot_change_the_keys_of_the_reserves(link: BothE
 
 
 def test_a_stolen_primary_key_cannot_begin_a_packet_that_the_reserve_key_ends(link: BothEnds) -> None:
-    """The attacker sends a whole packet as first portion; the operator sends one with the reserve SPI."""
+    """The attacker sends a whole packet as the first portion; the operator's portion has the reserve SPI."""
     whole = directives.pack(NewKey(2, 2, bytes(range(32))), 1)
     first = Portion(2, 1, whole.ljust(72, b"\0"))
     link.terminal.send(directives.pack(first, 1))

@@ -95,7 +95,7 @@ def test_a_budget_below_the_coming_run_and_a_place_that_cannot_be_written_are_cl
 def test_a_full_disk_takes_the_oldest_runs_but_not_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The tested disks have room after two runs were deleted, or only after all runs were deleted."""
+    """The disk has room either after two runs were deleted, or only after all runs were deleted."""
     for _ in range(4):
         fill(begin_run(tmp_path, 10_000, 100).folder, 300)
 
