@@ -137,7 +137,7 @@ def test_a_suspicion_of_coils_at_zero_ends_if_no_probe_is_applied() -> None:
 
 
 def _alone(axis: int, current: float) -> Predicted:
-    """Return a sample of the supply current (A) while only one axis is commanded, to 40 mA."""
+    """Return a sample of the supply current (A) while only one axis is commanded, with 40 mA."""
     commands = np.zeros((12, 3))
     commands[:, axis] = 0.04
     return predict(current, commands, BOUNDS, NEWEST)

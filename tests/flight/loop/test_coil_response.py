@@ -1,4 +1,4 @@
-"""Tests of the coil gains estimated from the motion, with stalls of the loop, and on a free body."""
+"""Tests of the coil gains estimated from the motion, including stalls of the loop and a free body."""
 
 from __future__ import annotations
 
@@ -531,7 +531,7 @@ def _point_in_dense_air(
 ) -> tuple[dict[Finding, int], FloatArray]:
     """Simulate coils with the given `gains`, which hold an attitude for 150 s against a varying torque.
 
-    Returns how many fits had each finding on how many axes, and the errors of the gains in standard
+    Returns for each finding how often a fit had it on an axis, and the errors of the gains in standard
     deviations.
     """
     settings = ResponseSettings(

@@ -72,8 +72,8 @@ PERSISTENCE = {
 """For each fact (a monitored condition): numbers of updates until it becomes true and until it ends, and
 modes.
 
-The second number is None if a true fact never ends. `modes` are the modes in which the fact is monitored; an
-empty string means all modes.
+The second number is None if the fact, once true, never ends. `modes` are the modes in which the fact is
+monitored; an empty string means all modes.
 
 All other facts become true and end immediately, and are monitored in all modes.
 """

@@ -32,7 +32,7 @@ class Group:
 
 
 class Bench:
-    """The health task with test doubles that record the calls. All cycles of the groups complete."""
+    """The health task with test doubles that record the calls. All cycles of the groups are completed."""
 
     def __init__(self, power: bool = True) -> None:
         self.reports: list[tuple[str, str]] = []
