@@ -1,4 +1,4 @@
-"""Tests of the open devices of a bring-up session, and of the identification of chips and serial devices."""
+"""Tests that a bring-up session opens its devices, and recognises chips and serial devices."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def bench(
 
 
 def dark(change: Callable[[Image], Image] = lambda pixels: pixels, **values: Any) -> tuple[Image, ...]:
-    """Return three dark frames with different noise, each of which is changed."""
+    """Return three dark frames with different noise, to each of which `change` is applied."""
     return tuple(change(noisy(seed=seed, **values)) for seed in (1, 2, 3))
 
 

@@ -359,7 +359,7 @@ def test_a_guardian_that_dies_is_replaced_and_reported_once() -> None:
 
 
 def test_coils_of_a_body_that_moves_are_not_judged() -> None:
-    """A body that swings by 30 deg changes the measured field more than 10 % of a coil's field."""
+    """A body that swings by 30 deg changes the measured field by more than 10 % of a coil's field."""
     found = step_coils(Bench(swing=np.radians(30.0)).session)
     assert named(found.findings) == ["coils moved"]
     assert "rotated by" in found.findings[0].text

@@ -1,4 +1,4 @@
-"""Tests of the commands `elements`, whose elements `knightcube check` accepts, `passes` and `day`."""
+"""Tests of the commands `elements`, `passes` and `day`; `knightcube check` accepts the made elements."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_a_number_of_nodes_of_0_is_refused() -> None:
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_target_behind_the_earth_is_named(side: float) -> None:
-    """The target is below the satellite at the end of the slew, or on the opposite side of the Earth."""
+    """The target is the point below the satellite at the end of the slew, or the antipode of this point."""
     elements = as_orbit(load(config_path("orbit"))).elements
     assert elements is not None
     scale = skyfield.load.timescale(builtin=True)
