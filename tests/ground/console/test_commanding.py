@@ -33,7 +33,7 @@ from tests.support.places import ROOT
 class Satellite:
     """Both ends of a link.
 
-    The ground end is a feed. Each update of the feed runs one cycle of the satellite's end.
+    The ground end is a `LinkFeed`. Each update of the feed runs one cycle of the satellite's end.
     """
 
     def __init__(self, ends: BothEnds, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,7 +212,7 @@ def _rest(line: socket.socket) -> bytes:
 def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
     """An authorised request is accepted.
 
-    So the requests in the other tests are refused because of their sender.
+    This shows that the requests in the other tests are refused because of their sender.
     """
     with socket.create_connection(("127.0.0.1", ground.gateway), PATIENCE_S) as line:
         line.sendall(token_path(ground.keys, ground.gateway).read_bytes() + SAFE)
@@ -341,7 +341,7 @@ def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, con
 
 @pytest.mark.slow
 def test_a_page_whose_name_is_rebound_to_loopback_is_not_obeyed(ground: Ground, context: Any) -> None:
-    """A page whose name is rebound to the console's port is refused, although it may read all responses."""
+    """A page whose name is rebound to loopback can read all responses, but its requests are refused."""
     origin = f"http://evil.example:{ground.console}/start"
     context.route(origin, lambda route: route.fulfill(content_type="text/html", body="<!doctype html>"))
     found = _attacked(ground, context, origin, "evil.example")
