@@ -18,7 +18,7 @@ from tests.scenario.mode_flights import released
 from tests.support.flights import Rigged, config_for, demo_config, demo_world, event_names, fly
 
 BEGIN, END, DURATION, LONG = 2.0, 5.0, 8.0, 12.0
-"""Start and end (s) of a fault; duration (s) of a flight, and of a flight that returns to its target."""
+"""Start and end (s) of a fault, and durations (s) of a short flight and of a flight back to its target."""
 AT_TARGET = released(-0.3, 0.0)
 """World in which the body starts at rest at its target; the suspension thread alone would rotate it by 6 deg
 in 6 s."""

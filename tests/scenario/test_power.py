@@ -1,4 +1,4 @@
-"""Tests that loads are shed while a much too small battery is low, and restored after sunrise."""
+"""Tests that loads are shed when a small battery is low, and restored after sunrise."""
 
 from __future__ import annotations
 

@@ -70,8 +70,7 @@ def test_no_coil_switches_during_an_exposure_of_a_slew(flown: Run) -> None:
     for frame in frames:
         begin = int(frame["exposure_start_ns"])
         end = begin + round(float(frame["exposure"]) * 1e9)
-        # An exposure may end when the dipole changes, and a packet of this instant already has the new
-        # dipole.
+        # If an exposure ends at a change of the dipole, the packet of this instant has the new dipole.
         assert not ((after - 100_000_000 >= begin) & (after < end)).any()
 
 

@@ -121,7 +121,7 @@ def test_a_distorted_lens_that_the_configuration_describes_is_corrected(tmp_path
     assert_solved(run)
     assert run["stars"]["accepted"].all()
     error, _ = star_errors(run)
-    # The coil's torque changes within an exposure, about y; about the other axes the body rests.
+    # The coil's torque about y changes within an exposure; the body does not rotate about the other axes.
     assert np.abs(error[:, [0, 2]]).max() < 0.15 / 2900.0
     streaks = run["streak"][run["streak"]["status"] == b"rate"]
     assert len(streaks) == 2

@@ -90,7 +90,7 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
 
 
 def may_have_any(text: str) -> bool:
-    """Return whether a text may contain a refused phrase. Most texts contain none.
+    """Return whether a text may contain a refused phrase.
 
     Code is searched like text, so a result of True must be confirmed by an exact search.
     """
