@@ -378,7 +378,7 @@ def test_the_noise_of_the_solar_strings_has_the_configured_standard_deviation(in
 
 @pytest.mark.parametrize("altitude", [350e3, 550e3, 1200e3])
 def test_the_light_of_the_ground_changes_by_less_than_a_part_in_5000_over_100_m(altitude: float) -> None:
-    """The simulation rounds the distance to 100 m, so the rounding errs by half of this change."""
+    """The simulation rounds the distance to 100 m, so the rounding error is at most half of this change."""
     model = SolarCellsModel(np.concatenate([np.eye(3), -np.eye(3)]), np.ones(6), np.zeros(6), noise=0.0)
     rng = np.random.default_rng(3)
     for _ in range(20):

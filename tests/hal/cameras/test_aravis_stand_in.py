@@ -275,7 +275,7 @@ def test_a_camera_that_cannot_be_set_up_is_refused(
 
 
 def test_the_bounds_of_gain_and_exposure_are_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    Rig(monkeypatch, {}, gain_error=0.2).driver.open()  # the steps of this camera are wide
+    Rig(monkeypatch, {}, gain_error=0.2).driver.open()  # the gain of this camera has wide steps
     for gain, exposure in ((24.0, 10_000), (0.0, 2_000_000_000)):
         Rig(monkeypatch, {"gain": gain, "exposure_ns": exposure}).driver.open()
     Rig(monkeypatch, {"columns": 1001, "rows": 803}, steps=(1, 1)).driver.open()

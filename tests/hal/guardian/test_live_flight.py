@@ -85,7 +85,7 @@ def test_a_death_is_seen_at_once_and_a_hang_when_the_line_fills_up(
     def seen(campaign: Campaign) -> float:
         events = campaign.truth.run["event"]
         reported = events["time_ns"][events["name"] == b"guardian-lost"] + campaign.truth.epoch_ns
-        # On a busy machine, a new guardian can be replaced too, because it does not read its line yet.
+        # On a busy machine, a new guardian that does not read its line yet can be replaced as well.
         lost = campaign.guardian_lost_ns[number]
         return float((reported[reported > lost] - lost).min(initial=np.iinfo(np.int64).max)) * 1e-9
 

@@ -321,8 +321,7 @@ def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limit
 def test_noisy_stars_give_the_attitude_of_the_q_method_within_its_uncertainty() -> None:
     """The attitude of noisy stars agrees with the q method within its uncertainty.
 
-    In the image plane, the weight of stars at the edge of a 20 deg field is up to 1.06 times their usual
-    weight.
+    In the image plane, stars at the edge of a 20 deg field have up to 1.06 times their usual weight.
     """
     for seed in range(10):
         observed, reference, _ = _stars(100 + seed, SIGMA)

@@ -422,7 +422,7 @@ def test_an_attitude_follows_from_the_rings_of_defocused_stars(
     assert solution is not None
     assert solution.fix is not None
     error = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(attitude)))
-    assert error @ np.linalg.solve(solution.fix.covariance, error) < 16.3  # 99.9 %, 3 degrees of freedom
+    assert error @ np.linalg.solve(solution.fix.covariance, error) < 16.3  # 99.9 % of chi-square(3)
     matched = solution.matched
     assert len(matched) >= 10
     off = solution.points[matched] - solution.expected[matched]

@@ -133,7 +133,7 @@ def test_configured_structure_stays_hidden() -> None:
 
 
 def test_a_lit_panel_hides_no_limb_with_its_mask_and_makes_none_alone() -> None:
-    """A lit panel with a mask does not prevent the fit of the limb, and is not fitted as a horizon itself.
+    """A masked lit panel does not prevent the fit of the limb, and is not fitted as a horizon itself.
 
     The panel covers a sixth of the frame, on sky, limb and ground.
     """

@@ -94,7 +94,7 @@ def test_the_coarse_sun_of_solar_strings_is_as_recorded() -> None:
 
 
 def matched(lens: Lens, count: int, wrong: float) -> list[MatchedFrame]:
-    """Return frames of matched stars. A fraction of the matches is wrong."""
+    """Return frames of matched stars. The fraction `wrong` of the matches is wrong."""
     rng = np.random.default_rng(24)
     frames = []
     for _ in range(count):

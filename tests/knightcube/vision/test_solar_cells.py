@@ -196,7 +196,7 @@ def test_the_camera_that_has_the_sun_is_read_first() -> None:
 
 
 def test_a_sun_between_two_fields_is_possible_in_the_nearest_only() -> None:
-    """If the Sun is between two fields of view, only the nearest camera may show it.
+    """If the Sun is between two fields of view, only the nearest camera counts as a possible one.
 
     The Sun is 2 deg beyond the edge of a field of view, and the coarse Sun has an error of 3 deg.
     """

@@ -334,7 +334,7 @@ def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(monkeypatch: p
     solution = tracker.solve(image)
     assert solution, "the sums of 3 x 3 px leave two pixels at each side"
     error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))
-    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # 99.9 %, 3 degrees of freedom
+    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # 99.9 % of chi-square(3)
     assert solution.sky_map is not None
     places = solution.sky_map.pixels(solution.stars.directions)
     np.testing.assert_allclose(places, solution.stars.points - solution.stars.residuals, atol=1e-6)

@@ -179,7 +179,7 @@ def test_glare_that_is_brighter_on_one_side_increases_the_covariance(share: floa
 def test_the_sun_is_found_in_the_corners_of_a_field_of_92_deg() -> None:
     """The Sun is found in the corners of a field of 92 deg.
 
-    In the corners, a pinhole widens the disc to 1.7 times its width, but not the blur around the disc.
+    In the corners, a pinhole projection widens the disc to 1.7 times its width, but not the blur around it.
     """
     model = wide_model(WideCamera(columns=512, rows=512, field_of_view_deg=92.0))
     for number, (x, y) in enumerate(
@@ -559,7 +559,7 @@ def test_distances_from_a_circle_have_their_derivatives() -> None:
 
 
 def _disc(radius_deg: float, used: int, points: int, endless: int, residual_px: float, stretch: float) -> str:
-    """Return the flaw of a disc on a camera with a scale of 700 px/rad and a stretched second axis."""
+    """Return what is wrong with a disc in a camera of 700 px/rad whose second axis is stretched."""
     scale = np.diag([700.0, 700.0 * stretch])
     per_radian = 700.0 * np.sqrt(stretch)
     mask = np.arange(points) < used

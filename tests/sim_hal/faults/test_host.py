@@ -148,7 +148,7 @@ def test_without_faults_of_the_host_its_parts_are_unchanged() -> None:
     assert faults.jobs(runner, specs, JobResult) is runner
     assert faults.workers(specs) == specs
     assert faults.clock() is clock
-    assert faults.opener(open) is open  # any other function would do
+    assert faults.opener(open) is open  # any function would do
 
 
 def test_a_corrupted_configuration_is_refused_in_one_line_or_still_a_valid_one() -> None:

@@ -216,7 +216,7 @@ def test_a_moving_source_streaks_while_the_stars_stand_still() -> None:
 
 
 def test_a_source_that_the_camera_follows_is_a_point() -> None:
-    """An object that the camera follows is a point. The stars are streaks."""
+    """The image of an object that the camera follows is a point. The stars are streaks."""
     times, attitudes = turning([0.0, 60.0 / FOCAL, 0.0], samples=101)
     boresights = quaternion.attitude_matrix(attitudes)[:, 2]
     nothing = np.zeros((0, 3))

@@ -84,7 +84,7 @@ def test_one_coil_under_constant_current_keeps_the_energy_of_a_dipole_in_a_field
 def test_the_torque_is_the_cross_product_of_dipole_and_field(angle: float) -> None:
     """The torque is the cross product of dipole and field.
 
-    The motion from rest over one second is compared with m x B, by the attitude matrix.
+    The rate 1 ms after the start from rest is compared with m x B, where B is in body axes.
     """
     current = np.array([0.07, 0.05, -0.03])
     world = bed(current, angle=angle)
@@ -132,7 +132,7 @@ def test_the_measured_field_is_that_of_76_turns() -> None:
 
 
 def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
-    """The field of the thesis takes 0.99 A in the coils of the testbed.
+    """The field of the thesis requires 0.99 A in the coils of the testbed.
 
     The thesis states 4.5 gauss, "approximately 9 times Earth's ambient magnetic field strength".
     """

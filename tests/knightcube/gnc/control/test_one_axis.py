@@ -143,7 +143,7 @@ def test_an_error_beyond_one_radian_is_treated_as_one_radian(error: float, is_he
 
 @pytest.mark.parametrize("strength", [0.02, 0.4])
 def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reach(strength: float) -> None:
-    """Each manoeuvre ends at rest and stays within its reach. The motion is integrated exactly."""
+    """Each manoeuvre ends at rest and stays within its stated reach. The motion is integrated exactly."""
     made = manoeuvres(strength, 0.2, 3.0)
     assert len(made) == 4
     extremes = []

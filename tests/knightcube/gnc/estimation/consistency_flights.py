@@ -287,7 +287,7 @@ def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
 
 
 def _free_errors(suspended: bool) -> IntArray:
-    """Return the indices of the 15 error states of the filter that can differ from zero in the world."""
+    """Return the indices of the 15 error states that can be non-zero in this simulated world."""
     return np.array([1, 4, 7, 10, 12, 13, 14]) if suspended else np.array([*range(12), 14])
 
 

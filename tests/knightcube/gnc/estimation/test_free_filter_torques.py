@@ -92,8 +92,8 @@ def fly(
 ) -> None:
     """Simulate a body with a gyro mean every second, and star attitudes every ten seconds.
 
-    The true dipole of each coil deviates from the command by the standard deviation `variation`. The
-    deviation changes after `every` seconds.
+    The true dipole of each coil deviates from the command by the standard deviation `variation`. A new
+    deviation is drawn at intervals of `every` s.
     """
     true = dipole
     for second in range(1, seconds + 1):

@@ -34,7 +34,7 @@ def test_the_heat_of_a_steady_current_is_the_supply_power_times_the_duty_cycle()
 
 
 def test_each_coil_has_its_own_resistance() -> None:
-    """Each coil has its own resistance: 0.1 A in 20 ohm and 0.2 A in 10 ohm, at two times."""
+    """Each coil has its own resistance. Coils of 20 and 10 ohm carry given currents at two times."""
     current = np.array([[0.1, 0.2], [-0.1, 0.0]])
     np.testing.assert_allclose(steady_heat(current, np.array([20.0, 10.0])), [[0.2, 0.4], [0.2, 0.0]])
 

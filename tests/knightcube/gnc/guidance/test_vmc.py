@@ -383,7 +383,7 @@ def test_a_cost_of_time_gives_the_horizon_of_the_closed_form(angle: float, price
 
 
 def test_no_other_horizon_has_a_smaller_total_cost() -> None:
-    """No other duration has a smaller sum of energy and time cost, by the collocation oracle."""
+    """The collocation oracle finds no duration with a smaller sum of energy and time cost."""
     price = 0.2
     for problem, _ in feasible_problems(10, seed=3):
         found = problem.planned(time_cost=price)

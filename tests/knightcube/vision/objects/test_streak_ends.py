@@ -350,7 +350,7 @@ def test_long_regions_inside_the_frame_are_candidates_the_strongest_first() -> N
 def test_streaks_have_their_two_ends(centre_of: str) -> None:
     """The two corners of a region are the ends of its streak.
 
-    The corners are up to 2 px inside the streak if the frame is the image of the centre of intensity.
+    The corners are up to 2 px inside the streak if they are centres of the image instead of the response.
     """
     settings = EndpointSettings(gain=2.0, centre_of=centre_of)  # type: ignore[arg-type]  # one of two words
     segmented = segment_frame(_frame().astype(np.uint16), settings)

@@ -248,7 +248,7 @@ def test_equal_errors_of_bright_and_faint_stars_are_in_the_covariance(scatter: b
         off += float(np.sum(error[:2] ** 2))
         ideal += float(np.sum(_error(_fit(seen, covariance + 0.05**2 * np.eye(2), reference))[:2] ** 2))
     # Some of the brightest stars are rejected, so the variance of the remaining stars is slightly too small.
-    # Without `scatter`, an excess that is not significant is not added either.
+    # Without `scatter`, an excess is added only if it is significant.
     assert known / (3.0 * _TRIALS) < (2.3 if scatter else 2.5)
     assert off < 1.5 * ideal
 

@@ -218,7 +218,7 @@ def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
 
 @pytest.mark.parametrize(("field_deg", "known_deg"), [(12.0, 0.1), (28.0, None)])
 def test_the_covariance_is_honest(field_deg: float, known_deg: float | None) -> None:
-    """The mean of the normalised squared error is 3, as of a chi-square with three degrees of freedom.
+    """The mean of the normalised squared error is 3, as for a chi-square with three degrees of freedom.
 
     If the field of view is unknown, the given standard deviations refer to the assumed field of 17 deg.
     """

@@ -350,7 +350,7 @@ def test_the_mismatch_of_the_psf_is_the_median_over_the_stars() -> None:
 
 
 def test_stars_in_reach_of_a_window_are_neighbours() -> None:
-    """A neighbour is within the half-width of the window and three standard deviations of the PSF."""
+    """A neighbour is nearer than the half-width of the window plus three standard deviations of the PSF."""
     points = np.array([[10.0, 10.0], [17.9, 10.0], [10.0, 18.1], [11.5, 12.0], [9.0, 9.0]])
     flux = np.array([5.0, 4.0, 3.0, 2.0, 0.0])
     pairs = neighbours(points, flux, 1.0, 5)

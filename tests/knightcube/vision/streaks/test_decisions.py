@@ -186,7 +186,7 @@ def test_a_prior_rate_decides_on_the_sign_of_the_rotation() -> None:
         assert found.status is StreakStatus.RATE
         assert found.rate == pytest.approx([expected, 0.0, 0.0])
         assert asked == [np.sign(prior)]
-    # A prior rate that is not significant does not decide.
+    # A prior rate that is not significant does not decide the sense of the rotation.
     assert _rolling(ahead, back, np.array([0.05, 0.0, 0.0]), 1.0)[1] == [1.0, -1.0]
     failed = _candidate(None, [0.0])
     found, asked = _rolling(failed, back, np.array([0.05, 0.0, 0.0]))
@@ -234,7 +234,7 @@ _LIGHT = np.array([6000.0, 5000.0, 3000.0, 2500.0, 6.0])
 
 
 def _fit() -> StreakFit:
-    """Return a fit of five stars, of which the fourth is on the third, and the fifth is not significant."""
+    """Return a fit of five stars, of which the fourth is near the third, and the fifth not significant."""
     rng = np.random.default_rng(3)
     root = (
         rng.normal(size=(5, SHARED + ALONE, 30)) * np.array([3e3] * 6 + [90.0, 30.0, 20.0, 0.1, 1.0])[:, None]
@@ -318,7 +318,7 @@ def _moved(result: MotionResult, stars: list[int], place: float) -> MotionResult
     """Return the result with the leftmost end of some streaks moved to the column `place`."""
     moved = result.stars.copy()
     for _ in range(5):
-        # The point-spread width is 1.1 px, so that an end is visible from the column 1.7 on.
+        # The point-spread width is 1.1 px, so that an end is visible at column 1.7 or more.
         first = positions(_PINHOLE, _MOTION, moved, np.full(len(moved), -0.5))
         last = positions(_PINHOLE, _MOTION, moved, np.full(len(moved), 0.5))
         moved[stars, 0] += place - np.minimum(first, last)[stars, 0]
@@ -448,7 +448,7 @@ def _searched(
     misfit: float = 1.0,
     disturbed: dict[float, tuple[float, bool, float]] | None = None,
 ) -> list[float]:
-    """Return the angles of the preliminary fits for guesses with given chi-square, conviction and angle.
+    """Return the angles of the first fits for guesses given as (chi-square, is convincing, angle).
 
     The keys of `disturbed` are the angles of the fits whose residuals may show a vibration, and its values
     are the fits with a vibration.

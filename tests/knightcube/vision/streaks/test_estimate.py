@@ -602,7 +602,7 @@ def test_the_distortion_of_a_lens_is_corrected(lens: Lens) -> None:
 
 @pytest.mark.parametrize("error", [-0.03, 0.02])
 def test_a_stated_error_of_the_focal_length_is_part_of_the_covariance(error: float) -> None:
-    """A rate is not refused for an uncertainty that the covariance includes."""
+    """An uncertainty that the covariance includes does not lead to the refusal of a rate."""
     scene = real_sky(60, 1.1, 60.0, 0.5)
     pinhole = replace(CAMERA.pinhole, focal_length=CAMERA.pinhole.focal_length * (1.0 + error))
     settings = LikelihoodSettings(saturation=SATURATION, knowledge=CameraKnowledge(focal_length=0.03))

@@ -270,7 +270,7 @@ def test_faint_stars_are_found_with_position_and_flux(way: float) -> None:
     length = np.linalg.norm(
         np.diff(paths(_SMALL, motion, stars[[2, 2]], np.array([-0.5, 0.5])).position, axis=0)
     )
-    # The streak's flux within three rows, in a window of three rows with the noise of 3 counts per pixel.
+    # The streak's flux within three rows, divided by the noise of these rows at 3 counts per pixel.
     expected = 0.83 * 4000.0 / (3.0 * np.sqrt(3.0 * length))
     assert found.significance[0] == pytest.approx(expected, rel=0.25)
     alone = _faint_frame(stars[2:3], electrons[2:3], motion) - np.random.default_rng(2).normal(

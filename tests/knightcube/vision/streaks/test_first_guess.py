@@ -259,7 +259,7 @@ def test_a_longer_region_contradicts_an_angle_by_its_flux() -> None:
     assert angles[0][0] == pytest.approx(0.05, rel=0.05)
     assert angles[0][1] == pytest.approx(mixed.flux[4] / mixed.flux.sum())
     assert any(abs(angle - 0.11) < 0.005 and against == 0.0 for angle, against in angles)
-    # If all regions are truncated, the longest is a lower limit.
+    # If all regions are truncated, the angle of the longest region is a lower limit.
     truncated = replace(mixed, cut=np.ones(7, dtype=np.bool_))
     (limit, against), *others = first_guess._angles(guess, truncated)
     assert not others

@@ -75,7 +75,7 @@ def test_windows_have_the_values_of_the_frame_and_the_pixels_that_stars_share() 
     assert np.array_equal(view.signal[inside], frame.signal[index][inside])
     assert np.array_equal(view.floor[inside], frame.floor[index][inside])
     assert view.gain == frame.gain
-    # The level at which a pixel saturates is given above its background.
+    # The level at which a pixel saturates is relative to its background.
     level = 4000.0 - (frame.counts.astype(float) - frame.signal)
     assert view.ceiling[inside] == pytest.approx(level[index][inside], abs=0.01)
     hot = index == 30 * 150 + 50

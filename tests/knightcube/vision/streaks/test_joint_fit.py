@@ -148,7 +148,7 @@ def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.Mon
 
 
 def test_a_step_without_rejected_stars_needs_no_further_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first step from known normal equations without some stars is that of a fit without these stars."""
+    """If known equations omit some stars, the first step is that of a fit without these stars."""
     camera, scene = _taken(1.1, 60.0)
     once = replace(ROUGH, rounds=1)
     rough = iterate(camera, scene, camera.free, once)

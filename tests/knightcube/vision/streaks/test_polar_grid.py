@@ -59,7 +59,7 @@ def test_a_polar_grid_consists_of_circles_about_the_rotation_axis() -> None:
         polar = np.arccos(seen @ axis)
         assert polar == pytest.approx(np.interp(row, np.arange(len(grid.polar)), grid.polar))
         assert grid.speed == pytest.approx(np.sin(grid.polar) * pinhole.focal_length)
-        # One sample further along its circle, a star has rotated by the angle between two samples.
+        # At the next sample of its circle, a star has rotated by the angle between two samples.
         turned = pinhole.unit_vectors(grid.pixels(pinhole, row, column + 1.0))
         step = grid.azimuth[1] - grid.azimuth[0]
         normal = seen - (seen @ axis)[:, None] * axis

@@ -492,7 +492,7 @@ def test_a_displacement_is_the_root_of_the_excess_chi_square_per_information() -
 def _streaked(share: float, length: float, flux: float) -> tuple[FitProblem, StreakScene]:
     """Return a frame with the streak of a motion that reverses, and the fitted motion from rest.
 
-    The star is at the point of rest `share` times as long before the end of the exposure as after its start.
+    The exposure lasts from -`share` to 1, in a time that is 0 when the star is at the point of rest.
     """
     pinhole = replace(CAMERA.pinhole, columns=160, rows=90)
     image = np.random.default_rng(3).normal(100.0, 3.0, (90, 160))

@@ -367,8 +367,8 @@ def test_a_displacement_of_all_stars_is_a_common_motion(shift: float) -> None:
 def test_residuals_at_equal_times_are_a_common_motion(across: float, along: float) -> None:
     """Displacements across all streaks, and changes of their brightness, are measured as rms values.
 
-    The streaks of twelve stars are along rows. The residuals are those of a displacement, in px, or of a
-    relative change of the brightness, that is a sine of the time.
+    The streaks of twelve stars are along rows. The residuals are those of a displacement (px) or of a
+    relative change of brightness, which is a sine of the time.
     """
     rng = np.random.default_rng(6)
     pinhole, n, blocks = Pinhole(400, 300, 1200.0), 12, 6
