@@ -254,7 +254,7 @@ def test_the_configuration_by_values_is_what_another_author_reads(port: int, nam
 
 
 def settings_of(message: Any) -> dict[str, Any]:
-    """Return the settings of a CFG-VALSET message by their names in the interface description."""
+    """Return the settings of a CFG-VALSET message, named as in the interface description."""
     return {name: value for name, value in vars(message).items() if name.startswith("CFG_")}
 
 

@@ -139,7 +139,7 @@ def test_the_compiled_interpolation_between_blocks_equals_that_in_numpy(blocks: 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_the_compiled_samples_of_blocks_equal_those_in_numpy(dtype: type[np.number[Any]]) -> None:
-    """The samples are the pixels minus the interpolated level of larger blocks, if it is given."""
+    """The samples are the pixels, from which the level of larger blocks, if given, is subtracted."""
     draw = np.random.default_rng(7)
     pixels, coarse = draw.integers(80, 120, (67, 131)).astype(dtype), draw.uniform(90.0, 110.0, (2, 3))
     assert_forms_agree(_samples, pixels, 4, 8, 2, 4, coarse, relative=1e-6)

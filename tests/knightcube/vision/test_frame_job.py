@@ -212,7 +212,7 @@ def _small_job(**changed: Any) -> FrameJob:
 
 
 def test_short_streaks_are_predicted_with_the_uncertainty_of_the_rate() -> None:
-    """The longest predicted streak is that of the rate plus its standard deviations."""
+    """The longest predicted streak is that of the rate plus PRIOR_SIGMAS standard deviations."""
     longest = (0.005 + PRIOR_SIGMAS * 1e-3) * 0.2 * 1000.0
     assert frame_job._predicted_within(_small_job(), 1.01 * longest)
     assert not frame_job._predicted_within(_small_job(), 0.99 * longest)

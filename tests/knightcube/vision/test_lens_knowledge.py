@@ -350,7 +350,7 @@ def _matched(lens: Lens, count: int, seed: int, late: bool) -> tuple[MatchedFram
 
 @pytest.mark.parametrize("late", [False, True])
 def test_a_step_of_the_calibration_solves_the_equations_of_lens_and_attitudes(late: bool) -> None:
-    """The step is that of dense equations with numerical derivatives by all lens parameters and rotations.
+    """The step solves dense equations with numerical derivatives by all lens parameters and rotations.
 
     The information about the lens is that after elimination of the rotations.
     """

@@ -65,7 +65,7 @@ def test_a_tracker_that_learns_its_lens_has_the_same_axes_in_all_images() -> Non
     """The attitudes are in the axes of the given camera, and not in those of the estimated lens.
 
     The axis of the estimated lens moves by up to 1 px (42 arcsec) between images. The optical axis of the
-    second camera is 2 px beside that of the given camera, which rotates all attitudes by the same angle.
+    second camera is 2 px from that of the given camera, so all attitudes are rotated by the same angle.
     """
     columns, rows, f = NARROW.pinhole.columns, NARROW.pinhole.rows, NARROW.pinhole.focal_length
     x, y = NARROW.pinhole.centre

@@ -95,8 +95,8 @@ def random_sun_scene(
 ) -> EarthScene:
     """Return a scene with the whole Sun at a random pixel, at least `margin` px inside the edge.
 
-    If `margin` is negative, the Sun may be outside of the frame by this number of pixels. Raises RuntimeError
-    if no scene is found.
+    If `margin` is negative, the Sun may be outside the frame by this number of pixels. Raises RuntimeError if
+    no scene is found.
     """
     for _ in range(_MOST_DRAWS):
         size = np.array([model.columns, model.rows])

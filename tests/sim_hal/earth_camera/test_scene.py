@@ -116,10 +116,10 @@ def test_light_above_the_limb_falls_by_e_for_each_scale_height() -> None:
 
 
 def test_the_terminator_lies_where_the_sun_is_on_the_horizon() -> None:
-    """The terminator is where the Sun is on the horizon.
+    """The terminator is the line on which the Sun is on the horizon.
 
-    Relative to the sea below the Sun, the day side is brighter than a tenth, and the night side is darker
-    than a hundredth.
+    The day side is brighter than a tenth of the sea below the Sun, and the night side is darker than a
+    hundredth of it.
     """
     scene = _nadir_scene(np.array([0.0, 1.0, 0.0]), 2000e3)
     light, cosine = expected_radiance(QUIET, scene), _solar_cosines(scene)
@@ -337,8 +337,7 @@ def test_a_camera_inside_the_earth_and_values_that_are_not_finite_are_refused() 
 def test_no_ray_below_the_top_of_the_air_is_left_out(altitude: float) -> None:
     """No ray below the top of the atmosphere is omitted.
 
-    The rays are from all over the sphere, and many are within a tenth of a degree of the top of the
-    atmosphere.
+    The rays are in all directions, and many are within a tenth of a degree of the top of the atmosphere.
     """
     generator = np.random.default_rng(8)
     for _ in range(5):

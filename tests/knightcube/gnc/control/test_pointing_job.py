@@ -194,7 +194,7 @@ def rest_of(table: PointingTable, since: float, q: FloatArray, w: FloatArray) ->
 def test_the_rest_of_a_slew_begins_where_the_body_will_be_and_arrives_at_the_same_time(
     table: PointingTable,
 ) -> None:
-    """The new plan begins where the body will be after `LEAD` s, and ends at the time of the current path.
+    """The new plan begins at the state after `LEAD` s and ends at the same time as the current path.
 
     The body is 0.04 deg away from its current path.
     """

@@ -12,8 +12,8 @@ rate over 1 s with a full covariance if the stars are streaks, and on the free b
 camera's results are delayed by 0.2 to 0.6 s.
 
 NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band follows from the
-chi-square of independent runs. NIS divided by its degrees of freedom has a similar band, over all accepted
-measurements.
+chi-square of independent runs. NIS over all accepted measurements, divided by its degrees of freedom, has a
+similar band.
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def _free_errors(suspended: bool) -> IntArray:
 
 
 def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
-    """Return for each cycle whether the IMU is silent: one interval in each half of the run."""
+    """Return for each cycle whether the IMU is silent. One interval is silent in each half of the run."""
     silent = [False] * (seconds * 40 + 1)
     for half in range(2):
         begin = int(40 * seconds * (0.5 * half + rng.uniform(0.05, 0.4)))

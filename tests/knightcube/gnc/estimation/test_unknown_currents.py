@@ -93,7 +93,7 @@ def test_a_gyro_that_jumps_further_than_any_current_pushes_raises_no_doubt(flown
 
 
 def test_a_jump_of_the_gyro_bias_is_estimated() -> None:
-    """A jump like that of wrong currents makes the bias unknown, and the attitudes determine the new bias."""
+    """A jump as by wrong currents makes the bias unknown; the attitudes then determine the new bias."""
     flown, jump = fly(5, END, suspended=True), np.array([0.0, 2e-3, 0.0])
     filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, bias_start=2e-3))
     follow(filter_, flown, 1, STUCK)

@@ -94,7 +94,7 @@ def test_a_free_roll_keeps_the_roll_that_there_is_and_turns_the_shortest_way(
 def test_a_pass_over_a_ground_target_with_a_free_roll_needs_only_the_rate_of_the_direction(
     aside: float,
 ) -> None:
-    """The body rotates about its pointing axis only as slowly as the Earth's rotation and the pass require.
+    """The body rotates about its pointing axis no faster than the Earth's rotation and the pass require.
 
     If the direction of the ground target passed near the direction from which the roll is measured, a
     constant roll would need a rate many times higher.

@@ -59,7 +59,7 @@ def test_guesses_are_the_same_each_time() -> None:
 
 
 class Model:
-    """A solver of a slew with a known shortest duration, whose heat is that of a scaled rotation.
+    """A solver for a slew whose shortest duration is known, with the heat of a scaled rotation.
 
     The dipoles of a slew of T s are proportional to 1/T^2, and its heat to 1/T^3.
     """

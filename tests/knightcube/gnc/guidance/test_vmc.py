@@ -92,7 +92,7 @@ def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
 
 
 def bang_bang_time(problem: Problem) -> float:
-    """Return the shortest time (s) of a free body, by full torque in one direction and then in the other.
+    """Return the shortest time (s) for a free body, with full torque in one direction and then in the other.
 
     The energy determines the angle at which the torque is reversed, because J w^2/2 changes by the torque
     constant times I times the change of sin(theta). The time is the integral of d(theta)/w. The substitution
@@ -308,7 +308,7 @@ def test_impossible_problems_are_refused_with_the_reason(
 
 @pytest.mark.parametrize("max_stretch", [1.0, 1e3])
 def test_both_ends_of_the_range_of_the_stretch_are_permitted(max_stretch: float) -> None:
-    """The factor by which a duration may be stretched may be 1 (no stretching) or 1000."""
+    """The largest factor by which a duration is stretched can be set to 1 (no stretching) or to 1000."""
     found = plan(KNIGHTCUBE, 0.1, 0.0, 0.2, 0.0, 10.0, max_stretch=max_stretch)
     assert found.horizon == pytest.approx(10.0)
 

@@ -23,8 +23,8 @@ PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hal
 def test_the_number_of_scan_lines_that_cross_a_circle_follows_from_its_extent() -> None:
     """Scan lines cross a circle as often as its extent in x and y predicts.
 
-    A scan line is counted only up to 0.954 of the radius from the centre, where the cosine of the angle
-    between scan line and normal of the circle is 0.3.
+    A scan line is counted only if its distance from the centre is at most 0.954 of the radius. There, the
+    cosine of the angle between the scan line and the normal of the circle is 0.3.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 7200, endpoint=False)
     circle = 256.0 + 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)

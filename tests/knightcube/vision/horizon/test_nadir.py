@@ -632,7 +632,7 @@ def test_an_uncertain_focal_length_is_weighted_by_its_probability(
     """The nadir is the mean over the focal lengths, whose prior and misfit are both normal distributions.
 
     The product of the two distributions has the mean b/(1 + w^2) and the variance w^2/(1 + w^2). The
-    covariance is that of one horizon plus that of the focal length.
+    covariance is the sum of that of one horizon and the contribution of the focal length.
     """
     found = _uncertain(monkeypatch, best, width, lambda _: False).nadir
     assert found is not None
@@ -657,7 +657,7 @@ def test_an_uncertain_focal_length_is_refused_if_most_of_its_probability_is_refu
     most = _uncertain(monkeypatch, 0.8, 0.5, lambda step: step > 0.4)
     assert most.status is HorizonStatus.REFUSED
     assert most.nadir is None
-    # The reason is that of the most probable of the refused focal lengths.
+    # The reason for the refusal is that of the most probable refused focal length.
     assert abs(float(most.reason.removeprefix("refused at ")) - 0.64) < 0.3
 
 

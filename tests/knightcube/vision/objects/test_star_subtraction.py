@@ -123,7 +123,7 @@ def test_the_excess_of_a_patch_is_that_of_chi_square_over_its_expectation() -> N
     expected = np.sum(((400.0 - variance) * patch.weight**2)[:, :10])
     assert patch.excess(left) == pytest.approx(expected)
     assert_forms_agree(star_subtraction._excess, left, patch.signal, patch.weight, patch.mask, _NOISE, 2.0)
-    # The noise of the smoothed image is that of white noise, summed with the squares of the kernel.
+    # The noise of the smoothed image is that of a pixel times the root of the kernel's sum of squares.
     point = np.zeros((31, 31))
     point[15, 15] = 1.0
     kernel = _smoothed(point, 1.0)

@@ -1,4 +1,4 @@
-"""Foregrounds and defects for frames of stars, as in photographs or from a worn sensor.
+"""Foregrounds and defects for star frames, like those in photographs or of a worn sensor.
 
 Each function takes pixels (rows, columns) as floats, the brightness range of the stars in counts, and a
 random generator.

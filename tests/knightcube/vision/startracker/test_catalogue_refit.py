@@ -183,7 +183,7 @@ _COURSE = CameraMotion.steady(np.array([0.0, 0.04, 0.0]))
 
 
 def test_known_stars_are_ordered_by_their_flux_within_the_frame() -> None:
-    """The fraction inside is that of nine instants; stars outside the frame are dropped."""
+    """The fraction inside the frame is computed at nine instants; stars outside the frame are dropped."""
     places = np.array([[100.0, 80.0], [0.0, 80.0], [100.0, 400.0], [60.0, 50.0], [216.0, 30.0]])
     light = np.array([450.0, 900.0, 9000.0, 700.0, 8000.0])
     found = catalogue_refit._Known.seen(_PINHOLE, _COURSE, places, light, 9)

@@ -415,7 +415,7 @@ def test_a_triangle_of_guide_stars_is_found_in_the_index(scale: float) -> None:
 
 
 def test_sides_of_triangles_are_sorted_with_their_opposite_corners() -> None:
-    """The first corner is opposite to the shortest side; the orientation is that of the sorted corners."""
+    """The first corner is opposite to the shortest side; the orientation refers to the sorted corners."""
     field, triangles = spread_field(9), triples(9)
     scales = np.random.default_rng(3).uniform(0.9, 1.15, len(triangles))
     corners, sides, left = lost_in_space._forms(field.direction, triangles, scales)

@@ -355,7 +355,7 @@ def test_an_area_is_a_streak_if_it_is_long_and_thin() -> None:
 
 
 def test_places_among_many_bright_pixels_are_cluttered() -> None:
-    """A block of 32 x 32 px, on either of two grids along each axis, is cluttered by its bright pixels."""
+    """A place is cluttered if its block of 32 x 32 px, on any of the grids, has many bright pixels."""
     row, column = np.mgrid[48:64, 80:96].reshape(2, -1)
     areas = _areas()
     bright = Areas(

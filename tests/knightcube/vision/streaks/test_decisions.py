@@ -255,7 +255,7 @@ def _fit() -> StreakFit:
 
 
 def test_the_result_contains_the_fitted_stars_and_their_streaks() -> None:
-    """The ends of the streaks are those of the motion, with the covariance of motion and star.
+    """The ends of the streaks follow from the motion; their covariance is that of motion and star.
 
     A star on a brighter star, and a star that is not significant, are omitted.
     """

@@ -201,7 +201,7 @@ def test_a_rate_that_begins_or_ends_at_zero_is_fitted(growth: float, length: flo
 def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() -> None:
     """A step within the exposure is fitted with the time profile of the rate from navigation.
 
-    The camera rests for a third of the exposure and then accelerates, which is not linear in time.
+    The camera rests for a third of the exposure and then accelerates, so its rate is not linear in time.
     """
     turn = turn_of(np.radians(70.0), 40.0, 0.9)
     share = 1.0 / 3.0
@@ -587,7 +587,7 @@ def test_one_call_refuses_a_wrong_argument_by_name(given: dict[str, Any], messag
     ids=["off-axis", "barrel", "pixels and tangential"],
 )
 def test_the_distortion_of_a_lens_is_corrected(lens: Lens) -> None:
-    """The covariance is right, and the same as that of a pinhole within a factor of 1.5."""
+    """The rate error agrees with its covariance, and sigma is below 1.5 times that of a pinhole."""
     knowledge = CameraKnowledge(centre=0.1, distortion=1e-4)
     settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0, knowledge=knowledge)
     scene, ideal = (real_sky(61, 1.1, 140.0, 0.5, replace(CAMERA, lens=each)) for each in (lens, None))

@@ -88,7 +88,7 @@ def test_peaks_are_refined_by_a_parabola() -> None:
 
 
 def test_counts_are_subtracted_from_the_sums_of_pixels() -> None:
-    """Sums of 3 x 3 pixels are those of the frame without the subtracted counts, and zero at the border."""
+    """The 3 x 3 sums are those of the frame after subtraction of the counts, and zero at the border."""
     rng = np.random.default_rng(3)
     image = rng.integers(0, 100, (9, 11)).astype(np.float32)
     pixels = np.array([0, 10, 14, 15, 37, 44, 54, 88, 98, 60])

@@ -316,7 +316,7 @@ def test_a_box_is_significant_relative_to_both_its_sides() -> None:
 
 
 def test_variations_along_bright_streaks_are_not_streaks() -> None:
-    """The angle from the whole frame is near that of the streaks, and not that of the variations along them.
+    """The whole frame gives the angle of the streaks, not that of the variations along them.
 
     Without the limit of the samples, the angle is wrong by a factor of eight.
     """

@@ -342,7 +342,7 @@ def test_the_search_is_repeated_if_streak_ends_moved_far() -> None:
 
 
 def test_subtracted_stars_leave_noise_and_their_model_errors() -> None:
-    """The frame without the stars has no streaks, and a larger noise where the stars were."""
+    """The frame without the stars has no streaks, and more noise at the positions of the stars."""
     camera, scene = _small_problem(), _small_scene()
     flat = np.full((100, 120), 100.0)
     windows = camera.windows(scene)

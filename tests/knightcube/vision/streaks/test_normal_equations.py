@@ -67,7 +67,7 @@ _FREE = np.array([True, True, True, False, False, False, True])
 
 @pytest.mark.parametrize("free", [_FREE, np.ones(SHARED, dtype=np.bool_)])
 def test_the_step_solves_the_equations_of_all_parameters(free: BoolArray) -> None:
-    """The step and its covariance are those of the dense equations of all stars.
+    """The step and its covariance agree with the solution of dense equations for all stars.
 
     Parameters that are not fitted do not change. The prior of the sky level is centred on zero.
     """
@@ -223,8 +223,8 @@ def test_equations_without_some_stars_are_those_of_a_scene_that_rejects_them() -
 def test_the_information_is_that_of_numerical_derivatives(growing: bool) -> None:
     """Products of the coupled information matrix equal those of numerical derivatives of the model.
 
-    The derivatives of the model have errors of a few percent, and those with respect to the acceleration of
-    20 %, which do not change the solution.
+    The derivatives of the model have errors of a few per cent, and those by the acceleration of 20 %. These
+    errors do not change the solution.
     """
     scene, windows = _crossing_scene(growing)
     assert len(windows.long) == 4

@@ -584,7 +584,7 @@ def test_a_single_star_has_no_scatter() -> None:
 
 
 def test_the_scatter_of_equally_accurate_stars_is_their_sample_variance() -> None:
-    """The scatter is the variance relative to the noise, reduced by its standard deviation."""
+    """The scatter is the ratio of sample to noise variance, reduced by its standard deviation."""
     values = np.array([-3.0, -2.0, -1.0, -1.0, 0.0, 1.0, 1.0, 2.0, 3.0])
     change = np.stack([10.0 + values, 0.1 * values], axis=1)
     deviation = np.full((9, 2), 0.5)

@@ -152,8 +152,8 @@ def test_the_rate_of_a_resolved_vibration_is_within_its_claim(
 def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() -> None:
     """A vibration that no streak resolves is refused, or the rate error is within its uncertainty.
 
-    The streaks look like streaks with a slightly wider point spread, but their ends are displaced. A
-    tolerance of 5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
+    The streaks look as if the point spread were slightly wider, but their ends are displaced. A tolerance of
+    5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
     """
     for seed in (2, 5, 6):
         frame = _frame(41.0, 0.45, seed)
@@ -191,7 +191,7 @@ def test_functions_of_time_have_their_slopes_and_ends() -> None:
 
 
 def _sums(true: FloatArray, bins: int = 200, noise: float = 0.0) -> vibration._RotationSums:
-    """Return exact normal equations of a rotation given as a function (3, b, 4) of the time in each axis."""
+    """Return exact normal equations of a rotation, given as a function (3, b, 4) of time about each axis."""
     rng = np.random.default_rng(5)
     root = rng.normal(size=(bins, 12, 14)) * 3e4
     information = root @ root.swapaxes(1, 2)
