@@ -2,8 +2,8 @@
 
 `boot` runs `python -m tests.deploy.container FOLDER SCENARIO` in a separate mount namespace, so that the
 mounts are not visible to other programs, and end with the program. The program installs the service by
-`deploy/install.sh` and boots the container. In the container, the unit `scenario` runs the module SCENARIO,
-which writes its observations into FOLDER, and the container is shut down.
+`deploy/install.sh` and boots the container. In the container, the unit `scenario` runs the module SCENARIO.
+The module writes its observations into FOLDER; then the container is shut down.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def main(folder: Path, scenario: str) -> None:
 
 
 def _overlay() -> Path:
-    """Mount an overlay of the machine's files, whose upper layer in memory receives all writes."""
+    """Mount an overlay over the machine's files; its upper layer, in memory, receives all writes."""
     _do("mount", "-t", "tmpfs", "tmpfs", "/mnt")
     for name in ("upper", "work", "root"):
         Path("/mnt", name).mkdir()

@@ -1,4 +1,4 @@
-"""Tests of the installer into an image, without root and systemd, and as a dry run."""
+"""Tests of the installer: into an image, without root and systemd, and as a dry run."""
 
 from __future__ import annotations
 

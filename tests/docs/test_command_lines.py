@@ -106,7 +106,7 @@ def test_commands_in_a_block_without_a_language_are_found() -> None:
 
 
 def test_the_collector_finds_commands_and_their_marks() -> None:
-    """Commands are found in plain blocks and in blocks of lists, without comments, prompts and outputs.
+    """Commands are found in plain blocks and in blocks within lists, without comments, prompts and outputs.
 
     The mark "not run" before a block in a list is found, together with its reason.
     """
