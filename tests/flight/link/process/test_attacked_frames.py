@@ -1,6 +1,6 @@
 """Tests with altered, repeated and reordered telecommand frames near the limits of the frame counter.
 
-The attacker sends a link process, whose next counter is near a limit, 1,000 frames in portions: genuine
+The attacker sends 1,000 frames in portions to a link process whose next counter is near a limit: genuine
 frames in another order, repetitions, damaged frames with a wrong or a correct CRC, joined parts of two
 frames, and authentic frames whose IV of 96 bits is near a limit. The link must not execute a command twice,
 nor a command that the ground did not send. No frame may end the process, and the link must execute the next

@@ -97,7 +97,7 @@ def test_random_damage_costs_the_packets_it_touches_and_invents_none(run: Path, 
 
 
 def test_a_packet_that_is_a_segment_of_a_sequence_is_refused() -> None:
-    """A packet is accepted only if both sequence flags are set, which mark it as complete.
+    """A packet is accepted only if both sequence flags, which mark it as complete, are set.
 
     Packets with other flags are refused even if their CRC is correct.
     """
