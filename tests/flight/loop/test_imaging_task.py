@@ -478,7 +478,7 @@ def test_the_priors_of_a_job_are_those_of_mid_exposure_in_camera_axes() -> None:
 
 
 def solved(count: int = 14, status: SolveStatus = SolveStatus.SOLVED) -> FrameSolution:
-    """Return a solution of the star tracker, with a star fix if solved."""
+    """Return a solution of the star tracker, which contains a star fix only for the status SOLVED."""
     found = FrameSolution(
         status, "", FrameKind.POINTS, CAMERA, points=np.zeros((count, 2)), star=np.arange(count) - 2
     )
