@@ -671,7 +671,7 @@ def test_faults_of_the_power_system_are_named(fault_of: str, expected: list[str]
 
 
 def rail(gain: float) -> Callable[[Session], None]:
-    """Return a fault of the battery monitor, whose measured current is multiplied by `gain`."""
+    """Return a fault by which the battery monitor multiplies its measured current by `gain`."""
 
     def spoil(opened: Session) -> None:
         battery = opened.hand.hardware.power.rails[0]

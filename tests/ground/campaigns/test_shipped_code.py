@@ -1,4 +1,4 @@
-"""Tests of the packages and results of a Dask cluster without Dask: scheduler and workers are objects."""
+"""Tests of the packages and results of a Dask cluster, with test doubles of Dask's scheduler and workers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `knightcube mission-control` without Java, with small programs or objects for Yamcs and flight."""
+"""Tests of `knightcube mission-control` without Java, with test doubles of Yamcs and of the flight."""
 
 from __future__ import annotations
 
