@@ -262,7 +262,7 @@ def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same(
 
 
 def test_the_time_for_a_long_log_grows_with_its_length() -> None:
-    """Four times as many packets, of which each 400 print one line, take less than eight times as long."""
+    """Four times as many packets, with a printed line per 400, take less than eight times as long."""
 
     def processor_time(lines: int) -> float:
         packets = {name: np.zeros(0, layout.dtype) for name, layout in LAYOUTS.items()}

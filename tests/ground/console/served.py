@@ -23,7 +23,7 @@ def asked(
     send: Any = None,
     access: Access | None = None,
 ) -> Any:
-    """Serve a run; return the responses to a client, which is authorised unless `access` differs."""
+    """Serve a run; return the responses to a client, which is authorised by default."""
 
     async def talk(history: History) -> Any:
         place = FlightSurroundings.of(folder / "config.yaml")

@@ -128,7 +128,7 @@ def test_a_missing_answer_has_a_cause(admitted: int, refused: dict[Refusal, int]
     [(1, Stage.COMPLETED, 0), (2, Stage.COMPLETED, 1), (1, Stage.REPEATED, 1)],
 )
 def test_the_counters_are_raised_if_they_may_be_too_low(spi: int, last: Stage, learned: int) -> None:
-    """The link sends its counters once a second, which may be later than the reports on a command."""
+    """The link sends its counters once a second, possibly later than the reports on a command."""
     double = terminal(None, [report(last, spi=spi)])
     commanding.command(double, b"x", spi, 2.0, lambda _: None)
     assert double.learned == learned
