@@ -72,8 +72,8 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Let one worker process run all files whose tests compile functions.
 
-    Numba compiles its own functions, such as that of `np.empty`, again in each process that compiles a
-    function that calls them, which takes some seconds.
+    Some functions of numba, such as that of `np.empty`, are compiled again in each process that compiles a
+    function that calls them. This takes some seconds.
     """
     if config.getoption("dist") != "loadfile":
         return None

@@ -19,7 +19,7 @@ from tests.support.flights import demo_config, demo_world, event_names, fly
 
 
 def flown(folder: Path, q2: float, seconds: float, tracker: StarTrackerSection | None = None) -> Run:
-    """Return a flight with two objects, which slews from q2 = 0.2 to `q2`."""
+    """Return a flight that slews from q2 = 0.2 to `q2`, with two objects."""
     config, world = demo_config(seconds), demo_world()
     assert config.camera is not None
     assert world.release is not None

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 EXEMPT = ("tests/style/test_phrases.py", "tests/studies/same_bytes/renamed_texts.yaml")
-"""This file, and the texts of former versions, which are not checked."""
+"""Files that are not checked: this file, and the texts of former versions."""
 
 REFUSED = {
     r"(?<!there )\b(?:is|are|was|were) no\b(?! (?:longer|more|less|fewer|later|earlier)\b)": "is not a ...",
