@@ -1,4 +1,4 @@
-"""A real-time flight process with emulated devices, which tests stop, hang and kill.
+"""A real-time flight process with emulated devices. The tests stop, hang and kill the process.
 
 The truth log of the devices contains the coil currents. The service manager's end of the notification socket
 receives the message that the flight is ready.
@@ -43,7 +43,7 @@ _MAIN = "raise SystemExit(main())"
 
 
 def write_config(folder: Path) -> Path:
-    """Write the step demonstration without a camera, which starts fast and always drives the coils."""
+    """Write the step demonstration without its camera, so that it starts fast and always drives the coils."""
     text = CONFIG.read_text(encoding="utf-8")
     before, _, rest = text.partition("\ncamera:")
     path = folder / "flight.yaml"

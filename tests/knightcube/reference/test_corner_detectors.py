@@ -55,7 +55,7 @@ def _by_brute_force(patch: FloatArray, neighbours: int) -> float:
 
 
 def test_a_patch_computed_by_hand() -> None:
-    """The response of a patch equals 2/29, which was computed by hand.
+    """The response of a patch equals 2/29, as computed by hand.
 
     The centre is 5, with 1 right, 3 left, 8 below and 6 above, so r_A = 16 + 4 and r_B = 9 + 1. B1 =
     (8-1)(1-5) + (6-3)(3-5) = -34 and B2 = (8-3)(3-5) + (6-1)(1-5) = -30, so B = -34. With C = 20 and A = 10 -

@@ -46,7 +46,7 @@ def environment() -> Iterator[Mapping[str, str]]:
 
 
 def run(environment: Mapping[str, str], script: str) -> str:
-    """Return the output of a Python script, which contains no code for the emulation."""
+    """Return the output of a Python script that contains no code for the emulation."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
@@ -56,7 +56,7 @@ def run(environment: Mapping[str, str], script: str) -> str:
 def test_smbus2_makes_every_transfer(environment: Mapping[str, str]) -> None:
     """smbus2 makes every type of transfer, with the values of the data sheets.
 
-    PRE_SCALE is 0x1E and Config is 0x399F at power-on, which the chip sends big-endian.
+    At power-on, PRE_SCALE is 0x1E and Config is 0x399F, sent with the high byte first.
     """
     said = run(
         environment,

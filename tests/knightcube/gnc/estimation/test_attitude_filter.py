@@ -392,7 +392,7 @@ def test_an_attitude_older_than_the_gyro_sample_is_rotated_to_its_time() -> None
     found = estimate.at(SECOND // 2)
     error = rotation_vector(multiply(found.quaternion, conjugate(from_rotation_vector(0.5 * spin))))
     np.testing.assert_allclose(error, 0.5 * bias, atol=1e-4)
-    # The unknown bias of the gyro is also an error of the attitude.
+    # The unknown gyro bias also causes an attitude error.
     expected = 1e-8 + 0.25 * (1e-8 + SETTINGS.bias_start**2)
     np.testing.assert_allclose(found.covariance[ATTITUDE, ATTITUDE], expected * np.eye(3), atol=1e-12)
     np.testing.assert_allclose(

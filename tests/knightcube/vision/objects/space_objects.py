@@ -58,7 +58,7 @@ def frame_with(
     objects: list[tuple[FloatArray, float]],
     faintest: float = 7.0,
 ) -> Image:
-    """Return a frame of a star field, which depends only on the seed, with some objects (path, magnitude)."""
+    """Return a frame of the star field `seed` with some objects (path, magnitude)."""
     image = expose(camera, *star_field(camera, seed, faintest), rotation, exposure)
     for path, magnitude in objects:
         add_object(image, camera, path, magnitude, exposure)

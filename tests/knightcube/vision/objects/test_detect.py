@@ -329,7 +329,7 @@ def test_overlapping_streaks_of_two_stars_are_not_reported_as_an_object(
 
 @pytest.mark.parametrize("middle", [(270.0, 230.0), (20.0, 230.0)])
 def test_an_object_that_crosses_a_star_is_found(middle: tuple[float, float]) -> None:
-    """An object that crosses a star is found, also if the star's streak leaves the image."""
+    """An object that crosses a star is found, even if the star's streak leaves the image."""
     place = _FRAME_CAMERA.pinhole.unit_vectors(np.array([middle]))[0]
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
     directions = np.concatenate([directions, place[None]])
@@ -562,7 +562,7 @@ HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 MEETING = np.array([251.3, 262.8])
 """Position (px) at which the objects meet after 7 s."""
 MOTIONS = np.array([[8.0, 2.0], [5.0, -5.5]])
-"""Image motions (px/s), which are 0.33 and 0.30 deg/s."""
+"""Image motions (px/s), equal to 0.33 and 0.30 deg/s."""
 MAGNITUDE = 4.5
 
 
@@ -686,7 +686,7 @@ def test_all_forms_find_the_same_light_beside_a_path() -> None:
 
 
 def test_light_beside_the_path_of_a_star_is_that_of_pixels_beyond_the_reach() -> None:
-    """The path of the star is a parabola through both ends, which is sampled finely here."""
+    """The path of the star is a parabola through both ends, here sampled finely."""
     draw = np.random.default_rng(3)
     region, light = draw.integers(0, 60, (300, 2)), draw.uniform(1.0, 9.0, 300)
     ends, half = np.array([[10.0, 20.0], [45.0, 38.0]]), np.array([1.5, -3.0])

@@ -330,7 +330,7 @@ def test_the_terms_of_the_noise_are_not_negative() -> None:
 
 
 def test_the_mismatch_of_the_psf_is_the_median_over_the_stars() -> None:
-    """A star with light of a neighbour does not change the mismatch, which most stars have in common."""
+    """Most stars determine the mismatch, so a star with the light of a neighbour does not change it."""
     rng = np.random.default_rng(7)
     light, noise = rng.uniform(100.0, 900.0, (9, 5, 5)), np.full(9, 3.0)
     variance = 9.0 + 0.25 * light + (0.04 * light) ** 2

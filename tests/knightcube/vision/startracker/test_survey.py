@@ -170,7 +170,7 @@ def test_a_frame_with_a_foreground_or_defects_is_solved(kind: str) -> None:
 
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are missing")
 def test_photographs_with_a_foreground_or_defects_are_solved_and_never_wrongly() -> None:
-    """Photographs with a foreground or with defects are solved, and never wrongly.
+    """Photographs with a foreground or defects are solved, and no solution is wrong.
 
     With a global noise estimate, and without the repair of hot pixels, only 1 of 8 frames was solved.
     """

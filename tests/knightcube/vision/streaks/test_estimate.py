@@ -485,7 +485,7 @@ def _assert_right_or_refused(camera: StarCameraModel, scene: Drawn) -> None:
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:
-    """The summed errors agree with a chi-square, which is from 19 to 62 in 99 % of cases.
+    """The summed errors agree with a chi-square whose 99 % interval is 19 to 62.
 
     The chi-square has 36 degrees of freedom. The tested lower limit is half of the lower quantile.
     """

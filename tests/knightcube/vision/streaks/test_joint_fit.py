@@ -456,7 +456,7 @@ def test_the_last_step_is_that_of_the_motion(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_brightness_along_a_path_is_the_mean_of_three_rows_of_pixels() -> None:
-    """The mean of a band of pixels is that of a linear image. Its error is that of the mean of samples."""
+    """A band of pixels in a linear image has the expected mean. Its error is that of the mean of samples."""
     row, column = np.mgrid[:100, :120]
     camera = _small_problem()
     frame = replace(
