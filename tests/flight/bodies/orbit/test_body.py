@@ -122,7 +122,7 @@ def test_the_planner_gets_axes_weights_and_the_share_of_the_time_with_current() 
     assert craft.weights.dipole == given.dipole_weight()
     np.testing.assert_array_equal(craft.weights.axis, [0.0, 0.0, 1.0])
     assert craft.duty == pytest.approx(1.8 / 2.0), "the coils pause for 0.2 s of 2 s"
-    # The boresight is body -y, turned by 22 deg to -z, as the configuration states.
+    # The boresight is body -y, rotated by 22 deg towards -z, as the configuration states.
     turned = math.radians(22.0)
     camera = craft.slew.camera
     assert np.linalg.norm(camera) == pytest.approx(1.0)

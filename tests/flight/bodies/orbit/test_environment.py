@@ -272,7 +272,7 @@ def strength(flight: Flight, elements: TwoLineElements) -> float:
 
 
 def test_the_field_decides_between_elements_and_a_consistent_false_orbit() -> None:
-    """The field strength refutes fixes that are wrong by a quarter of an orbit, and confirms true fixes."""
+    """The field strength contradicts fixes that are wrong by a quarter of an orbit, but not true fixes."""
     there, here = ahead(90.0), TwoLineElements(FIRST, SECOND)
     for known, true, used in ((here, there, False), (there, here, True)):
         flight = Flight(known, true)
