@@ -29,8 +29,8 @@ class Disk(LinuxFiles):
     """A file system in which only synced content and names survive a power loss.
 
     `calls` counts the calls that change the disk. The power fails before call number `stop_before`. If
-    `failure` is an errno, the power stays on, but this call and all later calls fail with the errno. Calls
-    with the name `forget` have no effect.
+    `failure` is an errno, the power stays on, but this call and all later calls fail with the errno. The call
+    named by `forget` ("sync" or "sync_folder") has no effect.
     """
 
     def __init__(

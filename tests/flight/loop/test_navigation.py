@@ -246,7 +246,7 @@ def test_the_speed_without_a_gyro_is_that_of_the_estimate_or_of_the_field() -> N
 
 
 def test_with_a_gyro_the_speed_is_that_of_the_newest_reading_without_the_estimated_bias() -> None:
-    """An estimated gyro bias neither delays the end of detumbling nor looks like a spin."""
+    """An estimated gyro bias does not delay the end of detumbling, and is not mistaken for a spin."""
     bench = Bench()
     bench.update(BEGIN + 20 * MS, reading(BEGIN + 15 * MS))
     assert bench.task.speed == pytest.approx(0.11)
