@@ -93,7 +93,7 @@ def test_dark_frames_give_level_noise_and_read_noise() -> None:
 
 
 def _hot(share: float, *, pairs: bool = False) -> Callable[[Image], Image]:
-    """Return a change that makes a fraction of the pixels hot, single pixels or pairs in a row."""
+    """Return a change that makes a fraction of the pixels hot: single pixels, or pairs in a row."""
 
     def change(pixels: Image) -> Image:
         places = np.random.default_rng(7).random(pixels.shape) < share

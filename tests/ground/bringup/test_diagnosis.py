@@ -93,7 +93,7 @@ def test_exchanged_and_reversed_coils_are_found(size_known: bool) -> None:
         current = 0.15 * (1.0 + 0.02 * generator.normal(size=(3, 2)))
         test = CoilTest(np.full(3, 0.15), plus, minus, current, 0.0, 1e-7, np.zeros((3, 2)))
         found = diagnose_coils(test, expected, "xyz", size_known=size_known)
-        # The diagnosis blames the magnetometer, not the three coils.
+        # The diagnosis reports a fault of the magnetometer, not of the three coils.
         common = -1.0 if (signs < 0).all() else 1.0
         assert found.serves == order.tolist()
         assert np.array_equal(np.sign(found.strength), common * signs)

@@ -1,4 +1,4 @@
-"""Tests of the commands `elements`, `passes` and `day`; `knightcube check` accepts the made elements."""
+"""Tests of the commands `elements`, `passes` and `day`; `knightcube check` accepts the new elements."""
 
 from __future__ import annotations
 
