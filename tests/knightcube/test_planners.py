@@ -46,7 +46,7 @@ SLEW: dict[str, Any] = {
 
 
 def test_the_current_of_a_step_moves_the_body_to_its_end() -> None:
-    """The planned current of a step moves a body to the end of the step.
+    """The planned current of a step moves a body to the planned end of the step.
 
     The equation of motion J w' = n A B I cos(theta) - k theta - c w is integrated independently.
     """

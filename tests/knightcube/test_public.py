@@ -312,7 +312,7 @@ def test_a_rate_is_true_if_it_was_found() -> None:
 
 
 def test_vectors_can_be_lists_for_type_checkers_too() -> None:
-    """The functions accept lists and tuples, in the type checker, which reads this file, and at run time."""
+    """The functions accept lists and tuples at run time, and in the type checker, which reads this file."""
     solution = StarTracker(camera=CAMERA).solve(IMAGE, attitude=(0, 0, 0, 1), rate=[0, 0, 1], exposure=1.0)
     assert not solution
     assert not estimate_rate(IMAGE, CAMERA, 1.0, prior_rate=(0, 0, 1))

@@ -248,7 +248,7 @@ def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironm
 PINHOLE = Pinhole.from_field_of_view(200, 200, math.radians(20.0))
 ABOVE = np.array([1.0, 0.0, 0.0])
 SIDES = np.array([0.0, -1.0, 0.0])
-"""Sun direction above that side of the Earth which is not visible to the camera."""
+"""Sun direction over the side of the Earth that the camera does not see."""
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ Trials = Callable[[int], Campaign]
 
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> Trials:
-    """Return a function that runs the trial of a number once, and returns its result."""
+    """Return a function that runs the trial with a given number once, and returns its result."""
     return cache(lambda _: disturb_in_every_way(tmp_path_factory.mktemp("fault")))
 
 

@@ -249,7 +249,7 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
 def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
     """The direction of a star after a small rotation of the body agrees with v' = -w x v.
 
-    The direction is computed by the attitude matrix.
+    The direction is transformed by the attitude matrix.
     """
     rate, step = np.array([0.02, -0.01, 0.03]), 1e-4
     before = np.array([0.1, 0.2, 1.0]) / np.linalg.norm([0.1, 0.2, 1.0])

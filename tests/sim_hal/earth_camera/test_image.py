@@ -341,7 +341,7 @@ RANGES = {
 
 
 def made(**changes: Any) -> EarthCameraModel:
-    """Return a camera model with a pinhole lens for the image size of the model."""
+    """Return a camera model with a pinhole lens whose image size is that of the model."""
     size = changes.get("columns", 512), changes.get("rows", 512)
     return EarthCameraModel(lens=Pinhole.from_field_of_view(*size, 1.0), **changes)
 

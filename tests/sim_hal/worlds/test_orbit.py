@@ -105,7 +105,7 @@ def test_elements_with_another_shape_than_the_orbit_are_named(
 def test_mean_elements_written_as_an_orbit_keep_its_shape(seed: int) -> None:
     """Mean elements of SGP4 that are used as osculating elements in ICRS axes keep the shape of the orbit.
 
-    This use of mean elements is a common confusion.
+    This use of mean elements is a common mistake.
     """
     rng = np.random.default_rng(seed)
     altitude, tilt = rng.uniform(400e3, 1200e3), rng.uniform(20.0, 120.0)

@@ -65,7 +65,7 @@ class Sky:
 
 @cache
 def flown_with_stars(sigma: float) -> Sky:
-    """Return a body after 6,000 s with stars. A test that continues the run must copy the body."""
+    """Return a body after 6,000 s with star attitudes. A test that continues the run must copy the body."""
     sky = Sky(sigma, 4)
     sky.fly(6_000.0, stars=True)
     return sky

@@ -66,7 +66,7 @@ def test_the_smoothed_power_has_its_slope_and_is_within_a_tenth_of_full_power(co
     ahead, behind = (cost.smooth(plant, current + shift)[0] for shift in (step, -step))
     np.testing.assert_allclose(slope, (ahead - behind) / (2.0 * step), atol=1e-5)
     assert value[20] == pytest.approx(0.0, abs=1e-12)
-    # The smoothed power is at most a tenth of the full power below the exact power.
+    # The smoothed power is below the exact power by at most a tenth of the full power.
     lower = cost.power(plant, current) - value
     assert lower.min() > -1e-12
     assert lower.max() < 0.1 * VOLTAGE * FULL

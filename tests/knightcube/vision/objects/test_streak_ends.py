@@ -287,7 +287,7 @@ def _regions(boxes: list[list[int]]) -> Regions:
 
 
 def test_regions_near_any_border_may_be_truncated() -> None:
-    """A box of rows 5 to 54 and columns 5 to 74 has a distance of 5 px from each border of 60 x 80 px."""
+    """A box of rows 5 to 54 and columns 5 to 74 is 5 px from each border of 60 x 80 px."""
     inner = [5, 55, 5, 75]
     boxes = [inner, [4, 55, 5, 75], [5, 56, 5, 75], [5, 55, 4, 75], [5, 55, 5, 76]]
     assert near_border(_regions(boxes), (60, 80), 5).tolist() == [False, True, True, True, True]

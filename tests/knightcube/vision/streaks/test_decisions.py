@@ -257,7 +257,7 @@ def _fit() -> StreakFit:
 def test_the_result_contains_the_fitted_stars_and_their_streaks() -> None:
     """The ends of the streaks follow from the motion; their covariance is that of motion and star.
 
-    A star on a brighter star, and a star that is not significant, are omitted.
+    A star near a brighter star, and a star that is not significant, are omitted.
     """
     last, camera = _fit(), _problem(psf_sigma=1.3)
     found = with_stars(MotionResult(StreakStatus.FAILED, 7, 0.2), camera, last)

@@ -185,7 +185,7 @@ def _small_problem(image: FloatArray | None = None, **settings: object) -> FitPr
 
 
 def _small_scene() -> StreakScene:
-    """Return three stars with streaks of about 30 px, of which the last does not determine the motion."""
+    """Return three stars with streaks of about 30 px. The last star does not determine the motion."""
     stars = np.array([[30.0, 40.0], [60.0, 50.0], [90.0, 70.0]])
     light, trusted = np.array([4000.0, 3000.0, 2000.0]), np.array([True, True, False])
     motion = CameraMotion.steady(np.array([0.02, 0.04, 0.01]))
